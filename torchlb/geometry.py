@@ -1,0 +1,174 @@
+"""What a ladder needs to know of a shape: points, graph, tangent frames, areas and the rows of last resort."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from math import gamma, pi
+
+import torch
+from jaxtyping import Float, Int
+from scipy import sparse
+from torch import Tensor
+from tqdm import tqdm
+
+from torchlb.cotangent import robust_rows
+from torchlb.ladder import CHUNK_BYTES, chunks, ladder_rungs
+from torchlb.neighbors import (
+    GraphBalls,
+    mesh_graph,
+    nearest_graph,
+    nearest_neighbors,
+    unit_directions,
+)
+from torchlb.tangent import (
+    cloud_frames,
+    complete_frames,
+    face_normals,
+    mesh_frames,
+    normals_of_frames,
+    orient_by_graph,
+    refine_frames,
+)
+
+__all__ = ["Geometry", "cloud_geometry", "mesh_geometry", "voronoi_areas"]
+
+CANDIDATES = {1: 12, 2: 24, 3: 64}
+"""Nearest points from which the frames and the graph of a cloud start, by dimension."""
+
+
+@dataclass(frozen=True)
+class Geometry:
+    """A shape ready for stencils.
+
+    Attributes
+    ----------
+    points : (N, n), ℓ, float64.
+    frames : (N, n, d), orthonormal; [frames, normal] is right-handed where there is a normal.
+    normals : (N, n) unit normals of a hypersurface, else None. Oriented by the faces, or consistently on a cloud.
+    normal_order : (N,), the degree q of the fit behind each frame; 0 for a frame that stayed poor.
+    graph : (N, N) adjacency whose balls are the neighbourhoods.
+    areas : (N,), ℓ^d, positive: a first-order share of the area.
+    fallback : M-matrix rows, strong form; None beyond surfaces in R² and R³.
+    """
+
+    points: Float[Tensor, "N n"]
+    frames: Float[Tensor, "N n d"]
+    normals: Float[Tensor, "N n"] | None
+    normal_order: Int[Tensor, " N"]
+    graph: sparse.csr_array
+    areas: Float[Tensor, " N"]
+    fallback: sparse.csr_array | None
+
+
+def cloud_geometry(
+    points: Float[Tensor, "N n"],
+    dim: int,
+    normal_order: int,
+    *,
+    num_neighbors: int | None = None,
+    normals: Float[Tensor, "N n"] | None = None,
+    progress: bool = True,
+) -> Geometry:
+    """Geometry of a point cloud: graph and frames from the nearest neighbours."""
+    candidates = nearest_neighbors(points, min(CANDIDATES.get(dim, 128), len(points)))
+    poor = cloud_frames(points, candidates, dim) if normals is None else complete_frames(normals)
+    graph = nearest_graph(points, poor, candidates)
+    frames, order = _refined(points, poor, graph, normal_order, num_neighbors, progress)
+    reference = normals
+    if reference is None and dim == points.shape[1] - 1:
+        reference = orient_by_graph(points, normals_of_frames(frames), graph)
+    fallback = robust_rows(points, None)[0] if dim == 2 and points.shape[1] <= 3 else None
+    areas = voronoi_areas(points, frames, graph)
+    return _oriented(points, frames, reference, order, graph, areas, fallback)
+
+
+def mesh_geometry(
+    vertices: Float[Tensor, "N n"],
+    faces: Int[Tensor, "F v"],
+    normal_order: int,
+    *,
+    num_neighbors: int | None = None,
+    progress: bool = True,
+) -> Geometry:
+    """Geometry of a mesh of triangles (or of segments, or tetrahedra in Rⁿ): graph and frames from the faces."""
+    poor = mesh_frames(vertices, faces)
+    graph = mesh_graph(faces, len(vertices))
+    frames, order = _refined(vertices, poor, graph, normal_order, num_neighbors, progress)
+    hypersurface = faces.shape[1] == vertices.shape[1]
+    reference = face_normals(vertices, faces) if hypersurface else None
+    if faces.shape[1] == 3 and vertices.shape[1] <= 3:
+        fallback, areas = robust_rows(vertices, faces)
+    else:
+        fallback, areas = None, voronoi_areas(vertices, frames, graph)
+    return _oriented(vertices, frames, reference, order, graph, areas, fallback)
+
+
+def _refined(
+    points: Tensor,
+    poor: Tensor,
+    graph: sparse.csr_array,
+    degree: int,
+    num_neighbors: int | None,
+    progress: bool,
+) -> tuple[Tensor, Tensor]:
+    """Frames of order q, in chunks; the poor ones if q = 0 or in a flat space."""
+    if degree == 0 or poor.shape[1] == poor.shape[2]:
+        return poor, torch.full((len(points),), degree)
+    rungs = ladder_rungs(poor.shape[-1], range(degree, 0, -1), num_neighbors=num_neighbors)
+    balls = GraphBalls(points, graph, poor)
+    parts = chunks(len(points), rungs, poor.shape[-1])
+    bar = tqdm(parts, "tangent frames", delay=2, disable=not progress, leave=False)
+    frames, order = zip(
+        *(refine_frames(points, poor, balls, centers, rungs) for centers in bar), strict=True
+    )
+    return torch.cat(frames), torch.cat(order)
+
+
+def _oriented(
+    points: Tensor,
+    frames: Tensor,
+    reference: Tensor | None,
+    order: Tensor,
+    graph: sparse.csr_array,
+    areas: Tensor,
+    fallback: sparse.csr_array | None,
+) -> Geometry:
+    """Turn normals to the side of `reference`, and frames so that [frames, normal] is right-handed."""
+    normals = None
+    if frames.shape[-1] == points.shape[1] - 1:
+        normals = normals_of_frames(frames)
+        if reference is not None:
+            flip = (normals * reference).sum(-1) < 0
+            normals = torch.where(flip[:, None], -normals, normals)
+            frames = torch.where(
+                flip[:, None, None], torch.cat([-frames[..., :1], frames[..., 1:]], -1), frames
+            )
+    return Geometry(points, frames, normals, order, graph, areas, fallback)
+
+
+def voronoi_areas(
+    points: Float[Tensor, "N n"], frames: Float[Tensor, "N n d"], graph: sparse.csr_array
+) -> Float[Tensor, " N"]:
+    r"""Volume ℓ^d of each point's Voronoi cell in its tangent plane, second order in the spacing.
+
+    In the direction u the cell ends at r(u) = min_j |y_j|² / (2 y_j·u), and its volume is that of the unit ball times
+    the mean of r^d over the sphere of directions. Cells that are open (at a boundary) end half-way to the farthest of
+    the neighbours.
+    """
+    dim = frames.shape[-1]
+    directions = unit_directions(dim)
+    unit_ball = pi ** (dim / 2) / gamma(dim / 2 + 1)
+    balls = GraphBalls(points, graph, frames)
+    size = min(6 * 2**dim + 1, len(points))
+    areas = []
+    for centers in torch.arange(len(points)).split(max(1, CHUNK_BYTES // (8 * size * len(directions)))):
+        index, _ = balls(centers, size)
+        coords = (points[index[:, 1:]] - points[centers, None]) @ frames[centers]
+        square = coords.square().sum(-1)
+        half = square.amax(1).sqrt() / 2
+        # 1 / (2 r) = max_j y_j·u / |y_j|²; a neighbour behind the centre does not bound the cell.
+        inverse = coords / square.clamp_min(torch.finfo(coords.dtype).tiny)[..., None]
+        bound = (inverse @ directions.T).amax(1)
+        radius = 1 / (2 * bound.clamp_min((1 / (2 * half))[:, None]))
+        areas.append(unit_ball * radius.pow(dim).mean(1))
+    return torch.cat(areas)

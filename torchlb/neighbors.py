@@ -1,0 +1,219 @@
+"""Neighbourhoods: who may enter a point's stencil, and in which order (`method.md`, section 4).
+
+A plain ball of the nearest points mixes the two sides of a thin sheet, whose tangent planes agree. So a stencil is
+drawn from a *graph ball*: walk the edges of a mesh, or of the graph of each point's few nearest admissible neighbours
+on a cloud, and step only on points that are admissible from the centre. The `size` nearest of what was reached are the
+pool, ordered by distance. A path across a sharp rim is cut at the rim, where the tangent planes turn away.
+"""
+
+from __future__ import annotations
+
+from math import pi
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Int
+from scipy import sparse
+from scipy.spatial import cKDTree
+from torch import Tensor
+
+__all__ = [
+    "GraphBalls",
+    "admissible",
+    "mesh_graph",
+    "nearest_graph",
+    "nearest_neighbors",
+    "unit_directions",
+]
+
+MIN_ALIGNMENT = 0.5
+"""Admission: smallest singular value of E_kᵀE_i, the cosine of the largest angle between two tangent planes."""
+MAX_SLOPE = 0.6
+"""Admission: largest share of the distance |e| that may be height over the centre's tangent plane. On a sphere the
+two bounds meet at 60°, where it is 0.5; the rest is for frames that are still poor."""
+BALL_SURPLUS = 1.5
+"""A graph ball holds this many times the points asked for, so that its round core lies inside the ragged rim."""
+
+
+def nearest_neighbors(points: Float[Tensor, "N n"], size: int) -> Int[Tensor, "N K"]:
+    """The `size` nearest points of each point by distance, the point itself first.
+
+    >>> nearest_neighbors(torch.tensor([[0.0], [1.0], [3.0]]), 2).tolist()
+    [[0, 1], [1, 0], [2, 1]]
+    """
+    tree = cKDTree(points.numpy())
+    _, index = tree.query(points.numpy(), k=np.arange(1, size + 1), workers=-1)
+    return torch.from_numpy(index.astype(np.int64))
+
+
+def _smallest_singular_value(
+    a: Float[Tensor, "P n d"], b: Float[Tensor, "P n d"]
+) -> Float[Tensor, " P"]:
+    """σ_min(AᵀB) of pairs of orthonormal frames."""
+    product = a.mT @ b
+    dim = product.shape[-1]
+    if dim == 1:
+        return product[:, 0, 0].abs()
+    if dim == 2:  # σ² are the roots of s² − |A|²s + det² = 0
+        frobenius = product.square().sum((-1, -2))
+        discriminant = (frobenius.square() - 4 * torch.linalg.det(product).square()).clamp_min(0)
+        return ((frobenius - discriminant.sqrt()) / 2).clamp_min(0).sqrt()
+    return torch.linalg.svdvals(product)[:, -1]
+
+
+def admissible(
+    points: Float[Tensor, "N n"],
+    frames: Float[Tensor, "N n d"],
+    centers: Int[Tensor, " P"],
+    others: Int[Tensor, " P"],
+) -> Bool[Tensor, " P"]:
+    """Whether `others[j]` may enter the stencil of `centers[j]`.
+
+    It may if their tangent planes are less than 60° apart (σ_min(E_kᵀE_i) ≥ 0.5) and it does not stand above or
+    below the centre's plane (height ≤ 0.6 of the distance). Orientation of the frames is irrelevant.
+    """
+    offset = points[others] - points[centers]
+    along = torch.einsum("pn,pnd->pd", offset, frames[centers]).square().sum(-1)
+    total = offset.square().sum(-1)
+    flat = total - along <= MAX_SLOPE**2 * total
+    aligned = _smallest_singular_value(frames[others], frames[centers]) >= MIN_ALIGNMENT
+    return flat & aligned
+
+
+def _graph(i: np.ndarray, j: np.ndarray, num_points: int) -> sparse.csr_array:
+    """Symmetric 0/1 adjacency with the pairs (i, j), without loops."""
+    keep = i != j
+    ones = np.ones(int(keep.sum()), dtype=np.float32)
+    graph = sparse.csr_array((ones, (i[keep], j[keep])), shape=(num_points, num_points))
+    graph = (graph + graph.T).tocsr()
+    graph.data[:] = 1
+    return graph
+
+
+def mesh_graph(faces: Int[Tensor, "F v"], num_points: int) -> sparse.csr_array:
+    """Edges of a mesh of simplices as a symmetric (N, N) adjacency.
+
+    >>> mesh_graph(torch.tensor([[0, 1, 2]]), 4).toarray().astype(int).tolist()
+    [[0, 1, 1, 0], [1, 0, 1, 0], [1, 1, 0, 0], [0, 0, 0, 0]]
+    """
+    corners = faces.numpy()
+    pairs = [(a, b) for a in range(corners.shape[1]) for b in range(a)]
+    i = np.concatenate([corners[:, a] for a, _ in pairs])
+    j = np.concatenate([corners[:, b] for _, b in pairs])
+    return _graph(i, j, num_points)
+
+
+def unit_directions(dim: int) -> Float[Tensor, "u d"]:
+    """Evenly spread unit vectors: 2, 128 or 1024 of them for d = 1, 2, more."""
+    if dim == 1:
+        return torch.tensor([[-1.0], [1.0]], dtype=torch.float64)
+    if dim == 2:
+        angle = 2 * pi * torch.arange(128, dtype=torch.float64) / 128
+        return torch.stack([angle.cos(), angle.sin()], dim=1)
+    normal = torch.quasirandom.SobolEngine(dim).draw(1024).double().clamp(1e-3, 1 - 1e-3)
+    direction = torch.special.ndtri(normal)
+    return direction / direction.norm(dim=1, keepdim=True)
+
+
+def nearest_graph(
+    points: Float[Tensor, "N n"],
+    frames: Float[Tensor, "N n d"],
+    candidates: Int[Tensor, "N K"],
+) -> sparse.csr_array:
+    """A cloud's stand-in for the edges of a mesh, symmetric (N, N).
+
+    Each point is joined to its 2^(d+1) nearest admissible neighbours (4, 8, 16 for curves, surfaces, solids) and to
+    those that bound its Voronoi cell in the tangent plane, which bridge the voids of an uneven cloud. `candidates`
+    come from `nearest_neighbors`; an edge must be admissible from both its ends.
+    """
+    wanted = 2 ** (frames.shape[-1] + 1)
+    others = candidates[:, 1:]
+    num_rows, size = others.shape
+    centers = torch.arange(num_rows).repeat_interleave(size)
+    flat = others.reshape(-1)
+    good = admissible(points, frames, centers, flat) & admissible(points, frames, flat, centers)
+    good = good.view(num_rows, size)
+    chosen = good & (good.cumsum(1) <= wanted)
+    directions = unit_directions(frames.shape[-1]).to(points)
+    for rows in torch.arange(num_rows).split(max(1, 2**24 // (size * len(directions)))):
+        coords = (points[others[rows]] - points[rows, None]) @ frames[rows]
+        # The cell ends at r(u) = min_j |y_j|² / (2 y_j·u): keep the neighbours that attain it.
+        inverse = coords / coords.square().sum(-1, keepdim=True).clamp_min(1e-300)
+        reach = (inverse @ directions.T).masked_fill(~good[rows, :, None], -torch.inf)
+        best, first = reach.max(1)
+        mark = torch.zeros_like(good[rows]).scatter_(1, first, best > 0)
+        chosen[rows] |= mark & good[rows]
+    pick = chosen.reshape(-1).numpy()
+    return _graph(centers.numpy()[pick], flat.numpy()[pick], num_rows)
+
+
+class GraphBalls:
+    """The nearest points of a graph ball, for any chunk of centres.
+
+    Parameters
+    ----------
+    points : (N, n), length ℓ.
+    graph : (N, N) symmetric adjacency, from `mesh_graph` or `nearest_graph`.
+    frames : (N, n, d) tangent frames that decide admission.
+    """
+
+    def __init__(
+        self,
+        points: Float[Tensor, "N n"],
+        graph: sparse.csr_array,
+        frames: Float[Tensor, "N n d"],
+    ) -> None:
+        self.points = points
+        self.graph = graph
+        self.frames = frames
+
+    def __call__(
+        self, centers: Int[Tensor, " B"], size: int
+    ) -> tuple[Int[Tensor, "B K"], Int[Tensor, " B"]]:
+        """The `size` nearest admissible points of each centre, itself first.
+
+        Returns
+        -------
+        index : (B, size), padded by the centre itself where the ball holds fewer.
+        count : (B,), how many are real.
+        """
+        local, others = self._reach(centers, size)
+        offset = self.points[others] - self.points[centers[local]]
+        distance = offset.square().sum(-1)
+        order = np.lexsort((others.numpy(), distance.numpy(), local.numpy()))
+        local, others = local[order], others[order]
+        total = torch.bincount(local, minlength=len(centers))
+        rank = torch.arange(len(local)) - (total.cumsum(0) - total)[local]
+        kept = rank < size
+        index = centers[:, None].repeat(1, size)
+        index[local[kept], rank[kept]] = others[kept]
+        return index, total.clamp_max(size)
+
+    def _reach(
+        self, centers: Int[Tensor, " B"], size: int
+    ) -> tuple[Int[Tensor, " P"], Int[Tensor, " P"]]:
+        """Pairs (row of `centers`, point) of the graph balls, grown ring by ring until they are large enough."""
+        num_rows, num_points = len(centers), len(self.points)
+        shape = (num_rows, num_points)
+        start = (np.ones(num_rows, np.float32), centers.numpy(), np.arange(num_rows + 1))
+        visited = sparse.csr_array(start, shape=shape)
+        frontier = visited
+        while frontier.nnz:
+            ring = frontier @ self.graph + visited * np.float32(2**20)  # marks what is known
+            ring = ring.tocoo()
+            new = ring.data < 2**20
+            local = torch.from_numpy(ring.coords[0][new].astype(np.int64))
+            others = torch.from_numpy(ring.coords[1][new].astype(np.int64))
+            good = admissible(self.points, self.frames, centers[local], others).numpy()
+            row, col = ring.coords[0][new][good], ring.coords[1][new][good]
+            ones = np.ones(len(row), np.float32)
+            frontier = sparse.csr_array((ones, (row, col)), shape=shape)
+            visited = visited + frontier
+            wanting = np.diff(visited.indptr) < BALL_SURPLUS * size
+            frontier = sparse.csr_array(sparse.diags_array(wanting.astype(np.float32)) @ frontier)
+            frontier.eliminate_zeros()
+        pairs = visited.tocoo()
+        return (
+            torch.from_numpy(pairs.coords[0].astype(np.int64)),
+            torch.from_numpy(pairs.coords[1].astype(np.int64)),
+        )

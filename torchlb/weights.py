@@ -1,0 +1,242 @@
+"""Stencil weights: the derivatives at the centre of a fit to the neighbours (`method.md`, section 2).
+
+Local coordinates y_j of the K − 1 neighbours, centre at the origin. One factorisation serves every functional.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import lru_cache
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from torchlb.polynomials import (
+    gradient_functional,
+    hessian_functional,
+    monomials,
+    num_monomials,
+)
+
+__all__ = [
+    "WEIGHT_RULES",
+    "Weights",
+    "least_squares_weights",
+    "polyharmonic_weights",
+    "positive_weights",
+    "typical_growth",
+    "window",
+]
+
+RANK_TOLERANCE = 1e-10
+
+
+@dataclass(frozen=True)
+class Weights:
+    """Weights of the gradient and of the second derivatives at the centre of a batch of stencils.
+
+    Attributes
+    ----------
+    gradient : (B, K, d), 1/ℓ. Entry 0 along K is the centre, as below.
+    hessian : (B, K, pairs), 1/ℓ²: ∂_a∂_b for a ≤ b; no columns below degree 2.
+    radius : (B,), ℓ: distance ρ of the farthest neighbour in local coordinates.
+    condition : (B,): 2-norm condition of the column-scaled √ω V.
+    deficit : (B,): M − 1 less its numerical rank; 0 for a poised stencil.
+    residual : (B,): largest violation of the moment equations, in units of the largest right-hand side.
+    """
+
+    gradient: Float[Tensor, "B K d"]
+    hessian: Float[Tensor, "B K pairs"]
+    radius: Float[Tensor, " B"]
+    condition: Float[Tensor, " B"]
+    deficit: Int[Tensor, " B"]
+    residual: Float[Tensor, " B"]
+
+    @property
+    def laplacian(self) -> Float[Tensor, "B K"]:
+        """Weights of Δ = Σ_c ∂_c², 1/ℓ²."""
+        dim = self.gradient.shape[-1]
+        pairs = [a == b for a in range(dim) for b in range(a, dim)]
+        return self.hessian[..., pairs].sum(-1)
+
+
+def window(radius: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
+    """Weight ω(r) = (1 − (r/1.1)²)⁴ of a neighbour at r = |y|/ρ ∈ [0, 1].
+
+    >>> window(torch.tensor([0.0, 1.1])).tolist()
+    [1.0, 0.0]
+    """
+    return (1 - (radius / 1.1).square()).clamp_min(0).pow(4)
+
+
+def _functionals(dim: int, degree: int) -> Float[Tensor, "M F"]:
+    """Right-hand sides: the d first derivatives, then (from degree 2 on) the second ones."""
+    columns = [gradient_functional(dim, degree)]
+    if degree >= 2:
+        columns.append(hessian_functional(dim, degree))
+    return torch.cat(columns, dim=1)
+
+
+def _finish(
+    weights: Float[Tensor, "B K F"],
+    monomial_values: Float[Tensor, "B neighbors M"],
+    functionals: Float[Tensor, "M F"],
+    radius: Float[Tensor, " B"],
+    singular_values: Float[Tensor, "B M"],
+    dim: int,
+) -> Weights:
+    """Check the moments in scaled coordinates, then return to units of length."""
+    moments = monomial_values.mT @ weights[:, 1:]
+    residual = (moments - functionals).abs().amax((1, 2)) / functionals.abs().max()
+    largest = singular_values[:, :1]
+    rho = radius[:, None, None]
+    return Weights(
+        gradient=weights[..., :dim] / rho,
+        hessian=weights[..., dim:] / rho.square(),
+        radius=radius,
+        condition=singular_values[:, 0] / singular_values[:, -1],
+        deficit=(singular_values <= RANK_TOLERANCE * largest).sum(1),
+        residual=residual,
+    )
+
+
+def _scaled_system(
+    coords: Float[Tensor, "B neighbors d"], degree: int
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """ρ, y/ρ, the monomials V there and √ω."""
+    distance = coords.norm(dim=-1)
+    radius = distance.amax(-1)
+    scaled = coords / radius[:, None, None]
+    root = window(distance / radius[:, None]).sqrt()
+    return radius, scaled, monomials(scaled, degree), root
+
+
+def least_squares_weights(
+    coords: Float[Tensor, "B neighbors d"],
+    degree: int,
+    keep: Bool[Tensor, "B neighbors"] | None = None,
+) -> Weights:
+    r"""Centre-constrained moving least squares.
+
+    For every functional D among the first and second derivatives,
+
+    .. math:: \min \sum_{j \ne i} w_j^2 / \omega_j \quad\text{subject to}\quad
+              \sum_{j \ne i} w_j y_j^\alpha = (D y^\alpha)(0), \quad 1 \le |\alpha| \le m, \qquad
+              w_i = -\sum_{j \ne i} w_j .
+
+    The polynomial passes through the centre's value; that is what makes the operator stable (`method.md`, section 2).
+    Solved by QR of √ω V in coordinates scaled by ρ: w = √ω Q R⁻ᵀ b. A stencil without full
+    rank comes out with a positive `deficit` and unusable weights; nothing is raised.
+
+    Parameters
+    ----------
+    coords : (B, K − 1, d), ℓ: the neighbours without the centre, K − 1 ≥ M − 1.
+    degree : m ≥ 1. Second derivatives come with m ≥ 2.
+    keep : (B, K − 1), neighbours that may have a weight; all by default.
+
+    >>> line = torch.tensor([[[-1.0], [1.0]]], dtype=torch.float64)
+    >>> least_squares_weights(line, 2).laplacian.round(decimals=12).tolist()
+    [[-2.0, 1.0, 1.0]]
+    """
+    radius, _, values, root = _scaled_system(coords, degree)
+    if keep is not None:
+        root = root * keep
+    functionals = _functionals(coords.shape[-1], degree).to(coords)
+    system = root[..., None] * values
+    scale = system.norm(dim=1).clamp_min(torch.finfo(coords.dtype).tiny)
+    q, r = torch.linalg.qr(system / scale[:, None])
+    right = functionals / scale[..., None]
+    neighbors = root[..., None] * (q @ torch.linalg.solve_triangular(r.mT, right, upper=False))
+    weights = torch.cat([-neighbors.sum(1, keepdim=True), neighbors], dim=1)
+    return _finish(
+        weights, values, functionals, radius, torch.linalg.svdvals(r), coords.shape[-1]
+    )
+
+
+@lru_cache(maxsize=64)
+def typical_growth(dim: int, degree: int) -> float:
+    """Growth ρ² Σ|w| of a stencil with very many evenly spread neighbours: what good stencils of any size have.
+
+    >>> [round(typical_growth(2, m)) for m in (2, 4, 6, 8)]
+    [23, 60, 112, 182]
+    """
+    cube = 2 * torch.quasirandom.SobolEngine(dim).draw(2**14).double() - 1
+    ball = cube[cube.norm(dim=1) <= 1][1 : 20 * num_monomials(dim, degree)]
+    weights = least_squares_weights(ball[None], degree)
+    return float(weights.radius[0] ** 2 * weights.laplacian.abs().sum())
+
+
+def positive_weights(coords: Float[Tensor, "B neighbors d"], degree: int) -> Weights:
+    """Least squares over as many neighbours as can have weights Δ ≥ 0: a row of an M-matrix, and consistent.
+
+    Neighbours with a negative weight are left out and the rest solved again until none is negative or the rank is
+    lost. This finds a positive stencil nearly wherever one exists (non-negative least squares finds 0–3 % more).
+    Positive weights exist up to degree 3 only, since Σ w |y|⁴ = 0 excludes them beyond (`method.md`, section 10).
+    """
+    keep = torch.ones(coords.shape[:2], dtype=torch.bool)
+    weights = least_squares_weights(coords, degree)
+    for _ in range(coords.shape[1]):
+        others = weights.laplacian[:, 1:]
+        rounding = 1e-12 * others.abs().amax(1, keepdim=True)
+        negative = keep & (others < -rounding) & (weights.residual <= 1e-10)[:, None]
+        if not negative.any():
+            break
+        keep &= ~negative
+        weights = least_squares_weights(coords, degree, keep)
+    return weights
+
+
+def polyharmonic_weights(coords: Float[Tensor, "B neighbors d"], degree: int) -> Weights:
+    r"""Derivatives of the polyharmonic spline :math:`|y|^5` plus polynomials of degree m that interpolates all K points.
+
+    Three to ten times smaller errors than least squares on quasi-uniform points, but less robust on random ones
+    (`method.md`, section 2). Same arguments and result as `least_squares_weights`; m ≥ 2.
+    """
+    radius, scaled, values, root = _scaled_system(coords, degree)
+    batch, _, dim = coords.shape
+    functionals = _functionals(dim, degree).to(coords)
+    system = root[..., None] * values
+    scale = system.norm(dim=1).clamp_min(torch.finfo(coords.dtype).tiny)
+    singular_values = torch.linalg.svdvals(system / scale[:, None])
+
+    nodes = torch.cat([scaled.new_zeros(batch, 1, dim), scaled], dim=1)
+    # Distances from differences: |a|² − 2ab + |b|² would lose half the digits.
+    kernel = (nodes[:, :, None] - nodes[:, None]).square().sum(-1).pow(2.5)
+    polynomials = torch.cat([torch.ones_like(nodes[..., :1]), monomials(nodes, degree)], dim=-1)
+    num_points, num_polynomials = polynomials.shape[1:]
+    zero = kernel.new_zeros(batch, num_polynomials, num_polynomials)
+    matrix = torch.cat(
+        [
+            torch.cat([kernel, polynomials], dim=2),
+            torch.cat([polynomials.mT, zero], dim=2),
+        ],
+        dim=1,
+    )
+    constant = functionals.new_zeros(1, functionals.shape[1])
+    exact = torch.cat([constant, functionals]).expand(batch, -1, -1)
+    right = torch.cat([_kernel_derivatives(nodes, functionals.shape[1]), exact], dim=1)
+    factors, pivots, _ = torch.linalg.lu_factor_ex(matrix)
+    weights = torch.linalg.lu_solve(factors, pivots, right)[:, :num_points]
+    return _finish(weights, values, functionals, radius, singular_values, dim)
+
+
+def _kernel_derivatives(nodes: Float[Tensor, "B K d"], count: int) -> Float[Tensor, "B K F"]:
+    """First, then second derivatives at y = 0 of |y − y_j|⁵: −5 r³ y_c and 5 r³ δ_ab + 15 r y_a y_b."""
+    dim = nodes.shape[-1]
+    r = nodes.norm(dim=-1)
+    columns = [-5 * r**3 * nodes[..., c] for c in range(dim)]
+    columns += [
+        15 * r * nodes[..., a] * nodes[..., b] + (5 * r**3 if a == b else 0)
+        for a in range(dim)
+        for b in range(a, dim)
+    ]
+    return torch.stack(columns[:count], dim=-1)
+
+
+WEIGHT_RULES = {
+    "least_squares": least_squares_weights,
+    "polyharmonic": polyharmonic_weights,
+    "positive": positive_weights,
+}
+"""The rules for the weights of a rung; the first two are the values of the option `weights`."""
