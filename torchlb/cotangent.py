@@ -39,31 +39,44 @@ def cotangent_laplacian(
             f"cotangent operator: vertices {bad} have no area (all their triangles are degenerate); "
             "remove or merge them, or use LaplaceBeltrami.from_mesh, which accepts degenerate triangles"
         )
-    strong = sparse.csr_array(sparse.diags_array(1 / area) @ weak)
-    return strong, torch.from_numpy(area.copy())
+    return _with_diagonal(sparse.csr_array(sparse.diags_array(1 / area) @ weak)), torch.from_numpy(
+        area.copy()
+    )
 
 
 def robust_rows(
     points: Float[Tensor, "N n"], faces: Int[Tensor, "F 3"] | None
 ) -> tuple[sparse.csr_array, Float[Tensor, " N"]]:
-    """Strong-form rows and areas of `robust_laplacian`, for a mesh (tufted cover) or a cloud in R² or R³.
+    """Strong-form rows and areas of `robust_laplacian`: the tufted cover of any triangle mesh, or of a cloud, in R³.
 
     Off-diagonal entries are ≥ 0 and the diagonal is their negative sum: an M-matrix row, stable on its own. First
-    order at best. Units: 1/ℓ² and ℓ².
+    order at best. Units: 1/ℓ² and ℓ². Points in R² are lifted. The areas of a cloud are not to be trusted: of a sphere
+    with 32,000 random points they miss a third.
     """
     space = np.zeros((len(points), 3))
-    space[:, : points.shape[1]] = points.double().numpy()
+    space[:, : points.shape[1]] = points.numpy()
     if faces is None:
-        neighbors = min(30, len(points) - 1)
-        weak, mass = robust_laplacian.point_cloud_laplacian(space, MOLLIFY, neighbors)
+        weak, mass = robust_laplacian.point_cloud_laplacian(space, MOLLIFY, min(30, len(space) - 1))
     else:
-        corners = faces.numpy().astype(np.int64)
-        weak, mass = robust_laplacian.mesh_laplacian(space, corners, MOLLIFY)
+        weak, mass = robust_laplacian.mesh_laplacian(space, faces.numpy(), MOLLIFY)
     area = cast(np.ndarray, mass.diagonal())
     # Degenerate triangles leave vertices with next to no area; a row must stay finite.
     area = np.maximum(area, 1e-12 * area.mean())
     off = sparse.coo_array(-weak)
-    keep = (off.row != off.col) & (off.data > 0)
-    weights = sparse.csr_array((off.data[keep], (off.row[keep], off.col[keep])), shape=off.shape)
+    row, col = off.coords
+    keep = (row != col) & (off.data > 0)
+    weights = sparse.csr_array((off.data[keep], (row[keep], col[keep])), shape=off.shape)
     strong = weights - sparse.diags_array(weights.sum(axis=1))
-    return sparse.csr_array(sparse.diags_array(1 / area) @ strong), torch.from_numpy(area)
+    return _with_diagonal(
+        sparse.csr_array(sparse.diags_array(1 / area) @ strong)
+    ), torch.from_numpy(area)
+
+
+def _with_diagonal(matrix: sparse.csr_array) -> sparse.csr_array:
+    """CSR with every diagonal entry stored, even where it is zero."""
+    row, col = sparse.coo_array(matrix).coords
+    size = len(matrix.indptr) - 1
+    diagonal = np.arange(size)
+    data = np.concatenate([sparse.coo_array(matrix).data, np.zeros(size)])
+    where = (np.concatenate([row, diagonal]), np.concatenate([col, diagonal]))
+    return sparse.csr_array((data, where), shape=(size, size))

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from math import gamma, pi
 
 import torch
 from jaxtyping import Float, Int
@@ -11,14 +10,13 @@ from scipy import sparse
 from torch import Tensor
 from tqdm import tqdm
 
-from torchlb.cotangent import robust_rows
-from torchlb.ladder import CHUNK_BYTES, chunks, ladder_rungs
+from torchlb.fallback import CloudFallback, MeshFallback
+from torchlb.ladder import chunks, ladder_rungs
 from torchlb.neighbors import (
     GraphBalls,
     mesh_graph,
     nearest_graph,
     nearest_neighbors,
-    unit_directions,
 )
 from torchlb.tangent import (
     cloud_frames,
@@ -30,7 +28,7 @@ from torchlb.tangent import (
     refine_frames,
 )
 
-__all__ = ["Geometry", "cloud_geometry", "mesh_geometry", "voronoi_areas"]
+__all__ = ["Geometry", "cloud_geometry", "mesh_geometry"]
 
 CANDIDATES = {1: 12, 2: 24, 3: 64}
 """Nearest points from which the frames and the graph of a cloud start, by dimension."""
@@ -48,7 +46,7 @@ class Geometry:
     normal_order : (N,), the degree q of the fit behind each frame; 0 for a frame that stayed poor.
     graph : (N, N) adjacency whose balls are the neighbourhoods.
     areas : (N,), ℓ^d, positive: a first-order share of the area.
-    fallback : M-matrix rows, strong form; None beyond surfaces in R² and R³.
+    fallback : M-matrix rows for points without a stencil.
     """
 
     points: Float[Tensor, "N n"]
@@ -57,7 +55,7 @@ class Geometry:
     normal_order: Int[Tensor, " N"]
     graph: sparse.csr_array
     areas: Float[Tensor, " N"]
-    fallback: sparse.csr_array | None
+    fallback: CloudFallback | MeshFallback
 
 
 def cloud_geometry(
@@ -77,9 +75,9 @@ def cloud_geometry(
     reference = normals
     if reference is None and dim == points.shape[1] - 1:
         reference = orient_by_graph(points, normals_of_frames(frames), graph)
-    fallback = robust_rows(points, None)[0] if dim == 2 and points.shape[1] <= 3 else None
-    areas = voronoi_areas(points, frames, graph)
-    return _oriented(points, frames, reference, order, graph, areas, fallback)
+    balls = GraphBalls(points, graph, frames)
+    fallback = CloudFallback(balls, surface=dim == 2 and points.shape[1] <= 3)
+    return _oriented(points, frames, reference, order, graph, fallback)
 
 
 def mesh_geometry(
@@ -97,10 +95,10 @@ def mesh_geometry(
     hypersurface = faces.shape[1] == vertices.shape[1]
     reference = face_normals(vertices, faces) if hypersurface else None
     if faces.shape[1] == 3 and vertices.shape[1] <= 3:
-        fallback, areas = robust_rows(vertices, faces)
+        fallback = MeshFallback(vertices, faces)
     else:
-        fallback, areas = None, voronoi_areas(vertices, frames, graph)
-    return _oriented(vertices, frames, reference, order, graph, areas, fallback)
+        fallback = CloudFallback(GraphBalls(vertices, graph, frames), surface=False)
+    return _oriented(vertices, frames, reference, order, graph, fallback)
 
 
 def _refined(
@@ -130,8 +128,7 @@ def _oriented(
     reference: Tensor | None,
     order: Tensor,
     graph: sparse.csr_array,
-    areas: Tensor,
-    fallback: sparse.csr_array | None,
+    fallback: CloudFallback | MeshFallback,
 ) -> Geometry:
     """Turn normals to the side of `reference`, and frames so that [frames, normal] is right-handed."""
     normals = None
@@ -143,32 +140,4 @@ def _oriented(
             frames = torch.where(
                 flip[:, None, None], torch.cat([-frames[..., :1], frames[..., 1:]], -1), frames
             )
-    return Geometry(points, frames, normals, order, graph, areas, fallback)
-
-
-def voronoi_areas(
-    points: Float[Tensor, "N n"], frames: Float[Tensor, "N n d"], graph: sparse.csr_array
-) -> Float[Tensor, " N"]:
-    r"""Volume ℓ^d of each point's Voronoi cell in its tangent plane, second order in the spacing.
-
-    In the direction u the cell ends at r(u) = min_j |y_j|² / (2 y_j·u), and its volume is that of the unit ball times
-    the mean of r^d over the sphere of directions. Cells that are open (at a boundary) end half-way to the farthest of
-    the neighbours.
-    """
-    dim = frames.shape[-1]
-    directions = unit_directions(dim)
-    unit_ball = pi ** (dim / 2) / gamma(dim / 2 + 1)
-    balls = GraphBalls(points, graph, frames)
-    size = min(6 * 2**dim + 1, len(points))
-    areas = []
-    for centers in torch.arange(len(points)).split(max(1, CHUNK_BYTES // (8 * size * len(directions)))):
-        index, _ = balls(centers, size)
-        coords = (points[index[:, 1:]] - points[centers, None]) @ frames[centers]
-        square = coords.square().sum(-1)
-        half = square.amax(1).sqrt() / 2
-        # 1 / (2 r) = max_j y_j·u / |y_j|²; a neighbour behind the centre does not bound the cell.
-        inverse = coords / square.clamp_min(torch.finfo(coords.dtype).tiny)[..., None]
-        bound = (inverse @ directions.T).amax(1)
-        radius = 1 / (2 * bound.clamp_min((1 / (2 * half))[:, None]))
-        areas.append(unit_ball * radius.pow(dim).mean(1))
-    return torch.cat(areas)
+    return Geometry(points, frames, normals, order, graph, fallback.areas(), fallback)

@@ -64,9 +64,7 @@ def ladder_rungs(
     return rungs
 
 
-def chunks(
-    num_points: int, rungs: Sequence[Rung], dim: int
-) -> tuple[Int[Tensor, " B"], ...]:
+def chunks(num_points: int, rungs: Sequence[Rung], dim: int) -> tuple[Int[Tensor, " B"], ...]:
     """Consecutive centres, so many at a time that one (B, K, M) array stays below `CHUNK_BYTES`."""
     size = max(rung.size for rung in rungs)
     columns = num_monomials(dim, rungs[0].degree)

@@ -8,14 +8,14 @@ pool, ordered by distance. A path across a sharp rim is cut at the rim, where th
 
 from __future__ import annotations
 
-from math import pi
-
 import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
 from scipy import sparse
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 from torch import Tensor
+
+from torchlb.voronoi import natural_neighbors
 
 __all__ = [
     "GraphBalls",
@@ -23,14 +23,15 @@ __all__ = [
     "mesh_graph",
     "nearest_graph",
     "nearest_neighbors",
-    "unit_directions",
 ]
 
 MIN_ALIGNMENT = 0.5
 """Admission: smallest singular value of E_kᵀE_i, the cosine of the largest angle between two tangent planes."""
-MAX_SLOPE = 0.6
+MAX_SLOPE = 0.5
 """Admission: largest share of the distance |e| that may be height over the centre's tangent plane. On a sphere the
-two bounds meet at 60°, where it is 0.5; the rest is for frames that are still poor."""
+two bounds meet, at 60°."""
+VOID = 1.5
+"""A natural neighbour may be this many times farther than the nearest ones; at an open end all else would be."""
 BALL_SURPLUS = 1.5
 """A graph ball holds this many times the points asked for, so that its round core lies inside the ragged rim."""
 
@@ -41,9 +42,9 @@ def nearest_neighbors(points: Float[Tensor, "N n"], size: int) -> Int[Tensor, "N
     >>> nearest_neighbors(torch.tensor([[0.0], [1.0], [3.0]]), 2).tolist()
     [[0, 1], [1, 0], [2, 1]]
     """
-    tree = cKDTree(points.numpy())
-    _, index = tree.query(points.numpy(), k=np.arange(1, size + 1), workers=-1)
-    return torch.from_numpy(index.astype(np.int64))
+    tree = KDTree(points.numpy())
+    _, index = tree.query(points.numpy(), k=size, workers=-1)
+    return torch.from_numpy(np.asarray(index, dtype=np.int64).reshape(len(points), size))
 
 
 def _smallest_singular_value(
@@ -70,7 +71,7 @@ def admissible(
     """Whether `others[j]` may enter the stencil of `centers[j]`.
 
     It may if their tangent planes are less than 60° apart (σ_min(E_kᵀE_i) ≥ 0.5) and it does not stand above or
-    below the centre's plane (height ≤ 0.6 of the distance). Orientation of the frames is irrelevant.
+    below the centre's plane (height ≤ 0.5 of the distance). Orientation of the frames is irrelevant.
     """
     offset = points[others] - points[centers]
     along = torch.einsum("pn,pnd->pd", offset, frames[centers]).square().sum(-1)
@@ -85,7 +86,7 @@ def _graph(i: np.ndarray, j: np.ndarray, num_points: int) -> sparse.csr_array:
     keep = i != j
     ones = np.ones(int(keep.sum()), dtype=np.float32)
     graph = sparse.csr_array((ones, (i[keep], j[keep])), shape=(num_points, num_points))
-    graph = (graph + graph.T).tocsr()
+    graph = sparse.csr_array(graph + graph.T)
     graph.data[:] = 1
     return graph
 
@@ -103,18 +104,6 @@ def mesh_graph(faces: Int[Tensor, "F v"], num_points: int) -> sparse.csr_array:
     return _graph(i, j, num_points)
 
 
-def unit_directions(dim: int) -> Float[Tensor, "u d"]:
-    """Evenly spread unit vectors: 2, 128 or 1024 of them for d = 1, 2, more."""
-    if dim == 1:
-        return torch.tensor([[-1.0], [1.0]], dtype=torch.float64)
-    if dim == 2:
-        angle = 2 * pi * torch.arange(128, dtype=torch.float64) / 128
-        return torch.stack([angle.cos(), angle.sin()], dim=1)
-    normal = torch.quasirandom.SobolEngine(dim).draw(1024).double().clamp(1e-3, 1 - 1e-3)
-    direction = torch.special.ndtri(normal)
-    return direction / direction.norm(dim=1, keepdim=True)
-
-
 def nearest_graph(
     points: Float[Tensor, "N n"],
     frames: Float[Tensor, "N n d"],
@@ -123,7 +112,7 @@ def nearest_graph(
     """A cloud's stand-in for the edges of a mesh, symmetric (N, N).
 
     Each point is joined to its 2^(d+1) nearest admissible neighbours (4, 8, 16 for curves, surfaces, solids) and to
-    those that bound its Voronoi cell in the tangent plane, which bridge the voids of an uneven cloud. `candidates`
+    its natural neighbours in the tangent plane, which bridge the voids of an uneven cloud. `candidates`
     come from `nearest_neighbors`; an edge must be admissible from both its ends.
     """
     wanted = 2 ** (frames.shape[-1] + 1)
@@ -134,15 +123,12 @@ def nearest_graph(
     good = admissible(points, frames, centers, flat) & admissible(points, frames, flat, centers)
     good = good.view(num_rows, size)
     chosen = good & (good.cumsum(1) <= wanted)
-    directions = unit_directions(frames.shape[-1]).to(points)
-    for rows in torch.arange(num_rows).split(max(1, 2**24 // (size * len(directions)))):
-        coords = (points[others[rows]] - points[rows, None]) @ frames[rows]
-        # The cell ends at r(u) = min_j |y_j|² / (2 y_j·u): keep the neighbours that attain it.
-        inverse = coords / coords.square().sum(-1, keepdim=True).clamp_min(1e-300)
-        reach = (inverse @ directions.T).masked_fill(~good[rows, :, None], -torch.inf)
-        best, first = reach.max(1)
-        mark = torch.zeros_like(good[rows]).scatter_(1, first, best > 0)
-        chosen[rows] |= mark & good[rows]
+    for rows in torch.arange(num_rows).split(2**24 // (size * 128)):
+        offset = points[others[rows]] - points[rows, None]
+        distance = offset.norm(dim=-1)
+        reach = VOID * (distance * chosen[rows]).amax(1, keepdim=True)
+        near = good[rows] & (distance <= reach)
+        chosen[rows] |= natural_neighbors(offset @ frames[rows], near)
     pick = chosen.reshape(-1).numpy()
     return _graph(centers.numpy()[pick], flat.numpy()[pick], num_rows)
 
@@ -200,7 +186,7 @@ class GraphBalls:
         frontier = visited
         while frontier.nnz:
             ring = frontier @ self.graph + visited * np.float32(2**20)  # marks what is known
-            ring = ring.tocoo()
+            ring = sparse.coo_array(ring)
             new = ring.data < 2**20
             local = torch.from_numpy(ring.coords[0][new].astype(np.int64))
             others = torch.from_numpy(ring.coords[1][new].astype(np.int64))
@@ -208,11 +194,11 @@ class GraphBalls:
             row, col = ring.coords[0][new][good], ring.coords[1][new][good]
             ones = np.ones(len(row), np.float32)
             frontier = sparse.csr_array((ones, (row, col)), shape=shape)
-            visited = visited + frontier
+            visited = sparse.csr_array(visited + frontier)
             wanting = np.diff(visited.indptr) < BALL_SURPLUS * size
             frontier = sparse.csr_array(sparse.diags_array(wanting.astype(np.float32)) @ frontier)
             frontier.eliminate_zeros()
-        pairs = visited.tocoo()
+        pairs = sparse.coo_array(visited)
         return (
             torch.from_numpy(pairs.coords[0].astype(np.int64)),
             torch.from_numpy(pairs.coords[1].astype(np.int64)),

@@ -1,29 +1,29 @@
-"""From points to the rows of a sparse operator: every point takes the first stencil that passes (`method.md`, 4).
+"""From points to the rows of a sparse operator: every point takes the first stencil that passes.
 
-The ladder of a point at order p: least-squares (or polyharmonic) stencils of degree p + 1 with K = 1.6, 2, …, 10 times as
-many points as polynomials; then the same at p − 1, …, 1; then positive weights of order 1; then the fallback row. How far down each point
-had to step is part of the result and never silent.
+The ladder of a point at order p (`method.md`, section 4): least-squares (or polyharmonic) stencils of degree p + 1
+with K = 1.6, 2, …, 10 times as many points as polynomials; then the same at p − 1, …, 1; then positive weights of
+order 1; then the fallback row. How far down each point had to step is part of the result and never silent.
 """
 
 from __future__ import annotations
 
 from dataclasses import replace
 
-import numpy as np
 import torch
 from jaxtyping import Float, Int
+from scipy import sparse
 from torch import Tensor
 from tqdm import tqdm
 
 from torchlb.geometry import Geometry
 from torchlb.ladder import Rung, chunks, ladder_rungs, walk_ladder
 from torchlb.neighbors import GraphBalls
-from torchlb.polynomials import num_monomials
 from torchlb.rows import Rows
+from torchlb.sparse import from_scipy
 from torchlb.tangent import local_offsets
 from torchlb.weights import WEIGHT_RULES, Weights, typical_growth
 
-__all__ = ["Ladder", "StencilError", "build_stencil"]
+__all__ = ["Ladder", "StencilError", "build_stencil", "matrix_rows"]
 
 MAX_DOMINANCE = 3.0
 MAX_GROWTH = 3.0
@@ -64,10 +64,7 @@ class Ladder:
         self.rungs += ladder_rungs(dim, [2], ["positive"], num_neighbors)
 
     def rows(self, centers: Int[Tensor, " B"], start: Int[Tensor, " B"] | None = None) -> Rows:
-        """Rows of `centers`, each at the first rung (from `start` on) that passes.
-
-        Raises StencilError where a point passes nowhere and there is no fallback.
-        """
+        """Rows of `centers`, each at the first rung (from `start` on) that passes, else the fallback row."""
         blocks, taken = [], []
         reason = torch.ones(len(centers), dtype=torch.int64)  # until something is tried: too few
         place = torch.empty(len(self.points), dtype=torch.int64)
@@ -88,8 +85,7 @@ class Ladder:
         left = torch.ones(len(centers), dtype=torch.bool)
         left[torch.cat([*taken, torch.empty(0, dtype=torch.int64)])] = False
         if left.any():
-            last_resort = self._least_bad_rows if self.fallback is None else self._fallback_rows
-            blocks.append(last_resort(centers[left]))
+            blocks.append(self._fallback_rows(centers[left]))
             taken.append(left.nonzero()[:, 0])
         rows = Rows.stack(blocks)[torch.cat(taken).argsort()]
         return replace(rows, reason=torch.where(rows.order < top - 1, reason, rows.reason))
@@ -99,58 +95,10 @@ class Ladder:
         return WEIGHT_RULES[rung.rule](coords, rung.degree)
 
     def _fallback_rows(self, centers: Int[Tensor, " B"]) -> Rows:
-        """M-matrix rows for Δ, and the first-order least-squares gradient of the nearest admissible neighbours."""
-        assert self.fallback is not None
-        index, _ = self.balls(centers, 2 * num_monomials(self.frames.shape[-1], 1) + 1)
-        coords = local_offsets(self.points, self.frames, centers, index, "tangent")
-        radius = coords.norm(dim=-1).amax(-1).clamp_min(torch.finfo(coords.dtype).tiny)
-        # Where all neighbours lie on a line the pseudo-inverse leaves the other derivative zero.
-        slopes = torch.linalg.pinv(coords / radius[:, None, None]).mT / radius[:, None, None]
-        slopes[:, 0] -= slopes.sum(1)
-        matrix = self.fallback[centers.numpy()].tocoo()
-        local = torch.arange(len(centers)).repeat_interleave(index.shape[1])
-        return _merged_rows(
-            torch.cat([torch.from_numpy(matrix.coords[0].astype(np.int64)), local]),
-            torch.cat([torch.from_numpy(matrix.coords[1].astype(np.int64)), index.reshape(-1)]),
-            torch.cat([torch.from_numpy(matrix.data), slopes.new_zeros(len(local))]),
-            torch.cat([slopes.new_zeros(matrix.nnz, slopes.shape[2]), slopes.flatten(0, 1)]),
-            radius,
-            len(self.rungs),
-        )
-
-    def _least_bad_rows(self, centers: Int[Tensor, " B"]) -> Rows:
-        """Where there is no fallback: the lowest order and the most points whose moments hold, stable or not."""
-
-        def attempt(rows: Tensor, index: Tensor, rung: Rung) -> tuple[Tensor, Rows]:
-            weights = self._weights(rows, index, rung)
-            failure = _failure(weights, rung.degree)
-            block = replace(_stencil_rows(index, weights, rung.degree), reason=failure)
-            return (failure == 0) | (failure > 3), block
-
-        upward = self.rungs[::-1]
-        blocks, taken = [], []
-        for number, rows, block in walk_ladder(self.balls, centers, upward, attempt):
-            block.rung[:] = len(self.rungs) - 1 - number
-            blocks.append(block)
-            taken.append(rows)
-        if sum(len(rows) for rows in taken) < len(centers):
-            found = torch.zeros(len(centers), dtype=torch.bool)
-            found[torch.cat([*taken, torch.empty(0, dtype=torch.int64)])] = True
-            raise StencilError(self._complaint(centers[~found]))
-        return Rows.stack(blocks)[torch.cat(taken).argsort()]
-
-    def _complaint(self, centers: Int[Tensor, " B"]) -> str:
-        rung = min(self.rungs)
-        index, count = self.balls(centers[:1], rung.size)
-        needed = num_monomials(self.frames.shape[-1], rung.degree) - 1
-        rank = needed - int(self._weights(centers[:1], index, rung).deficit[0])
-        names = ", ".join(map(str, centers[:8].tolist())) + (", …" if len(centers) > 8 else "")
-        return (
-            f"point {int(centers[0])}: rank {rank} of {needed} at degree {rung.degree} after "
-            f"{len(self.rungs)} sizes, with {int(count[0]) - 1} admissible neighbours nearby; "
-            f"{len(centers)} points have no stencil ({names}) and there are no fallback rows in "
-            f"{self.points.shape[1]} dimensions. Add points there, lower `order`, or pass `normals`"
-        )
+        matrix = self.fallback.rows(centers)
+        rows = matrix_rows(matrix, self.points, self.frames, centers)
+        rows.rung[:] = len(self.rungs)
+        return rows
 
 
 def _failure(weights: Weights, degree: int) -> Int[Tensor, " B"]:
@@ -195,37 +143,47 @@ def _stencil_rows(index: Int[Tensor, "B K"], weights: Weights, degree: int) -> R
     )
 
 
-def _merged_rows(
-    local: Int[Tensor, " E"],
-    col: Int[Tensor, " E"],
-    laplacian: Float[Tensor, " E"],
-    gradient: Float[Tensor, "E d"],
-    radius: Float[Tensor, " B"],
-    rung: int,
+def matrix_rows(
+    matrix: sparse.csr_array,
+    points: Float[Tensor, "N n"],
+    frames: Float[Tensor, "N n d"],
+    centers: Int[Tensor, " B"],
 ) -> Rows:
-    """Fallback rows from entries in any order, those of one place summed."""
-    batch, dim = len(radius), gradient.shape[1]
-    stride = int(col.max()) + 1
-    key, place = torch.unique(local * stride + col, return_inverse=True)
-    row = key // stride
+    """Rows of a given strong-form matrix (B, N), with the least-squares gradient over the points of each row.
+
+    Where those all lie on a line the derivative across it is zero; the second derivatives are not estimated.
+    """
+    crow, col, laplacian = from_scipy(matrix)
+    length = crow.diff()
+    local = torch.arange(len(centers)).repeat_interleave(length)
+    offset = points[col] - points[centers[local]]
+    coords = torch.einsum("en,end->ed", offset, frames[centers[local]])
 
     def summed(values: Tensor) -> Tensor:
-        return values.new_zeros(len(key), *values.shape[1:]).index_add_(0, place, values)
+        return values.new_zeros(len(centers), *values.shape[1:]).index_add_(0, local, values)
 
-    laplacian = summed(laplacian)
-    total = radius.new_zeros(batch).index_add_(0, row, laplacian.abs())
+    square = summed(coords.square().sum(-1))
+    scale = square.clamp_min(torch.finfo(square.dtype).tiny)[:, None, None]
+    moment = summed(coords[:, :, None] * coords[:, None, :]) / scale
+    inverse = torch.linalg.pinv(moment, rtol=1e-9, hermitian=True) / scale
+    gradient = torch.einsum("ecd,ed->ec", inverse[local], coords)
+    on_diagonal = col == centers[local]
+    gradient[on_diagonal] -= summed(gradient)[local[on_diagonal]]
+    total = summed(laplacian.abs())
+    center = summed(laplacian.abs() * on_diagonal)
+    radius = torch.zeros_like(total).index_reduce_(0, local, offset.norm(dim=-1), "amax")
     return Rows(
-        length=torch.bincount(row, minlength=batch),
-        col=key % stride,
+        length=length,
+        col=col,
         laplacian=laplacian,
-        gradient=summed(gradient),
-        hessian=gradient.new_zeros(len(key), dim * (dim + 1) // 2),
-        rung=torch.full((batch,), rung),
-        order=torch.zeros(batch, dtype=torch.int64),
+        gradient=gradient,
+        hessian=gradient.new_zeros(len(col), coords.shape[1] * (coords.shape[1] + 1) // 2),
+        rung=torch.zeros_like(length),
+        order=torch.zeros_like(length),
         growth=radius.square() * total,
-        condition=torch.full_like(radius, torch.nan),
-        dominance=torch.ones_like(radius),
-        reason=torch.zeros(batch, dtype=torch.int64),
+        condition=torch.full_like(total, torch.nan),
+        dominance=(total - center) / center,
+        reason=torch.zeros_like(length),
     )
 
 

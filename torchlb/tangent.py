@@ -34,21 +34,25 @@ MAX_GRADIENT_GROWTH = 15.0
 
 
 def cloud_frames(
-    points: Float[Tensor, "N n"], candidates: Int[Tensor, "N K"], dim: int, rounds: int = 2
+    points: Float[Tensor, "N n"], candidates: Int[Tensor, "N K"], dim: int, rounds: int = 3
 ) -> Float[Tensor, "N n d"]:
-    """Poor frames of a cloud: principal components of the nearest neighbours, decaying with distance.
+    """Poor frames of a cloud: principal components of the nearer half of the candidates, decaying with distance.
 
-    Each further round leaves out the neighbours that the frames before found inadmissible, such as the other side of
-    a thin sheet. Error O(h) on a smooth surface.
+    Each further round takes the nearest that the frames before found admissible, so that the other side of a thin
+    sheet drops out. Error O(h) on a smooth surface.
     """
     offset = points[candidates] - points[:, None]
     distance = offset.norm(dim=-1)
-    weight = window(distance / distance[:, -1:])
-    frames = _principal_directions(offset, weight, dim)
     centers = torch.arange(len(points)).repeat_interleave(candidates.shape[1])
+    good = torch.ones_like(candidates, dtype=torch.bool)
+    half = (candidates.shape[1] + 1) // 2
+    frames = torch.empty(0)
     for _ in range(rounds):
+        near = good & (good.cumsum(1) <= half)
+        reach = (distance * near).amax(1, keepdim=True).clamp_min(torch.finfo(distance.dtype).tiny)
+        weight = window((distance / reach).clamp_max(1.1)) * near
+        frames = _principal_directions(offset, weight, dim)
         good = admissible(points, frames, centers, candidates.reshape(-1)).view(candidates.shape)
-        frames = _principal_directions(offset, weight * good, dim)
     return frames
 
 
@@ -167,9 +171,7 @@ def normals_of_frames(frames: Float[Tensor, "N n d"]) -> Float[Tensor, "N n"]:
     ]
 
 
-def face_normals(
-    vertices: Float[Tensor, "N n"], faces: Int[Tensor, "F n"]
-) -> Float[Tensor, "N n"]:
+def face_normals(vertices: Float[Tensor, "N n"], faces: Int[Tensor, "F n"]) -> Float[Tensor, "N n"]:
     """Area-weighted sum at every vertex of the normals of its faces (segments in R², triangles in R³).
 
     Counter-clockwise triangles point at the viewer, counter-clockwise polygons outward.

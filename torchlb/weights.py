@@ -149,9 +149,7 @@ def least_squares_weights(
     right = functionals / scale[..., None]
     neighbors = root[..., None] * (q @ torch.linalg.solve_triangular(r.mT, right, upper=False))
     weights = torch.cat([-neighbors.sum(1, keepdim=True), neighbors], dim=1)
-    return _finish(
-        weights, values, functionals, radius, torch.linalg.svdvals(r), coords.shape[-1]
-    )
+    return _finish(weights, values, functionals, radius, torch.linalg.svdvals(r), coords.shape[-1])
 
 
 @lru_cache(maxsize=64)
@@ -188,7 +186,7 @@ def positive_weights(coords: Float[Tensor, "B neighbors d"], degree: int) -> Wei
 
 
 def polyharmonic_weights(coords: Float[Tensor, "B neighbors d"], degree: int) -> Weights:
-    r"""Derivatives of the polyharmonic spline :math:`|y|^5` plus polynomials of degree m that interpolates all K points.
+    r"""Derivatives of the interpolant by the spline :math:`|y|^5` plus polynomials of degree m.
 
     Three to ten times smaller errors than least squares on quasi-uniform points, but less robust on random ones
     (`method.md`, section 2). Same arguments and result as `least_squares_weights`; m ≥ 2.

@@ -1,0 +1,171 @@
+"""Input that cannot work is refused here, with the points named and the remedy."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from torchlb.polynomials import num_monomials
+
+__all__ = ["check_faces", "check_normals", "check_options", "check_points", "clean_mesh"]
+
+
+def _some(index: Tensor, limit: int = 8) -> str:
+    """The first few of a list of indices."""
+    names = ", ".join(str(i) for i in index[:limit].tolist())
+    return names + (", …" if len(index) > limit else "")
+
+
+def check_points(points: Any, what: str = "points") -> Float[Tensor, "N n"]:
+    """As (N, n) float64 on the CPU, detached; ValueError for a wrong shape or type, none at all, NaN or infinity."""
+    try:
+        points = torch.as_tensor(points)
+    except (TypeError, ValueError, RuntimeError) as error:
+        raise ValueError(
+            f"{what}: expected an (N, n) tensor or array, got {type(points)}"
+        ) from error
+    if points.ndim != 2:
+        raise ValueError(f"{what}: expected shape (N, n), got {tuple(points.shape)}")
+    if len(points) == 0 or points.shape[1] == 0:
+        raise ValueError(f"{what}: got none (shape {tuple(points.shape)})")
+    if points.is_complex() or points.dtype == torch.bool:
+        raise ValueError(f"{what}: expected real numbers, got {points.dtype}")
+    points = points.detach().to("cpu", torch.float64)
+    bad = (~points.isfinite()).any(1).nonzero()[:, 0]
+    if len(bad):
+        raise ValueError(
+            f"{what}: {len(bad)} are NaN or infinite ({_some(bad)}); remove or repair them"
+        )
+    return points
+
+
+def check_distinct(points: Float[Tensor, "N n"]) -> None:
+    """ValueError that names points which coincide."""
+    _, place, count = torch.unique(points, dim=0, return_inverse=True, return_counts=True)
+    bad = (count[place] > 1).nonzero()[:, 0]
+    if len(bad):
+        first = int(bad[0])
+        twins = (place == place[first]).nonzero()[:, 0]
+        raise ValueError(
+            f"points: {len(bad)} points share a place with another, such as {_some(twins)} "
+            f"(all: {_some(bad)}); remove duplicates, for example with torch.unique(points, dim=0)"
+        )
+
+
+def check_faces(faces: Any, num_points: int) -> Int[Tensor, "F v"]:
+    """As (F, d + 1) int64 on the CPU; ValueError for wrong shapes, types, indices, or unreferenced vertices."""
+    try:
+        faces = torch.as_tensor(np.asarray(faces) if not isinstance(faces, Tensor) else faces)
+    except (TypeError, ValueError, RuntimeError) as error:
+        raise ValueError(f"faces: expected an (F, 3) tensor or array, got {type(faces)}") from error
+    if faces.ndim != 2 or faces.shape[1] not in (2, 3, 4):
+        raise ValueError(
+            f"faces: expected shape (F, 3) (or (F, 2) segments, (F, 4) tetrahedra), got {tuple(faces.shape)}"
+        )
+    if len(faces) == 0:
+        raise ValueError("faces: got none; use LaplaceBeltrami.from_points for a cloud")
+    if faces.is_floating_point() or faces.is_complex() or faces.dtype == torch.bool:
+        raise ValueError(f"faces: expected integers, got {faces.dtype}")
+    faces = faces.detach().to("cpu", torch.int64)
+    bad = ((faces < 0) | (faces >= num_points)).any(1).nonzero()[:, 0]
+    if len(bad):
+        raise ValueError(
+            f"faces: {len(bad)} of them ({_some(bad)}) have indices outside 0 … {num_points - 1}: "
+            f"face {int(bad[0])} is {faces[bad[0]].tolist()}"
+        )
+    used = torch.zeros(num_points, dtype=torch.bool)
+    used[_proper(faces).reshape(-1)] = True
+    lost = (~used).nonzero()[:, 0]
+    if len(lost):
+        raise ValueError(
+            f"faces: {len(lost)} vertices ({_some(lost)}) belong to no face with distinct corners; drop them with "
+            "vertices, faces, kept = torchlb.clean_mesh(vertices, faces)"
+        )
+    return _proper(faces)
+
+
+def _proper(faces: Int[Tensor, "F v"]) -> Int[Tensor, "G v"]:
+    """The faces whose corners are distinct; one that repeats a corner covers nothing."""
+    ordered = faces.sort(dim=1).values
+    return faces[(ordered[:, 1:] != ordered[:, :-1]).all(1)]
+
+
+def clean_mesh(vertices: Tensor, faces: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Mesh without unreferenced vertices and without faces that repeat a corner.
+
+    Parameters
+    ----------
+    vertices : (N, n).
+    faces : (F, 3) indices.
+
+    Returns
+    -------
+    vertices : (N', n), those in use, in their order.
+    faces : (F', 3), renumbered.
+    kept : (N',), their indices in the input: `values[kept]` carries data over.
+
+    >>> vertices, faces, kept = clean_mesh(torch.eye(4), torch.tensor([[0, 1, 3], [0, 0, 1]]))
+    >>> faces.tolist(), kept.tolist()
+    ([[0, 1, 2]], [0, 1, 3])
+    """
+    vertices, faces = torch.as_tensor(vertices), torch.as_tensor(faces)
+    faces = _proper(faces)
+    kept, renumbered = torch.unique(faces, return_inverse=True)
+    return vertices[kept.long()], renumbered.to(faces.dtype), kept
+
+
+def check_normals(normals: Any, points: Float[Tensor, "N n"]) -> Float[Tensor, "N n"]:
+    """Unit normals of the shape of `points`; ValueError for wrong shapes, NaN or zero vectors."""
+    normals = check_points(normals, "normals")
+    if normals.shape != points.shape:
+        raise ValueError(
+            f"normals: expected the shape of points {tuple(points.shape)}, got {tuple(normals.shape)}"
+        )
+    length = normals.norm(dim=1)
+    bad = (length == 0).nonzero()[:, 0]
+    if len(bad):
+        raise ValueError(
+            f"normals: {len(bad)} are zero ({_some(bad)}); leave `normals` out to have them estimated"
+        )
+    return normals / length[:, None]
+
+
+def check_options(
+    num_points: int,
+    ambient_dim: int,
+    dim: int,
+    order: int,
+    normal_order: int,
+    num_neighbors: int | None,
+    **choices: tuple[str, list[str]],
+) -> None:
+    """ValueError for options out of range, and for fewer points than one stencil has polynomials."""
+    for name, (value, allowed) in choices.items():
+        if value not in allowed:
+            raise ValueError(f"{name}: expected one of {allowed}, got {value!r}")
+    if not 1 <= dim <= ambient_dim:
+        raise ValueError(
+            f"dim: expected 1 … {ambient_dim} for points in R^{ambient_dim}, got {dim}"
+        )
+    if order < 1:
+        raise ValueError(f"order: expected an integer ≥ 1, got {order}")
+    if normal_order < 0:
+        raise ValueError(
+            f"normal_order: expected an integer ≥ 1, or 0 to keep the poor frames, got {normal_order}"
+        )
+    needed = num_monomials(dim, order + 1)
+    if num_neighbors is not None and num_neighbors < needed:
+        raise ValueError(
+            f"num_neighbors: order {order} in {dim} dimensions has {needed} polynomials and needs at least as many "
+            f"neighbours (1.6 times as many, {-(-16 * needed // 10)}, is the default); got {num_neighbors}"
+        )
+    if num_points < needed:
+        fits = [p for p in range(1, order) if num_monomials(dim, p + 1) <= num_points]
+        remedy = f"lower `order` to {max(fits)}" if fits else "add points"
+        raise ValueError(
+            f"{num_points} points are fewer than the {needed} that a stencil of order {order} needs; {remedy}"
+        )

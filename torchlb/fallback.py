@@ -1,0 +1,117 @@
+"""Rows of last resort, for points where no stencil passes: positive weights, stable, and first order at best.
+
+On a triangle mesh they are robust_laplacian's. On a cloud they are finite volumes of the Voronoi cell in the tangent
+plane, built from admissible neighbours alone; only where a sharp rim leaves a surface of R³ without a tangent plane,
+and robust_laplacian's own row stays on this side of every gap, that row is better and is taken.
+"""
+
+from __future__ import annotations
+
+from functools import cached_property
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Int
+from scipy import sparse
+from torch import Tensor
+
+from torchlb.cotangent import robust_rows
+from torchlb.neighbors import GraphBalls, nearest_neighbors
+from torchlb.voronoi import cell_laplacian, cell_volume
+
+__all__ = ["CloudFallback", "MeshFallback"]
+
+MAX_HOPS = 3
+"""Neighbours of a row of robust_laplacian farther than this along the graph lie across a gap."""
+
+
+class MeshFallback:
+    """Rows and areas of robust_laplacian on a triangle mesh."""
+
+    def __init__(self, vertices: Float[Tensor, "N n"], faces: Int[Tensor, "F 3"]) -> None:
+        self._matrix, self._areas = robust_rows(vertices, faces)
+
+    def areas(self) -> Float[Tensor, " N"]:
+        """A third of the triangles around each vertex, ℓ²."""
+        return self._areas
+
+    def rows(self, centers: Int[Tensor, " B"]) -> sparse.csr_array:
+        """Rows (B, N) of Δ, 1/ℓ²."""
+        return sparse.csr_array(self._matrix[centers.numpy()])
+
+
+class CloudFallback:
+    """Finite-volume rows and cell volumes of a cloud in any dimension.
+
+    Parameters
+    ----------
+    balls : admissible neighbourhoods.
+    surface : whether robust_laplacian can be asked (a surface in R² or R³).
+    """
+
+    def __init__(self, balls: GraphBalls, surface: bool) -> None:
+        self.balls, self.surface = balls, surface
+        dim = balls.frames.shape[-1]
+        self.size = min(6 * 2**dim + 1, len(balls.points))
+        self.few = min(4 * dim + 1, len(balls.points))
+
+    def areas(self) -> Float[Tensor, " N"]:
+        """Volumes of the Voronoi cells, ℓ^d: second order in the spacing."""
+        everything = torch.arange(len(self.balls.points))
+        return torch.cat([cell_volume(*self._cells(c)[1:]) for c in everything.split(4096)])
+
+    def rows(self, centers: Int[Tensor, " B"]) -> sparse.csr_array:
+        """Rows (B, N) of Δ, 1/ℓ²."""
+        index, coords, valid = self._cells(centers)
+        flux = cell_laplacian(coords, valid)
+        weights = torch.cat([-flux.sum(1, keepdim=True), flux], dim=1)
+        row = np.arange(len(centers)).repeat(index.shape[1])
+        shape = (len(centers), len(self.balls.points))
+        cells = sparse.csr_array((weights.flatten(), (row, index.flatten())), shape=shape)
+        cells.sum_duplicates()
+        if not self.surface or len(self.balls.points) < 4:
+            return cells
+        matrix, reachable = self._robust
+        robust = sparse.csr_array(matrix[centers.numpy()])
+        near = robust.astype(bool).multiply(reachable[centers.numpy()])
+        clean = near.sum(axis=1) == robust.astype(bool).sum(axis=1)
+        chosen = sparse.diags_array(clean.astype(float))
+        return sparse.csr_array(chosen @ robust + cells - chosen @ cells)
+
+    def _cells(
+        self, centers: Int[Tensor, " B"]
+    ) -> tuple[Int[Tensor, "B K"], Float[Tensor, "B neighbors d"], Bool[Tensor, "B neighbors"]]:
+        """Neighbours, their coordinates, and which are real.
+
+        A point with hardly an admissible neighbour takes the nearest points, whatever they are.
+        """
+        points, frames = self.balls.points, self.balls.frames
+        index, count = self.balls(centers, self.size)
+        lonely = count <= 2 * frames.shape[-1]
+        if lonely.any():
+            index[lonely, : self.few] = self._nearest[centers[lonely]]
+            count[lonely] = self.few
+        offset = points[index[:, 1:]] - points[centers, None]
+        coords = offset @ frames[centers]
+        # Unrolled to their true distance, so that neighbours above one another do not collapse.
+        length = coords.norm(dim=-1, keepdim=True).clamp_min(torch.finfo(coords.dtype).tiny)
+        coords = coords * (offset.norm(dim=-1, keepdim=True) / length)
+        return index, coords, torch.arange(1, self.size) < count[:, None]
+
+    @cached_property
+    def _nearest(self) -> Int[Tensor, "N few"]:
+        return nearest_neighbors(self.balls.points, self.few)
+
+    @cached_property
+    def _robust(self) -> tuple[sparse.csr_array, sparse.csr_array]:
+        """Rows of robust_laplacian, and who can be reached in a few hops between close or admissible neighbours."""
+        points = self.balls.points
+        close = self._nearest[:, : self.balls.frames.shape[-1] + 1]
+        row = np.arange(len(points)).repeat(close.shape[1])
+        ones = np.ones(len(row), dtype=bool)
+        step = sparse.csr_array((ones, (row, close.flatten().numpy())), self.balls.graph.shape)
+        step = step + step.T + self.balls.graph.astype(bool)
+        reach = step
+        for _ in range(MAX_HOPS - 1):
+            reach = reach @ step
+        return robust_rows(points, None)[0], reach
