@@ -98,6 +98,13 @@ class Ladder:
         matrix = self.fallback.rows(centers)
         rows = matrix_rows(matrix, self.points, self.frames, centers)
         rows.rung[:] = len(self.rungs)
+        bad = centers[~rows.dominance.isfinite()]
+        if len(bad):
+            names = ", ".join(map(str, bad[:8].tolist())) + (", …" if len(bad) > 8 else "")
+            raise StencilError(
+                f"{len(bad)} points have neither a stencil after {len(self.rungs)} tries nor a fallback row: {names}. "
+                "Nothing admissible lies around them; remove them, or merge them with their neighbours"
+            )
         return rows
 
 
@@ -171,7 +178,7 @@ def matrix_rows(
     gradient[on_diagonal] -= summed(gradient)[local[on_diagonal]]
     total = summed(laplacian.abs())
     center = summed(laplacian.abs() * on_diagonal)
-    radius = torch.zeros_like(total).index_reduce_(0, local, offset.norm(dim=-1), "amax")
+    radius = torch.zeros_like(total).scatter_reduce_(0, local, offset.norm(dim=-1), "amax")
     return Rows(
         length=length,
         col=col,
