@@ -5,10 +5,19 @@ sparse operator (`stencil`), stored in a module (`laplace_beltrami`). `surfaces`
 """
 
 from torchlb import surfaces
+from torchlb.certificate import Certificate, StabilityWarning
 from torchlb.checks import clean_mesh
 from torchlb.laplace_beltrami import LaplaceBeltrami
 from torchlb.report import StencilReport
 from torchlb.stencil import StencilError
 
-__all__ = ["LaplaceBeltrami", "StencilError", "StencilReport", "clean_mesh", "surfaces"]
+__all__ = [
+    "Certificate",
+    "LaplaceBeltrami",
+    "StabilityWarning",
+    "StencilError",
+    "StencilReport",
+    "clean_mesh",
+    "surfaces",
+]
 __version__ = "0.1.0"

@@ -166,31 +166,25 @@ def certify(
     """
     count = len(areas)
     first = rows.rung.clone()
-    bottom = len(ladder.rungs)
     steps = torch.zeros(count, dtype=torch.int64)
+    rounds = 0
     with tqdm(desc="certificate", delay=2, disable=not progress, leave=False) as bar:
-        for rounds in range(MAX_ROUNDS + 1):
+        while True:
             matrix = to_scipy(rows.crow, rows.col, rows.laplacian, (count, count))
             stepped = int((rows.rung > first).sum())
             mass, result, feed = check_certificate(matrix, areas, rounds, stepped)
-            bar.set_postfix_str(f"min π {result.min_pi:.2g}, {stepped} rows stepped down")
+            bar.set_postfix_str(f"min π {result.min_pi:.2g}, {stepped} rows down", refresh=False)
             bar.update()
             blamed = _responsible(matrix, mass / areas, feed)
-            movable = blamed[rows.rung[blamed] < bottom]
-            if rounds == MAX_ROUNDS or (result.holds and not _worth_it(mass / areas, movable)):
+            movable = blamed[rows.rung[blamed] < len(ladder.rungs)]
+            if len(movable) == 0 or rounds == MAX_ROUNDS:
                 break
-            if len(movable) == 0:
-                break
+            rounds += 1
             steps[movable] += 1
             rows = _step_down(ladder, rows, movable, steps[movable], first)
     if not result.holds:
         _warn(result, mass / areas, feed)
     return rows, mass, result
-
-
-def _worth_it(density: Float[Tensor, " N"], movable: Int[Tensor, " J"]) -> bool:
-    """Whether π is so small somewhere that rows should still step down although the certificate holds."""
-    return bool(len(movable)) and bool((density <= MARGIN).any())
 
 
 def _responsible(
@@ -214,9 +208,7 @@ def _responsible(
     return blamed.nonzero()[:, 0]
 
 
-def _step_down(
-    ladder: Ladder, rows: Rows, movable: Tensor, steps: Tensor, first: Tensor
-) -> Rows:
+def _step_down(ladder: Ladder, rows: Rows, movable: Tensor, steps: Tensor, first: Tensor) -> Rows:
     """Rebuild the given rows one rung lower, twice as many the next time, so that the bottom is near."""
     start = torch.maximum(rows.rung[movable] + 1, first[movable] + 2 ** (steps - 1))
     start = start.clamp_max(len(ladder.rungs))

@@ -6,12 +6,20 @@ from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from torchlb.polynomials import num_monomials
 
-__all__ = ["check_faces", "check_normals", "check_options", "check_points", "clean_mesh"]
+__all__ = [
+    "check_boundary",
+    "check_distinct",
+    "check_faces",
+    "check_normals",
+    "check_options",
+    "check_points",
+    "clean_mesh",
+]
 
 
 def _some(index: Tensor, limit: int = 8) -> str:
@@ -132,6 +140,22 @@ def check_normals(normals: Any, points: Float[Tensor, "N n"]) -> Float[Tensor, "
             f"normals: {len(bad)} are zero ({_some(bad)}); leave `normals` out to have them estimated"
         )
     return normals / length[:, None]
+
+
+def check_boundary(boundary: Any, num_points: int) -> Bool[Tensor, " N"] | str | None:
+    """A mask of all points, "detect" or None; ValueError for anything else."""
+    if boundary is None or (isinstance(boundary, str) and boundary == "detect"):
+        return boundary
+    if isinstance(boundary, str):
+        raise ValueError(
+            f"boundary: expected a mask of the points, 'detect' or None, got {boundary!r}"
+        )
+    mask = torch.as_tensor(boundary).detach().cpu()
+    if mask.dtype != torch.bool or mask.shape != (num_points,):
+        raise ValueError(
+            f"boundary: expected a boolean mask of shape ({num_points},), got {mask.dtype} of shape {tuple(mask.shape)}"
+        )
+    return mask
 
 
 def check_options(

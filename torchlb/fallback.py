@@ -15,6 +15,7 @@ from jaxtyping import Bool, Float, Int
 from scipy import sparse
 from torch import Tensor
 
+from torchlb.boundary import Boundary
 from torchlb.cotangent import robust_rows
 from torchlb.neighbors import GraphBalls, nearest_neighbors
 from torchlb.voronoi import cell_laplacian, cell_volume
@@ -46,19 +47,27 @@ class CloudFallback:
     Parameters
     ----------
     balls : admissible neighbourhoods.
+    boundary : where cells end.
     surface : whether robust_laplacian can be asked (a surface in R² or R³).
     """
 
-    def __init__(self, balls: GraphBalls, surface: bool) -> None:
-        self.balls, self.surface = balls, surface
+    def __init__(self, balls: GraphBalls, boundary: Boundary | None, surface: bool) -> None:
+        self.balls, self.boundary, self.surface = balls, boundary, surface
         dim = balls.frames.shape[-1]
         self.size = min(6 * 2**dim + 1, len(balls.points))
         self.few = min(4 * dim + 1, len(balls.points))
 
     def areas(self) -> Float[Tensor, " N"]:
         """Volumes of the Voronoi cells, ℓ^d: second order in the spacing."""
-        everything = torch.arange(len(self.balls.points))
-        return torch.cat([cell_volume(*self._cells(c)[1:]) for c in everything.split(4096)])
+        volumes = []
+        for centers in torch.arange(len(self.balls.points)).split(4096):
+            _, coords, valid = self._cells(centers)
+            outward = torch.zeros_like(coords[:, 0])
+            if self.boundary is not None:
+                conormals = self.boundary.conormals[centers, None]
+                outward = (conormals @ self.balls.frames[centers])[:, 0]
+            volumes.append(cell_volume(coords, valid, outward))
+        return torch.cat(volumes)
 
     def rows(self, centers: Int[Tensor, " B"]) -> sparse.csr_array:
         """Rows (B, N) of Δ, 1/ℓ²."""

@@ -5,11 +5,12 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from scipy import sparse
 from torch import Tensor
 from tqdm import tqdm
 
+from torchlb.boundary import Boundary, boundary_of_cloud, boundary_of_mesh, detect_boundary
 from torchlb.fallback import CloudFallback, MeshFallback
 from torchlb.ladder import chunks, ladder_rungs
 from torchlb.neighbors import (
@@ -47,6 +48,7 @@ class Geometry:
     graph : (N, N) adjacency whose balls are the neighbourhoods.
     areas : (N,), ℓ^d, positive: a first-order share of the area.
     fallback : M-matrix rows for points without a stencil.
+    boundary : its points and conormals; None for a closed shape, or where it is to be ignored.
     """
 
     points: Float[Tensor, "N n"]
@@ -56,6 +58,7 @@ class Geometry:
     graph: sparse.csr_array
     areas: Float[Tensor, " N"]
     fallback: CloudFallback | MeshFallback
+    boundary: Boundary | None
 
 
 def cloud_geometry(
@@ -65,9 +68,13 @@ def cloud_geometry(
     *,
     num_neighbors: int | None = None,
     normals: Float[Tensor, "N n"] | None = None,
+    boundary: Bool[Tensor, " N"] | str | None = None,
     progress: bool = True,
 ) -> Geometry:
-    """Geometry of a point cloud: graph and frames from the nearest neighbours."""
+    """Geometry of a point cloud: graph and frames from the nearest neighbours.
+
+    `boundary` is the mask of its boundary points, or "detect".
+    """
     candidates = nearest_neighbors(points, min(CANDIDATES.get(dim, 128), len(points)))
     poor = cloud_frames(points, candidates, dim) if normals is None else complete_frames(normals)
     graph = nearest_graph(points, poor, candidates)
@@ -76,8 +83,10 @@ def cloud_geometry(
     if reference is None and dim == points.shape[1] - 1:
         reference = orient_by_graph(points, normals_of_frames(frames), graph)
     balls = GraphBalls(points, graph, frames)
-    fallback = CloudFallback(balls, surface=dim == 2 and points.shape[1] <= 3)
-    return _oriented(points, frames, reference, order, graph, fallback)
+    mask = detect_boundary(points, frames, balls) if isinstance(boundary, str) else boundary
+    rim = None if mask is None else boundary_of_cloud(points, mask, frames, normal_order)
+    fallback = CloudFallback(balls, rim, surface=dim == 2 and points.shape[1] <= 3)
+    return _oriented(points, frames, reference, order, graph, fallback, rim)
 
 
 def mesh_geometry(
@@ -86,19 +95,24 @@ def mesh_geometry(
     normal_order: int,
     *,
     num_neighbors: int | None = None,
+    boundary: bool = True,
     progress: bool = True,
 ) -> Geometry:
-    """Geometry of a mesh of triangles (or of segments, or tetrahedra in Rⁿ): graph and frames from the faces."""
+    """Geometry of a mesh of triangles (or of segments, or tetrahedra in Rⁿ): graph and frames from the faces.
+
+    Its boundary is found unless `boundary` is False.
+    """
     poor = mesh_frames(vertices, faces)
     graph = mesh_graph(faces, len(vertices))
     frames, order = _refined(vertices, poor, graph, normal_order, num_neighbors, progress)
     hypersurface = faces.shape[1] == vertices.shape[1]
     reference = face_normals(vertices, faces) if hypersurface else None
+    rim = boundary_of_mesh(vertices, faces, frames, normal_order) if boundary else None
     if faces.shape[1] == 3 and vertices.shape[1] <= 3:
         fallback = MeshFallback(vertices, faces)
     else:
-        fallback = CloudFallback(GraphBalls(vertices, graph, frames), surface=False)
-    return _oriented(vertices, frames, reference, order, graph, fallback)
+        fallback = CloudFallback(GraphBalls(vertices, graph, frames), rim, surface=False)
+    return _oriented(vertices, frames, reference, order, graph, fallback, rim)
 
 
 def _refined(
@@ -129,6 +143,7 @@ def _oriented(
     order: Tensor,
     graph: sparse.csr_array,
     fallback: CloudFallback | MeshFallback,
+    boundary: Boundary | None,
 ) -> Geometry:
     """Turn normals to the side of `reference`, and frames so that [frames, normal] is right-handed."""
     normals = None
@@ -140,4 +155,5 @@ def _oriented(
             frames = torch.where(
                 flip[:, None, None], torch.cat([-frames[..., :1], frames[..., 1:]], -1), frames
             )
-    return Geometry(points, frames, normals, order, graph, fallback.areas(), fallback)
+    areas = fallback.areas()
+    return Geometry(points, frames, normals, order, graph, areas, fallback, boundary)

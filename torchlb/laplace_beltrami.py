@@ -9,7 +9,9 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
+from torchlb.certificate import Certificate, certify
 from torchlb.checks import (
+    check_boundary,
     check_distinct,
     check_faces,
     check_normals,
@@ -77,7 +79,8 @@ class LaplaceBeltrami(nn.Module):
     ----------
     crow, col, values : the matrix of Δ in CSR; values in 1/ℓ², where ℓ is the unit of the points.
     gradient_values : (d, nnz), 1/ℓ: tangential derivatives in the frame of each row's point, on the same pattern.
-    mass : (N,), ℓ^d: positive quadrature weights that sum to the area.
+    mass : (N,), ℓ^d: positive quadrature weights that sum to the area; π of the certificate.
+    certificate : what is proved of the stability of Δ; None where it was not asked for, and for the cotangent.
     points : (N, n), ℓ.  frames : (N, n, d), orthonormal tangent vectors.
     normals : (N, n), unit normals of a hypersurface, empty (0, n) otherwise.
 
@@ -103,6 +106,7 @@ class LaplaceBeltrami(nn.Module):
         super().__init__()
         self.kind = "empty"
         self.options: dict[str, Any] = {}
+        self.certificate: Certificate | None = None
         for name in BUFFERS:
             self.register_buffer(name, torch.zeros(0))
         self.crow, self.col = torch.zeros(1, dtype=torch.int64), torch.zeros(0, dtype=torch.int64)
@@ -123,6 +127,8 @@ class LaplaceBeltrami(nn.Module):
         weights: str = "least_squares",
         num_neighbors: int | None = None,
         normals: Any = None,
+        boundary: Any = None,
+        certify: bool = True,
         progress: bool = True,
     ) -> LaplaceBeltrami:
         """Operator on a point cloud.
@@ -138,6 +144,10 @@ class LaplaceBeltrami(nn.Module):
         weights : "least_squares" (robust) or "polyharmonic" (more accurate on evenly spread points).
         num_neighbors : size K of every stencil, itself included, instead of the sizes of the ladder.
         normals : (N, n), if known (d = n − 1): the first guess of the tangent frames, and their orientation.
+        boundary : (N,) mask of the points on the boundary, or "detect" (surfaces), for the Neumann condition ∂_ν f = 0
+            there; None for a closed shape, or to do without a condition.
+        certify : whether rows step down until the certificate of stability holds, whose π is then the mass. Without
+            it the operator is the raw one, which may blow up under diffusion, and the mass is that of Voronoi cells.
         progress : whether to show a bar on what takes longer than two seconds.
 
         Raises
@@ -159,9 +169,15 @@ class LaplaceBeltrami(nn.Module):
                 )
             normals = check_normals(normals, points)
         geometry = cloud_geometry(
-            points, d, options.q, num_neighbors=num_neighbors, normals=normals, progress=progress
+            points,
+            d,
+            options.q,
+            num_neighbors=num_neighbors,
+            normals=normals,
+            boundary=check_boundary(boundary, len(points)),
+            progress=progress,
         )
-        return cls._from_geometry(geometry, "points", options, progress)._cast_like(given)
+        return cls._from_geometry(geometry, "points", options, certify, progress)._cast_like(given)
 
     @classmethod
     def from_mesh(
@@ -174,6 +190,8 @@ class LaplaceBeltrami(nn.Module):
         projection: str = "tangent",
         weights: str = "least_squares",
         num_neighbors: int | None = None,
+        boundary: str | None = "neumann",
+        certify: bool = True,
         progress: bool = True,
     ) -> LaplaceBeltrami:
         """Operator on the vertices of a mesh; its faces say who is whose neighbour and give the first normals.
@@ -183,7 +201,8 @@ class LaplaceBeltrami(nn.Module):
         vertices : (N, n) tensor or array, length ℓ.
         faces : (F, 3) indices. Any triangle mesh: several components, non-manifold edges, zero-area triangles.
             Also (F, 2) polylines and (F, 4) tetrahedra, for manifolds of dimension 1 and 3.
-        order, normal_order, projection, weights, num_neighbors, progress : as for `from_points`.
+        boundary : "neumann" for ∂_ν f = 0 on the boundary that the faces have, if any; None to do without a condition.
+        order, normal_order, projection, weights, num_neighbors, certify, progress : as for `from_points`.
 
         Raises
         ------
@@ -194,10 +213,17 @@ class LaplaceBeltrami(nn.Module):
         faces = check_faces(faces, len(vertices))
         options = _Options(order, normal_order, projection, weights, num_neighbors)
         options.check(len(vertices), vertices.shape[1], faces.shape[1] - 1)
+        if boundary not in ("neumann", None):
+            raise ValueError(f"boundary: expected 'neumann' or None, got {boundary!r}")
         geometry = mesh_geometry(
-            vertices, faces, options.q, num_neighbors=num_neighbors, progress=progress
+            vertices,
+            faces,
+            options.q,
+            num_neighbors=num_neighbors,
+            boundary=boundary is not None,
+            progress=progress,
         )
-        return cls._from_geometry(geometry, "mesh", options, progress)._cast_like(given)
+        return cls._from_geometry(geometry, "mesh", options, certify, progress)._cast_like(given)
 
     @classmethod
     def from_cotangent(cls, vertices: Any, faces: Any) -> LaplaceBeltrami:
@@ -227,7 +253,7 @@ class LaplaceBeltrami(nn.Module):
 
     @classmethod
     def _from_geometry(
-        cls, geometry: Geometry, kind: str, options: _Options, progress: bool
+        cls, geometry: Geometry, kind: str, options: _Options, certified: bool, progress: bool
     ) -> LaplaceBeltrami:
         ladder = Ladder(
             geometry,
@@ -237,7 +263,12 @@ class LaplaceBeltrami(nn.Module):
             num_neighbors=options.num_neighbors,
         )
         rows = build_stencil(ladder, progress=progress)
-        return cls._assembled(rows, geometry, kind, asdict(options))
+        if not certified:
+            return cls._assembled(rows, geometry, kind, {**asdict(options), "certify": False})
+        rows, mass, certificate = certify(ladder, rows, geometry.areas, progress=progress)
+        lb = cls._assembled(rows, replace(geometry, areas=mass), kind, asdict(options))
+        lb.certificate = certificate
+        return lb
 
     @classmethod
     def _assembled(
@@ -355,16 +386,21 @@ class LaplaceBeltrami(nn.Module):
         if self.kind == "empty":
             return "empty"
         size = f"{self.num_points} points, dim={self.dim} in R^{self.points.shape[1]}, from {self.kind}"
-        options = [f"{name}={value!r}" for name, value in self.options.items()]
-        return ", ".join([size, *options, f"{self.col.shape[0]} entries", str(self.values.dtype)])
+        options = [f"{k}={v!r}" for k, v in self.options.items() if v is not None]
+        certified = "" if self.certificate is None or self.certificate.holds else "NOT STABLE"
+        last = [f"{self.col.shape[0]} entries", str(self.values.dtype), certified]
+        return ", ".join(part for part in [size, *options, *last] if part)
 
     def get_extra_state(self) -> dict[str, Any]:
-        """Kind and options, plain types only."""
-        return {"kind": self.kind, "options": self.options}
+        """Kind, options and certificate, plain types only."""
+        certificate = None if self.certificate is None else asdict(self.certificate)
+        return {"kind": self.kind, "options": self.options, "certificate": certificate}
 
     def set_extra_state(self, state: dict[str, Any]) -> None:
         """Inverse of `get_extra_state`."""
         self.kind, self.options = state["kind"], dict(state["options"])
+        found = state["certificate"]
+        self.certificate = None if found is None else Certificate(**found)
 
     def _load_from_state_dict(
         self,

@@ -21,6 +21,7 @@ __all__ = [
     "gradient_functional",
     "hessian_functional",
     "laplacian_functional",
+    "monomial_derivatives",
     "monomials",
     "num_monomials",
 ]

@@ -21,12 +21,20 @@ from torchlb.neighbors import GraphBalls
 from torchlb.rows import Rows
 from torchlb.sparse import from_scipy
 from torchlb.tangent import local_offsets
-from torchlb.weights import WEIGHT_RULES, Weights, typical_growth
+from torchlb.weights import (
+    WEIGHT_RULES,
+    Weights,
+    least_squares_weights,
+    positive_weights,
+    typical_growth,
+)
 
 __all__ = ["Ladder", "StencilError", "build_stencil", "matrix_rows"]
 
 MAX_DOMINANCE = 3.0
 MAX_GROWTH = 3.0
+MAX_GROWTH_AT_BOUNDARY = 12.0
+"""One-sided stencils have larger weights; there dominance decides."""
 MAX_RESIDUAL = 1e-10
 
 
@@ -55,7 +63,7 @@ class Ladder:
         num_neighbors: int | None = None,
     ) -> None:
         self.points, self.frames = geometry.points, geometry.frames
-        self.fallback = geometry.fallback
+        self.fallback, self.boundary = geometry.fallback, geometry.boundary
         self.balls = GraphBalls(geometry.points, geometry.graph, geometry.frames)
         self.projection = projection
         dim = self.frames.shape[-1]
@@ -73,7 +81,7 @@ class Ladder:
 
         def attempt(rows: Tensor, index: Tensor, rung: Rung) -> tuple[Tensor, Rows]:
             weights = self._weights(rows, index, rung)
-            failure = _failure(weights, rung.degree)
+            failure = _failure(weights, self._growth_limit(index, rung.degree))
             if rung.degree == top and rung.rule != "positive":
                 reason[place[rows]] = failure
             return failure == 0, _stencil_rows(index, weights, rung.degree)
@@ -91,8 +99,40 @@ class Ladder:
         return replace(rows, reason=torch.where(rows.order < top - 1, reason, rows.reason))
 
     def _weights(self, centers: Tensor, index: Tensor, rung: Rung) -> Weights:
-        coords = local_offsets(self.points, self.frames, centers, index[:, 1:], self.projection)
-        return WEIGHT_RULES[rung.rule](coords, rung.degree)
+        """Weights of a batch; stencils that hold boundary points use the Neumann data there."""
+        touching = torch.zeros(len(centers), dtype=torch.bool)
+        if self.boundary is not None:
+            touching = self.boundary.mask[index].any(1)
+        parts = []
+        if not touching.all():
+            own, around = centers[~touching], index[~touching]
+            coords = local_offsets(self.points, self.frames, own, around[:, 1:], self.projection)
+            parts.append(WEIGHT_RULES[rung.rule](coords, rung.degree))
+        if touching.any():
+            parts.append(self._neumann_weights(centers[touching], index[touching], rung))
+        order = torch.cat([(~touching).nonzero()[:, 0], touching.nonzero()[:, 0]]).argsort()
+        return Weights.stack(parts)[order]
+
+    def _growth_limit(self, index: Tensor, degree: int) -> Float[Tensor, " B"]:
+        factor = torch.full((len(index),), MAX_GROWTH, dtype=self.points.dtype)
+        if self.boundary is not None:
+            factor[self.boundary.mask[index].any(1)] = MAX_GROWTH_AT_BOUNDARY
+        return factor * typical_growth(self.frames.shape[-1], degree)
+
+    def _neumann_weights(self, centers: Tensor, index: Tensor, rung: Rung) -> Weights:
+        """Second derivatives that use ∂_ν f = 0; first derivatives that do not, since they serve any f.
+
+        By straight projection, where the derivative along a conormal is its component in the plane. Splines have no
+        such form; least squares stands in for them.
+        """
+        assert self.boundary is not None
+        coords = local_offsets(self.points, self.frames, centers, index[:, 1:], "tangent")
+        flux = self.boundary.conormals[index] @ self.frames[centers]
+        rule = positive_weights if rung.rule == "positive" else least_squares_weights
+        weights = rule(coords, rung.degree, flux=flux)
+        free = least_squares_weights(coords, rung.degree)
+        usable = (free.residual <= MAX_RESIDUAL)[:, None, None]
+        return replace(weights, gradient=torch.where(usable, free.gradient, weights.gradient))
 
     def _fallback_rows(self, centers: Int[Tensor, " B"]) -> Rows:
         matrix = self.fallback.rows(centers)
@@ -108,18 +148,17 @@ class Ladder:
         return rows
 
 
-def _failure(weights: Weights, degree: int) -> Int[Tensor, " B"]:
+def _failure(weights: Weights, max_growth: Float[Tensor, " B"]) -> Int[Tensor, " B"]:
     """Which of the local tests a stencil fails first, as an index into `REASONS`; 0 if none."""
     laplacian = weights.laplacian
     center, others = laplacian[:, 0], laplacian[:, 1:].abs().sum(1)
-    typical = typical_growth(weights.gradient.shape[-1], degree)
     failure = torch.zeros(len(center), dtype=torch.int64)
     for code, passed in (
         (2, weights.deficit == 0),
         (3, weights.residual <= MAX_RESIDUAL),  # false for NaN
         (4, center < 0),
         (5, others <= MAX_DOMINANCE * center.abs()),
-        (6, weights.radius.square() * (others + center.abs()) <= MAX_GROWTH * typical),
+        (6, weights.radius.square() * (others + center.abs()) <= max_growth),
     ):
         failure = torch.where((failure == 0) & ~passed, code, failure)
     return failure

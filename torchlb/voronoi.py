@@ -13,7 +13,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-__all__ = ["cell_laplacian", "cell_volume", "natural_neighbors"]
+__all__ = ["cell_laplacian", "cell_volume", "largest_gap", "natural_neighbors"]
 
 
 def unit_directions(dim: int) -> Float[Tensor, "u d"]:
@@ -52,10 +52,15 @@ def natural_neighbors(
     return natural & valid
 
 
-def cell_volume(coords: Float[Tensor, "B K d"], valid: Bool[Tensor, "B K"]) -> Float[Tensor, " B"]:
+def cell_volume(
+    coords: Float[Tensor, "B K d"],
+    valid: Bool[Tensor, "B K"],
+    outward: Float[Tensor, "B d"] | None = None,
+) -> Float[Tensor, " B"]:
     """Volume of the cell, ℓ^d: that of the unit ball times the mean of r^d.
 
-    Where the cell is open (at a boundary) it ends half-way to the farthest valid neighbour.
+    At a boundary point, with its conormal `outward` (zero elsewhere), only the inner half counts. Where a cell is open
+    otherwise it ends half-way to the farthest valid neighbour.
 
     >>> corners = torch.tensor([[[1.0, 0.0], [0.0, 1.0], [-1.0, 0.0], [0.0, -1.0]]])
     >>> cell_volume(corners, torch.ones(1, 4, dtype=torch.bool)).round(decimals=2).tolist()
@@ -65,8 +70,11 @@ def cell_volume(coords: Float[Tensor, "B K d"], valid: Bool[Tensor, "B K"]) -> F
     distance = coords.norm(dim=-1).masked_fill(~valid, 0).amax(1)
     farthest = distance.clamp_min(torch.finfo(coords.dtype).tiny)
     inverse = _inverse_radius(coords, valid).amax(1).maximum(2 / farthest[:, None])
+    volume = inverse.pow(-dim)
+    if outward is not None:
+        volume = volume * (outward @ unit_directions(dim).to(coords).T <= 0)
     unit_ball = pi ** (dim / 2) / gamma(dim / 2 + 1)
-    return unit_ball * inverse.pow(-dim).mean(1)
+    return unit_ball * volume.mean(1)
 
 
 def cell_laplacian(
@@ -90,6 +98,20 @@ def cell_laplacian(
     share = torch.zeros_like(square).scatter_add_(1, first, part)
     total = part.sum(1, keepdim=True).clamp_min(torch.finfo(coords.dtype).tiny)
     return 2 * dim * (share / total) / square.clamp_min(torch.finfo(coords.dtype).tiny)
+
+
+def largest_gap(coords: Float[Tensor, "B K 2"], valid: Bool[Tensor, "B K"]) -> Float[Tensor, " B"]:
+    """Largest angle between neighbours that follow each other around the point, in radians.
+
+    >>> corner = torch.tensor([[[1.0, 0.0], [0.0, 1.0]]])
+    >>> largest_gap(corner, torch.ones(1, 2, dtype=torch.bool)).round(decimals=3).tolist()
+    [4.712]
+    """
+    angle = torch.atan2(coords[..., 1], coords[..., 0])
+    low = angle.masked_fill(~valid, torch.inf).amin(1, keepdim=True)
+    ordered = torch.where(valid, angle, low).sort(dim=1).values  # the invalid repeat the first
+    turn = torch.cat([ordered, low + 2 * pi], dim=1)
+    return turn.diff(dim=1).amax(1)
 
 
 def _star_cotangents(

@@ -5,7 +5,8 @@ Local coordinates y_j of the K − 1 neighbours, centre at the origin. One facto
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, fields
 from functools import lru_cache
 
 import torch
@@ -15,6 +16,7 @@ from torch import Tensor
 from torchlb.polynomials import (
     gradient_functional,
     hessian_functional,
+    monomial_derivatives,
     monomials,
     num_monomials,
 )
@@ -53,6 +55,15 @@ class Weights:
     deficit: Int[Tensor, " B"]
     residual: Float[Tensor, " B"]
 
+    def __getitem__(self, rows: Tensor) -> Weights:
+        """The given stencils."""
+        return Weights(*(getattr(self, f.name)[rows] for f in fields(Weights)))
+
+    @staticmethod
+    def stack(parts: Sequence[Weights]) -> Weights:
+        """Batches of stencils of one size, one after the other."""
+        return Weights(*(torch.cat([getattr(p, f.name) for p in parts]) for f in fields(Weights)))
+
     @property
     def laplacian(self) -> Float[Tensor, "B K"]:
         """Weights of Δ = Σ_c ∂_c², 1/ℓ²."""
@@ -80,15 +91,12 @@ def _functionals(dim: int, degree: int) -> Float[Tensor, "M F"]:
 
 def _finish(
     weights: Float[Tensor, "B K F"],
-    monomial_values: Float[Tensor, "B neighbors M"],
-    functionals: Float[Tensor, "M F"],
+    residual: Float[Tensor, " B"],
     radius: Float[Tensor, " B"],
     singular_values: Float[Tensor, "B M"],
     dim: int,
 ) -> Weights:
-    """Check the moments in scaled coordinates, then return to units of length."""
-    moments = monomial_values.mT @ weights[:, 1:]
-    residual = (moments - functionals).abs().amax((1, 2)) / functionals.abs().max()
+    """Return from scaled coordinates to units of length."""
     largest = singular_values[:, :1]
     rho = radius[:, None, None]
     return Weights(
@@ -116,6 +124,7 @@ def least_squares_weights(
     coords: Float[Tensor, "B neighbors d"],
     degree: int,
     keep: Bool[Tensor, "B neighbors"] | None = None,
+    flux: Float[Tensor, "B K d"] | None = None,
 ) -> Weights:
     r"""Centre-constrained moving least squares.
 
@@ -134,22 +143,44 @@ def least_squares_weights(
     coords : (B, K − 1, d), ℓ: the neighbours without the centre, K − 1 ≥ M − 1.
     degree : m ≥ 1. Second derivatives come with m ≥ 2.
     keep : (B, K − 1), neighbours that may have a weight; all by default.
+    flux : (B, K, d), the conormal at each point of the stencil that lies on a Neumann boundary (centre first), zero at
+        the others. Adds an unknown v_b for the datum ∂_ν f(x_b) = 0: minimise Σ w²/ω + Σ v²/ω subject to
+        Σ w_j y_j^α + Σ v_b ∂_ν y^α(y_b) = (D y^α)(0) (`method.md`, section 6). Only w is returned.
 
     >>> line = torch.tensor([[[-1.0], [1.0]]], dtype=torch.float64)
     >>> least_squares_weights(line, 2).laplacian.round(decimals=12).tolist()
     [[-2.0, 1.0, 1.0]]
     """
-    radius, _, values, root = _scaled_system(coords, degree)
+    radius, scaled, values, root = _scaled_system(coords, degree)
     if keep is not None:
         root = root * keep
+    if flux is not None:
+        values, root = _with_fluxes(scaled, values, root, flux, degree)
     functionals = _functionals(coords.shape[-1], degree).to(coords)
     system = root[..., None] * values
     scale = system.norm(dim=1).clamp_min(torch.finfo(coords.dtype).tiny)
     q, r = torch.linalg.qr(system / scale[:, None])
     right = functionals / scale[..., None]
-    neighbors = root[..., None] * (q @ torch.linalg.solve_triangular(r.mT, right, upper=False))
+    solution = root[..., None] * (q @ torch.linalg.solve_triangular(r.mT, right, upper=False))
+    residual = (values.mT @ solution - functionals).abs().amax((1, 2)) / functionals.abs().max()
+    neighbors = solution[:, : coords.shape[1]]
     weights = torch.cat([-neighbors.sum(1, keepdim=True), neighbors], dim=1)
-    return _finish(weights, values, functionals, radius, torch.linalg.svdvals(r), coords.shape[-1])
+    return _finish(weights, residual, radius, torch.linalg.svdvals(r), coords.shape[-1])
+
+
+def _with_fluxes(
+    scaled: Float[Tensor, "B neighbors d"],
+    values: Float[Tensor, "B neighbors M"],
+    root: Float[Tensor, "B neighbors"],
+    flux: Float[Tensor, "B K d"],
+    degree: int,
+) -> tuple[Tensor, Tensor]:
+    """The system with a further row ∂_ν y^α (and its √ω) for every point of the stencil; ω = 0 off the boundary."""
+    nodes = torch.cat([torch.zeros_like(scaled[:, :1]), scaled], dim=1)
+    slopes = (monomial_derivatives(nodes, degree) * flux[:, :, None]).sum(-1)
+    on_boundary = flux.square().sum(-1) > 0
+    weight = torch.cat([torch.ones_like(root[:, :1]), root], dim=1) * on_boundary
+    return torch.cat([values, slopes], dim=1), torch.cat([root, weight], dim=1)
 
 
 @lru_cache(maxsize=64)
@@ -165,7 +196,11 @@ def typical_growth(dim: int, degree: int) -> float:
     return float(weights.radius[0] ** 2 * weights.laplacian.abs().sum())
 
 
-def positive_weights(coords: Float[Tensor, "B neighbors d"], degree: int) -> Weights:
+def positive_weights(
+    coords: Float[Tensor, "B neighbors d"],
+    degree: int,
+    flux: Float[Tensor, "B K d"] | None = None,
+) -> Weights:
     """Least squares over as many neighbours as can have weights Δ ≥ 0: a row of an M-matrix, and consistent.
 
     Neighbours with a negative weight are left out and the rest solved again until none is negative or the rank is
@@ -173,7 +208,7 @@ def positive_weights(coords: Float[Tensor, "B neighbors d"], degree: int) -> Wei
     Positive weights exist up to degree 3 only, since Σ w |y|⁴ = 0 excludes them beyond (`method.md`, section 10).
     """
     keep = torch.ones(coords.shape[:2], dtype=torch.bool)
-    weights = least_squares_weights(coords, degree)
+    weights = least_squares_weights(coords, degree, flux=flux)
     for _ in range(coords.shape[1]):
         others = weights.laplacian[:, 1:]
         rounding = 1e-12 * others.abs().amax(1, keepdim=True)
@@ -181,7 +216,7 @@ def positive_weights(coords: Float[Tensor, "B neighbors d"], degree: int) -> Wei
         if not negative.any():
             break
         keep &= ~negative
-        weights = least_squares_weights(coords, degree, keep)
+        weights = least_squares_weights(coords, degree, keep, flux)
     return weights
 
 
@@ -216,7 +251,9 @@ def polyharmonic_weights(coords: Float[Tensor, "B neighbors d"], degree: int) ->
     right = torch.cat([_kernel_derivatives(nodes, functionals.shape[1]), exact], dim=1)
     factors, pivots, _ = torch.linalg.lu_factor_ex(matrix)
     weights = torch.linalg.lu_solve(factors, pivots, right)[:, :num_points]
-    return _finish(weights, values, functionals, radius, singular_values, dim)
+    moments = values.mT @ weights[:, 1:]
+    residual = (moments - functionals).abs().amax((1, 2)) / functionals.abs().max()
+    return _finish(weights, residual, radius, singular_values, dim)
 
 
 def _kernel_derivatives(nodes: Float[Tensor, "B K d"], count: int) -> Float[Tensor, "B K F"]:
