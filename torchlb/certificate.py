@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import warnings
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 import torch
@@ -31,6 +32,8 @@ STRICTNESS = 1e-12
 """S passes if it is negative up to this share of its spectral radius; a hundred times the rounding of its sums."""
 MAX_ROUNDS = 40
 MAX_VECTORS = 32
+ROUGH: dict[str, Any] = {"tol": 1e-3}
+"""Eigenvalues of S are wanted to a few digits only; the inertia decides."""
 FEED_SHARE = 0.2
 WEIGHT_SHARE = 0.1
 STEPPED_DOWN = REASONS.index("stepped down by the certificate")
@@ -81,6 +84,17 @@ def _factorized(matrix: sparse.csc_array, threshold: float) -> SuperLU:
     )
 
 
+class _Inverse(LinearOperator):
+    """Multiple of the inverse of a factorised matrix."""
+
+    def __init__(self, lu: SuperLU, factor: float) -> None:
+        super().__init__(np.float64, lu.shape)
+        self.lu, self.factor = lu, factor
+
+    def _matvec(self, x: np.ndarray) -> np.ndarray:
+        return self.factor * self.lu.solve(x)
+
+
 def left_null_vector(
     matrix: sparse.csr_array, areas: Float[Tensor, " N"]
 ) -> tuple[Float[Tensor, " N"], np.ndarray]:
@@ -120,22 +134,22 @@ def dissipation(
     root = np.sqrt(mass.numpy())
     scaled = sparse.csr_array(sparse.diags_array(root) @ matrix @ sparse.diags_array(1 / root))
     symmetric = sparse.csc_array((scaled + scaled.T) / 2)
-    radius = abs(float(eigsh(symmetric, 1, which="LM", tol=1e-3, return_eigenvectors=False)[0]))
+    radius = abs(float(eigsh(symmetric, 1, which="LM", return_eigenvectors=False, **ROUGH)[0]))
     shift = STRICTNESS * radius
     lu = _factorized(sparse.csc_array(shift * sparse.eye_array(len(root)) - symmetric), 0.0)
     positive = int((lu.U.diagonal() < 0).sum())
     if positive == 0:
         return 0.0, torch.zeros(len(root), 0)
-    inverse = LinearOperator(symmetric.shape, matvec=lambda v: -lu.solve(v), dtype=np.float64)
+    inverse = _Inverse(lu, -1.0)
     count = min(positive, MAX_VECTORS, len(root) - 1)
     try:
         values, vectors = eigsh(
-            symmetric, count, sigma=shift, which="LA", OPinv=inverse, tol=1e-3, maxiter=500
+            symmetric, count, sigma=shift, which="LA", OPinv=inverse, maxiter=500, **ROUGH
         )
     except ArpackNoConvergence as partial:
         values, vectors = partial.eigenvalues, partial.eigenvectors
     if len(values) == 0:
-        values, vectors = eigsh(symmetric, 1, which="LA", tol=1e-2)
+        values, vectors = eigsh(symmetric, 1, which="LA", **ROUGH)
     return float(values.max()) / radius, torch.from_numpy(vectors * (scaled @ vectors))
 
 

@@ -82,8 +82,9 @@ class CloudFallback:
             return cells
         matrix, reachable = self._robust
         robust = sparse.csr_array(matrix[centers.numpy()])
-        near = robust.astype(bool).multiply(reachable[centers.numpy()])
-        clean = near.sum(axis=1) == robust.astype(bool).sum(axis=1)
+        joined = robust.astype(bool)
+        near = joined.multiply(reachable[centers.numpy()])
+        clean = (near.sum(axis=1) == joined.sum(axis=1)) & (joined.sum(axis=1) > 1)
         chosen = sparse.diags_array(clean.astype(float))
         return sparse.csr_array(chosen @ robust + cells - chosen @ cells)
 

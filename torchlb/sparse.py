@@ -1,12 +1,13 @@
 """The sparse product that layers differentiate through, on plain tensors.
 
 A sparse CSR tensor as a buffer breaks `deepcopy`, autocast and second derivatives, and its native backward is slow.
-Here the matrix is `crow, col, values`, the transpose's pattern is computed once, and two custom operations, each the
-derivative of the other, give first and second derivatives in everything, under `torch.compile` and export.
+Here the matrix is `crow, col, values`, the transpose's pattern is computed once, and two custom operations, whose
+derivatives are each other, give derivatives of any order in values and features, under `torch.compile` and export.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -14,11 +15,9 @@ import torch
 from jaxtyping import Float, Int
 from scipy import sparse
 from torch import Tensor
+from torch.nn.functional import embedding_bag
 
 __all__ = ["from_scipy", "matmul", "to_scipy", "transpose_pattern"]
-
-ENTRIES_AT_ONCE = 2**26
-"""Bound on entries times columns that the gradient in the values gathers at a time."""
 
 
 def transpose_pattern(
@@ -48,16 +47,20 @@ def matmul(
 
     Parameters
     ----------
-    crow, col, values : A.
+    crow, col, values : A; int32 or int64 indices.
     pattern_t : of its transpose, from `transpose_pattern`.
-    x : dense. Half precision is computed in float32 and returned as it came; otherwise the result has the wider of the
-        types of `values` and `x`.
+    x : dense. The product is computed in the wider of the types of `values` and `x`, and at least in float32, also
+        under autocast; the result has that type, but for a half-precision x, which gives its own.
+
+    >>> crow, col, values = torch.tensor([0, 2, 3]), torch.tensor([0, 1, 1]), torch.tensor([1.0, 2.0, 3.0])
+    >>> matmul(crow, col, values, transpose_pattern(crow, col, 2), torch.tensor([[1.0], [10.0]])).tolist()
+    [[21.0], [30.0]]
     """
-    return _product(crow, col, *pattern_t, values, x, False)
+    return _product([crow, col, *pattern_t], values, x, False)
 
 
-def _compute_dtype(values: Tensor, x: Tensor) -> torch.dtype:
-    wider = torch.promote_types(values.dtype, x.dtype)
+def _compute_dtype(left: Tensor, right: Tensor) -> torch.dtype:
+    wider = torch.promote_types(left.dtype, right.dtype)
     return torch.promote_types(wider, torch.float32)
 
 
@@ -65,102 +68,84 @@ def _result_dtype(values: Tensor, x: Tensor) -> torch.dtype:
     return x.dtype if x.dtype.itemsize < 4 else _compute_dtype(values, x)
 
 
-@torch.library.custom_op("torchlb::csr_product", mutates_args=())
-def _product(
-    crow: Tensor,
-    col: Tensor,
-    crow_t: Tensor,
-    col_t: Tensor,
-    order_t: Tensor,
-    values: Tensor,
-    x: Tensor,
-    transposed: bool,
-) -> Tensor:
-    """A x, or Aᵀ x."""
-    dtype = _compute_dtype(values, x)
-    values, dense = values.to(dtype), x.to(dtype).contiguous()
+def _csr(crow: Tensor, col: Tensor, values: Tensor, num_cols: int) -> Tensor:
+    shape = (len(crow) - 1, num_cols)
+    return torch.sparse_csr_tensor(crow, col, values, shape, check_invariants=False)
+
+
+@torch.library.custom_op(
+    "torchlb::csr_product",
+    mutates_args=(),
+    schema="(Tensor[] pattern, Tensor values, Tensor x, bool transposed) -> Tensor",
+)
+def _product(pattern: Sequence[Tensor], values: Tensor, x: Tensor, transposed: bool) -> Tensor:
+    """A x, or Aᵀ x, for the pattern [crow, col, crow_t, col_t, order_t]."""
+    crow, col, crow_t, col_t, order_t = pattern
     if transposed:
-        crow, col, values = crow_t, col_t, values[order_t]
-    shape = (len(crow) - 1, len(x))
-    with torch.autocast(x.device.type, enabled=False):
-        matrix = torch.sparse_csr_tensor(crow, col, values, shape, check_invariants=False)
-        return (matrix @ dense).to(_result_dtype(values, x))
+        crow, col, values = crow_t, col_t, values.index_select(0, order_t)
+    dtype, device = _compute_dtype(values, x), x.device.type
+    weights, dense = values.to(dtype), x.to(dtype).contiguous()
+    with torch.autocast(device, enabled=False):
+        if device == "cpu" and dtype == torch.float32 and x.numel():
+            # A row of the result is a weighted sum of rows of x; in this type bags beat MKL twofold.
+            result = embedding_bag(
+                col, dense, crow, mode="sum", per_sample_weights=weights, include_last_offset=True
+            )
+        else:
+            result = _csr(crow, col, weights, len(x)) @ dense
+    return result.to(_result_dtype(values, x))
+
+
+@torch.library.custom_op(
+    "torchlb::csr_values_gradient",
+    mutates_args=(),
+    schema="(Tensor[] pattern, Tensor left, Tensor right) -> Tensor",
+)
+def _values_gradient(pattern: Sequence[Tensor], left: Tensor, right: Tensor) -> Tensor:
+    """Σ_c left[row, c] right[col, c] at every entry (row, col), without the (nnz, C) of its terms."""
+    crow, col, *_ = pattern
+    dtype = _compute_dtype(left, right)
+    matrix = _csr(crow, col, torch.zeros(len(col), dtype=dtype, device=left.device), len(right))
+    with torch.autocast(left.device.type, enabled=False):
+        return torch.sparse.sampled_addmm(matrix, left.to(dtype), right.to(dtype).T).values()
 
 
 @_product.register_fake
-def _(
-    crow: Tensor,
-    col: Tensor,
-    crow_t: Tensor,
-    col_t: Tensor,
-    order_t: Tensor,
-    values: Tensor,
-    x: Tensor,
-    transposed: bool,
-) -> Tensor:
-    num_rows = (crow_t if transposed else crow).shape[0] - 1
+def _(pattern: Sequence[Tensor], values: Tensor, x: Tensor, transposed: bool) -> Tensor:
+    num_rows = pattern[2 if transposed else 0].shape[0] - 1
     return x.new_empty(num_rows, x.shape[1], dtype=_result_dtype(values, x))
 
 
-@torch.library.custom_op("torchlb::csr_values_gradient", mutates_args=())
-def _values_gradient(
-    crow: Tensor,
-    col: Tensor,
-    crow_t: Tensor,
-    col_t: Tensor,
-    order_t: Tensor,
-    left: Tensor,
-    right: Tensor,
-) -> Tensor:
-    """Σ_c left[row, c] right[col, c] at every entry of the pattern."""
-    row = torch.repeat_interleave(torch.arange(len(crow) - 1, device=crow.device), crow.diff())
-    dtype = _compute_dtype(left, right)
-    result = torch.empty(len(col), dtype=dtype, device=left.device)
-    step = max(1, ENTRIES_AT_ONCE // max(1, left.shape[1]))
-    for start in range(0, len(col), step):
-        part = slice(start, start + step)
-        result[part] = (left[row[part]].to(dtype) * right[col[part]].to(dtype)).sum(1)
-    return result
-
-
 @_values_gradient.register_fake
-def _(
-    crow: Tensor,
-    col: Tensor,
-    crow_t: Tensor,
-    col_t: Tensor,
-    order_t: Tensor,
-    left: Tensor,
-    right: Tensor,
-) -> Tensor:
-    return left.new_empty(col.shape[0], dtype=_compute_dtype(left, right))
+def _(pattern: Sequence[Tensor], left: Tensor, right: Tensor) -> Tensor:
+    return left.new_empty(pattern[1].shape[0], dtype=_compute_dtype(left, right))
 
 
 def _save(ctx: Any, inputs: tuple[Any, ...], output: Tensor) -> None:
-    tensors = [value for value in inputs if isinstance(value, Tensor)]
-    ctx.save_for_backward(*tensors)
-    ctx.transposed = inputs[-1]
+    pattern, first, second, *transposed = inputs
+    ctx.save_for_backward(*pattern, first, second)
+    ctx.transposed = transposed == [True]
 
 
 def _product_backward(ctx: Any, grad: Tensor) -> tuple[Any, ...]:
     *pattern, values, x = ctx.saved_tensors
     grad_values = grad_x = None
-    if ctx.needs_input_grad[5]:
+    if ctx.needs_input_grad[1]:
         left, right = (x, grad) if ctx.transposed else (grad, x)
-        grad_values = _values_gradient(*pattern, left, right).to(values.dtype)
-    if ctx.needs_input_grad[6]:
-        grad_x = _product(*pattern, values, grad, not ctx.transposed).to(x.dtype)
-    return *(None,) * 5, grad_values, grad_x, None
+        grad_values = _values_gradient(pattern, left, right).to(values.dtype)
+    if ctx.needs_input_grad[2]:
+        grad_x = _product(pattern, values, grad, not ctx.transposed).to(x.dtype)
+    return [None] * 5, grad_values, grad_x, None
 
 
 def _values_gradient_backward(ctx: Any, grad: Tensor) -> tuple[Any, ...]:
     *pattern, left, right = ctx.saved_tensors
     grad_left = grad_right = None
-    if ctx.needs_input_grad[5]:
-        grad_left = _product(*pattern, grad, right, False).to(left.dtype)
-    if ctx.needs_input_grad[6]:
-        grad_right = _product(*pattern, grad, left, True).to(right.dtype)
-    return *(None,) * 5, grad_left, grad_right
+    if ctx.needs_input_grad[1]:
+        grad_left = _product(pattern, grad, right, False).to(left.dtype)
+    if ctx.needs_input_grad[2]:
+        grad_right = _product(pattern, grad, left, True).to(right.dtype)
+    return [None] * 5, grad_left, grad_right
 
 
 _product.register_autograd(_product_backward, setup_context=_save)

@@ -62,8 +62,8 @@ def cell_volume(
     At a boundary point, with its conormal `outward` (zero elsewhere), only the inner half counts. Where a cell is open
     otherwise it ends half-way to the farthest valid neighbour.
 
-    >>> corners = torch.tensor([[[1.0, 0.0], [0.0, 1.0], [-1.0, 0.0], [0.0, -1.0]]])
-    >>> cell_volume(corners, torch.ones(1, 4, dtype=torch.bool)).round(decimals=2).tolist()
+    >>> around = torch.tensor([[[1.0, 0.0], [0.0, 1.0], [-1.0, 0.0], [0.0, -1.0], [2.0, 0.0]]])
+    >>> cell_volume(around, torch.ones(1, 5, dtype=torch.bool)).round(decimals=2).tolist()
     [1.0]
     """
     dim = coords.shape[-1]
@@ -88,24 +88,28 @@ def cell_laplacian(
     with the right trace, though not consistent on uneven points. Open parts of the cell let no flux through.
     On surfaces the faces are exact, so that linear functions have Δ = 0 wherever the cell is closed.
     """
-    square = coords.square().sum(-1)
+    square = coords.square().sum(-1).clamp_min(torch.finfo(coords.dtype).tiny)
     dim = coords.shape[-1]
     if dim == 2:
-        return _star_cotangents(coords, valid) / cell_volume(coords, valid)[:, None]
-    inverse, first = _inverse_radius(coords, valid).max(dim=1)
-    part = torch.where(inverse > 0, inverse.abs().clamp_min(1e-300).pow(-dim), 0.0)
-    part = part.masked_fill(inverse < 2 / square.sqrt().amax(1, keepdim=True), 0.0)
-    share = torch.zeros_like(square).scatter_add_(1, first, part)
-    total = part.sum(1, keepdim=True).clamp_min(torch.finfo(coords.dtype).tiny)
-    return 2 * dim * (share / total) / square.clamp_min(torch.finfo(coords.dtype).tiny)
+        weights = _star_cotangents(coords, valid) / cell_volume(coords, valid)[:, None]
+    else:
+        inverse, first = _inverse_radius(coords, valid).max(dim=1)
+        closed = inverse >= 2 / square.sqrt().amax(1, keepdim=True)
+        part = torch.where(closed, inverse, torch.inf).pow(-dim)
+        share = torch.zeros_like(square).scatter_add_(1, first, part)
+        total = part.sum(1, keepdim=True).clamp_min(torch.finfo(coords.dtype).tiny)
+        weights = 2 * dim * (share / total) / square
+    # Where no face is left, an equal share for every neighbour: the trace is right and the point stays joined.
+    equal = 2 * dim * valid / (valid.sum(1, keepdim=True).clamp_min(1) * square)
+    return torch.where(weights.sum(1, keepdim=True) > 0, weights, equal)
 
 
 def largest_gap(coords: Float[Tensor, "B K 2"], valid: Bool[Tensor, "B K"]) -> Float[Tensor, " B"]:
     """Largest angle between neighbours that follow each other around the point, in radians.
 
     >>> corner = torch.tensor([[[1.0, 0.0], [0.0, 1.0]]])
-    >>> largest_gap(corner, torch.ones(1, 2, dtype=torch.bool)).round(decimals=3).tolist()
-    [4.712]
+    >>> round(float(largest_gap(corner, torch.ones(1, 2, dtype=torch.bool))), 3)
+    4.712
     """
     angle = torch.atan2(coords[..., 1], coords[..., 0])
     low = angle.masked_fill(~valid, torch.inf).amin(1, keepdim=True)
