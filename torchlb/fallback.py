@@ -85,8 +85,8 @@ class CloudFallback:
         joined = robust.astype(bool)
         near = joined.multiply(reachable[centers.numpy()])
         clean = (near.sum(axis=1) == joined.sum(axis=1)) & (joined.sum(axis=1) > 1)
-        chosen = sparse.diags_array(clean.astype(float))
-        return sparse.csr_array(chosen @ robust + cells - chosen @ cells)
+        ours, theirs = (sparse.diags_array(rows.astype(float)) for rows in (~clean, clean))
+        return sparse.csr_array(ours @ cells + theirs @ robust)
 
     def _cells(
         self, centers: Int[Tensor, " B"]

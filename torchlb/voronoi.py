@@ -123,7 +123,7 @@ def _star_cotangents(
 ) -> Float[Tensor, "B K"]:
     """½(cot α + cot β) over the triangles of the star: the natural neighbours in turn around the point.
 
-    A gap of a half-turn or more is open and has no triangle. Negative values, at obtuse open ends, become 0.
+    A gap of nearly a half-turn (177°) or more is open and has no triangle. Negative values, at obtuse open ends, become 0.
     """
     natural = natural_neighbors(coords, valid)
     angle = torch.atan2(coords[..., 1], coords[..., 0]).masked_fill(~natural, torch.inf)
@@ -134,7 +134,8 @@ def _star_cotangents(
     here = coords.take_along_dim(order[..., None], dim=1)
     there = here.take_along_dim(following[..., None], dim=1)
     twice_area = here[..., 0] * there[..., 1] - here[..., 1] * there[..., 0]
-    triangle = (place < count) & (twice_area > 0)
+    flat = 0.05 * here.norm(dim=-1) * there.norm(dim=-1)
+    triangle = (place < count) & (twice_area > flat)
     denominator = torch.where(triangle, twice_area, 1.0)
     # The angle opposite the edge to `here` sits at `there`, and the other way round.
     at_there = ((there - here) * there).sum(-1) / denominator
