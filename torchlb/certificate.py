@@ -16,7 +16,13 @@ import torch
 from jaxtyping import Float, Int
 from scipy import sparse
 from scipy.sparse import csgraph
-from scipy.sparse.linalg import ArpackNoConvergence, LinearOperator, SuperLU, eigsh, splu
+from scipy.sparse.linalg import (
+    ArpackNoConvergence,
+    LinearOperator,
+    SuperLU,
+    eigsh,
+    splu,
+)
 from torch import Tensor
 from tqdm import tqdm
 
@@ -31,6 +37,8 @@ MARGIN = 0.02
 STRICTNESS = 1e-12
 """S passes if it is negative up to this share of its spectral radius; a hundred times the rounding of its sums."""
 MAX_ROUNDS = 40
+LARGEST = 150_000
+"""Beyond this many points the sparse factors (5 GB at 144,000, p = 3) outgrow an ordinary machine."""
 MAX_VECTORS = 32
 ROUGH: dict[str, Any] = {"tol": 1e-3}
 """Eigenvalues of S are wanted to a few digits only; the inertia decides."""
@@ -111,9 +119,8 @@ def left_null_vector(
     density = np.ones(len(area))
     for _ in range(4):
         density = lu.solve(area * density)
-        # Each component has its own null vector and its own scale and sign.
-        scale = total / np.bincount(component, area * density, minlength=count)
-        density = density * scale[component]
+        # Each component has its own null vector, with its own scale and sign.
+        density *= (total / np.bincount(component, area * density, minlength=count))[component]
     return torch.from_numpy(area * density), component
 
 

@@ -2,33 +2,20 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict
 from typing import Any
 
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from torchlb.certificate import Certificate, certify
-from torchlb.checks import (
-    check_boundary,
-    check_distinct,
-    check_faces,
-    check_normals,
-    check_options,
-    check_points,
-)
-from torchlb.cotangent import cotangent_laplacian
-from torchlb.geometry import Geometry, cloud_geometry, mesh_geometry
+from torchlb.build import Built, Options, build_cloud, build_cotangent, build_mesh
+from torchlb.certificate import Certificate
 from torchlb.report import StencilReport
-from torchlb.rows import Rows
 from torchlb.sparse import matmul, transpose_pattern
-from torchlb.stencil import Ladder, build_stencil, matrix_rows
-from torchlb.tangent import PROJECTIONS
 
 __all__ = ["LaplaceBeltrami"]
 
-WEIGHTS = ["least_squares", "polyharmonic"]
 REPORT_FIELDS = (
     "order",
     "normal_order",
@@ -39,34 +26,6 @@ REPORT_FIELDS = (
     "reason",
 )
 BUFFERS = ("crow", "col", "values", "gradient_values", "mass", "points", "frames", "normals")
-
-
-@dataclass(frozen=True)
-class _Options:
-    """The choices that a user makes, as given."""
-
-    order: int
-    normal_order: int | None
-    projection: str
-    weights: str
-    num_neighbors: int | None
-
-    @property
-    def q(self) -> int:
-        """Order of the tangent frames: p + 1 unless given."""
-        return self.order + 1 if self.normal_order is None else self.normal_order
-
-    def check(self, num_points: int, ambient_dim: int, dim: int) -> None:
-        check_options(
-            num_points,
-            ambient_dim,
-            dim,
-            self.order,
-            self.q,
-            self.num_neighbors,
-            projection=(self.projection, list(PROJECTIONS)),
-            weights=(self.weights, WEIGHTS),
-        )
 
 
 class LaplaceBeltrami(nn.Module):
@@ -155,29 +114,11 @@ class LaplaceBeltrami(nn.Module):
         ValueError : for bad input, naming the points and the remedy.
         StencilError : where not even the fallback row of a point can be built.
         """
-        given = points
-        points = check_points(points)
-        ambient = points.shape[1]
-        d = max(ambient - 1, 1) if dim is None else dim
-        options = _Options(order, normal_order, projection, weights, num_neighbors)
-        options.check(len(points), ambient, d)
-        check_distinct(points)
-        if normals is not None:
-            if d != ambient - 1:
-                raise ValueError(
-                    f"normals: only hypersurfaces have them, not dim={d} in R^{ambient}"
-                )
-            normals = check_normals(normals, points)
-        geometry = cloud_geometry(
-            points,
-            d,
-            options.q,
-            num_neighbors=num_neighbors,
-            normals=normals,
-            boundary=check_boundary(boundary, len(points)),
-            progress=progress,
+        options = Options(order, normal_order, projection, weights, num_neighbors, certify)
+        built = build_cloud(
+            points, dim, options, normals=normals, boundary=boundary, progress=progress
         )
-        return cls._from_geometry(geometry, "points", options, certify, progress)._cast_like(given)
+        return cls._of(built, points)
 
     @classmethod
     def from_mesh(
@@ -208,22 +149,9 @@ class LaplaceBeltrami(nn.Module):
         ------
         ValueError : for bad input, such as vertices that belong to no face.
         """
-        given = vertices
-        vertices = check_points(vertices, "vertices")
-        faces = check_faces(faces, len(vertices))
-        options = _Options(order, normal_order, projection, weights, num_neighbors)
-        options.check(len(vertices), vertices.shape[1], faces.shape[1] - 1)
-        if boundary not in ("neumann", None):
-            raise ValueError(f"boundary: expected 'neumann' or None, got {boundary!r}")
-        geometry = mesh_geometry(
-            vertices,
-            faces,
-            options.q,
-            num_neighbors=num_neighbors,
-            boundary=boundary is not None,
-            progress=progress,
-        )
-        return cls._from_geometry(geometry, "mesh", options, certify, progress)._cast_like(given)
+        options = Options(order, normal_order, projection, weights, num_neighbors, certify)
+        built = build_mesh(vertices, faces, options, boundary=boundary, progress=progress)
+        return cls._of(built, vertices)
 
     @classmethod
     def from_cotangent(cls, vertices: Any, faces: Any) -> LaplaceBeltrami:
@@ -236,62 +164,24 @@ class LaplaceBeltrami(nn.Module):
         Its gradient is the first-order fit to the vertices around each point. Raises ValueError for bad input and for
         vertices without area.
         """
-        given = vertices
-        vertices = check_points(vertices, "vertices")
-        faces = check_faces(faces, len(vertices))
-        if faces.shape[1] != 3:
-            raise ValueError(
-                f"faces: the cotangent operator needs triangles, got {tuple(faces.shape)}"
-            )
-        matrix, mass = cotangent_laplacian(vertices, faces)
-        geometry = mesh_geometry(vertices, faces, 0)
-        everything = torch.arange(len(vertices))
-        rows = matrix_rows(matrix, geometry.points, geometry.frames, everything)
-        return cls._assembled(rows, replace(geometry, areas=mass), "cotangent", {})._cast_like(
-            given
-        )
+        return cls._of(build_cotangent(vertices, faces), vertices)
 
     @classmethod
-    def _from_geometry(
-        cls, geometry: Geometry, kind: str, options: _Options, certified: bool, progress: bool
-    ) -> LaplaceBeltrami:
-        ladder = Ladder(
-            geometry,
-            options.order,
-            projection=options.projection,
-            weights=options.weights,
-            num_neighbors=options.num_neighbors,
-        )
-        rows = build_stencil(ladder, progress=progress)
-        if not certified:
-            return cls._assembled(rows, geometry, kind, {**asdict(options), "certify": False})
-        rows, mass, certificate = certify(ladder, rows, geometry.areas, progress=progress)
-        lb = cls._assembled(rows, replace(geometry, areas=mass), kind, asdict(options))
-        lb.certificate = certificate
-        return lb
-
-    @classmethod
-    def _assembled(
-        cls, rows: Rows, geometry: Geometry, kind: str, options: dict[str, Any]
-    ) -> LaplaceBeltrami:
-        """Store rows and geometry."""
+    def _of(cls, built: Built, given: Any) -> LaplaceBeltrami:
+        """Store what was built, in the floating type of the input."""
         lb = cls()
-        lb.kind, lb.options = kind, options
+        rows, geometry = built.rows, built.geometry
+        lb.kind, lb.options, lb.certificate = built.kind, built.options, built.certificate
         lb.crow, lb.col, lb.values = rows.crow, rows.col, rows.laplacian
         lb.gradient_values = rows.gradient.T.contiguous()
         lb.mass, lb.points, lb.frames = geometry.areas, geometry.points, geometry.frames
-        normals = geometry.normals
-        lb.normals = lb.points[:0] if normals is None else normals
+        lb.normals = lb.points[:0] if geometry.normals is None else geometry.normals
         report = {**vars(rows), "num_neighbors": rows.length, "normal_order": geometry.normal_order}
         for name in REPORT_FIELDS:
             setattr(lb, f"report_{name}", report[name])
         lb._transpose()
-        return lb
-
-    def _cast_like(self, given: Any) -> LaplaceBeltrami:
-        """To the floating type of the input: float64 arrays stay float64."""
         dtype = torch.as_tensor(given).dtype
-        return self.to(dtype) if dtype.is_floating_point else self.to(torch.get_default_dtype())
+        return lb.to(dtype if dtype.is_floating_point else torch.get_default_dtype())
 
     def _transpose(self) -> None:
         self.crow_t, self.col_t, self.order_t = transpose_pattern(
@@ -300,12 +190,12 @@ class LaplaceBeltrami(nn.Module):
 
     @property
     def num_points(self) -> int:
-        """N."""
+        """Number of points N."""
         return self.crow.shape[0] - 1
 
     @property
     def dim(self) -> int:
-        """d of the manifold."""
+        """Dimension d of the manifold."""
         return self.frames.shape[-1]
 
     @property

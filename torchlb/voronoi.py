@@ -123,7 +123,7 @@ def _star_cotangents(
 ) -> Float[Tensor, "B K"]:
     """½(cot α + cot β) over the triangles of the star: the natural neighbours in turn around the point.
 
-    A gap of nearly a half-turn (177°) or more is open and has no triangle. Negative values, at obtuse open ends, become 0.
+    A gap of nearly a half-turn (177°) or more is open and has no triangle. Negative values, at obtuse ends, become 0.
     """
     natural = natural_neighbors(coords, valid)
     angle = torch.atan2(coords[..., 1], coords[..., 0]).masked_fill(~natural, torch.inf)

@@ -1,0 +1,152 @@
+"""From input to a finished operator: check, geometry, ladder, certificate."""
+
+from __future__ import annotations
+
+import warnings
+from dataclasses import asdict, dataclass, replace
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from torchlb.certificate import LARGEST, Certificate, StabilityWarning, certify
+from torchlb.checks import (
+    check_boundary,
+    check_distinct,
+    check_faces,
+    check_normals,
+    check_options,
+    check_points,
+)
+from torchlb.cotangent import cotangent_laplacian
+from torchlb.geometry import Geometry, cloud_geometry, mesh_geometry
+from torchlb.rows import Rows
+from torchlb.stencil import Ladder, build_stencil, matrix_rows
+from torchlb.tangent import PROJECTIONS
+
+__all__ = ["Built", "Options", "build_cloud", "build_cotangent", "build_mesh"]
+
+WEIGHTS = ["least_squares", "polyharmonic"]
+
+
+@dataclass(frozen=True)
+class Options:
+    """The choices that a user makes, as given."""
+
+    order: int
+    normal_order: int | None
+    projection: str
+    weights: str
+    num_neighbors: int | None
+    certify: bool
+
+    @property
+    def q(self) -> int:
+        """Order of the tangent frames: p + 1 unless given."""
+        return self.order + 1 if self.normal_order is None else self.normal_order
+
+    def check(self, num_points: int, ambient_dim: int, dim: int) -> None:
+        """ValueError for a choice that is none."""
+        check_options(
+            num_points,
+            ambient_dim,
+            dim,
+            self.order,
+            self.q,
+            self.num_neighbors,
+            projection=(self.projection, list(PROJECTIONS)),
+            weights=(self.weights, WEIGHTS),
+        )
+
+
+@dataclass(frozen=True)
+class Built:
+    """A finished operator; `geometry.areas` is its mass, and `certificate` is None where none was asked for."""
+
+    rows: Rows
+    geometry: Geometry
+    kind: str
+    options: dict[str, Any]
+    certificate: Certificate | None
+
+
+def build_cloud(
+    points: Any, dim: int | None, options: Options, *, normals: Any, boundary: Any, progress: bool
+) -> Built:
+    """Operator on a point cloud; arguments as for `LaplaceBeltrami.from_points`."""
+    points = check_points(points)
+    ambient = points.shape[1]
+    d = max(ambient - 1, 1) if dim is None else dim
+    options.check(len(points), ambient, d)
+    check_distinct(points)
+    if normals is not None:
+        if d != ambient - 1:
+            raise ValueError(f"normals: only hypersurfaces have them, not dim={d} in R^{ambient}")
+        normals = check_normals(normals, points)
+    geometry = cloud_geometry(
+        points,
+        d,
+        options.q,
+        num_neighbors=options.num_neighbors,
+        normals=normals,
+        boundary=check_boundary(boundary, len(points)),
+        progress=progress,
+    )
+    return _finished(geometry, "points", options, progress)
+
+
+def build_mesh(
+    vertices: Any, faces: Any, options: Options, *, boundary: str | None, progress: bool
+) -> Built:
+    """Operator on a mesh; arguments as for `LaplaceBeltrami.from_mesh`."""
+    vertices = check_points(vertices, "vertices")
+    faces = check_faces(faces, len(vertices))
+    options.check(len(vertices), vertices.shape[1], faces.shape[1] - 1)
+    if boundary not in ("neumann", None):
+        raise ValueError(f"boundary: expected 'neumann' or None, got {boundary!r}")
+    geometry = mesh_geometry(
+        vertices,
+        faces,
+        options.q,
+        num_neighbors=options.num_neighbors,
+        boundary=boundary is not None,
+        progress=progress,
+    )
+    return _finished(geometry, "mesh", options, progress)
+
+
+def build_cotangent(vertices: Any, faces: Any) -> Built:
+    """The cotangent operator with its mass; arguments as for `LaplaceBeltrami.from_cotangent`."""
+    vertices = check_points(vertices, "vertices")
+    faces = check_faces(faces, len(vertices))
+    if faces.shape[1] != 3:
+        raise ValueError(f"faces: the cotangent operator needs triangles, got {tuple(faces.shape)}")
+    matrix, mass = cotangent_laplacian(vertices, faces)
+    geometry = mesh_geometry(vertices, faces, 0, boundary=False)
+    everything: Tensor = torch.arange(len(vertices))
+    rows = matrix_rows(matrix, geometry.points, geometry.frames, everything)
+    return Built(rows, replace(geometry, areas=mass), "cotangent", {}, None)
+
+
+def _finished(geometry: Geometry, kind: str, options: Options, progress: bool) -> Built:
+    """Rows from the ladder, certified if asked for and possible."""
+    ladder = Ladder(
+        geometry,
+        options.order,
+        projection=options.projection,
+        weights=options.weights,
+        num_neighbors=options.num_neighbors,
+    )
+    rows = build_stencil(ladder, progress=progress)
+    count = len(geometry.points)
+    if options.certify and count > LARGEST:
+        warnings.warn(
+            f"{count} points are more than the {LARGEST} that can be certified: the operator is the raw one, which may "
+            "not be stable under diffusion. Thin the points, or pass certify=False to say that this is known",
+            StabilityWarning,
+            stacklevel=4,
+        )
+    if not options.certify or count > LARGEST:
+        return Built(rows, geometry, kind, {**asdict(options), "certify": False}, None)
+    rows, mass, certificate = certify(ladder, rows, geometry.areas, progress=progress)
+    return Built(rows, replace(geometry, areas=mass), kind, asdict(options), certificate)
