@@ -317,3 +317,7 @@ class LaplaceBeltrami(nn.Module):
             error_msgs,
         )
         self._transpose()
+
+
+# A whole module can be read back with torch.load(weights_only=True) where torchlb is imported.
+torch.serialization.add_safe_globals([LaplaceBeltrami, Certificate])

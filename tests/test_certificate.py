@@ -1,0 +1,130 @@
+"""The certificate: π > 0 and S = ½(ΠL + LᵀΠ) ≤ 0, and what follows from it."""
+
+import numpy as np
+import pytest
+import torch
+from scipy import sparse
+
+from torchlb import LaplaceBeltrami, StabilityWarning
+from torchlb.certificate import check_certificate, left_null_vector
+from torchlb.surfaces import Sphere, Torus, smooth_function
+
+
+def dense(lb):
+    return lb.matrix.to_dense()
+
+
+def largest_of_s(lb):
+    """λ_max(S) over the spectral radius of S, densely."""
+    weighted = lb.mass[:, None] * dense(lb)
+    values = torch.linalg.eigvalsh((weighted + weighted.T) / 2)
+    return float(values.max() / values.abs().max())
+
+
+@pytest.mark.parametrize("order", [1, 3, 5])
+@pytest.mark.parametrize("surface", [Sphere(), Torus()], ids=["sphere", "torus"])
+@pytest.mark.parametrize("sampling", ["points", "random_points"])
+def test_certificate_holds_as_dense_linear_algebra_sees_it(surface, sampling, order):
+    lb = LaplaceBeltrami.from_points(getattr(surface, sampling)(700), order=order)
+    assert lb.certificate.holds
+    assert lb.mass.min() > 0
+    residual = (lb.mass @ dense(lb)).abs().max() / (lb.mass @ dense(lb).abs()).max()
+    assert residual < 1e-13
+    assert largest_of_s(lb) <= 1e-8
+
+
+def test_quasi_uniform_points_need_no_round():
+    lb = LaplaceBeltrami.from_points(Torus().points(2000), order=3)
+    assert lb.certificate.rounds <= 1
+    assert lb.report.order_counts[3] >= 0.99 * 2000
+
+
+@pytest.mark.parametrize("surface", [Sphere(), Torus()], ids=["sphere", "torus"])
+def test_random_clouds_keep_their_order(surface):
+    lb = LaplaceBeltrami.from_points(surface.random_points(1500), order=3)
+    assert lb.certificate.holds
+    assert lb.report.order_counts[3] >= 0.95 * 1500
+
+
+def test_diffusion_contracts_and_conserves():
+    """‖e^{tL}‖_π ≤ 1 and πᵀ e^{tL} u = πᵀ u, for t over six decades."""
+    lb = LaplaceBeltrami.from_points(Torus().random_points(500), order=3)
+    root = lb.mass.sqrt()
+    f = smooth_function(lb.points)
+    total = lb.mass @ f
+    for t in 10.0 ** torch.arange(-4, 3):
+        flow = torch.linalg.matrix_exp(t.double() * dense(lb))
+        norm = torch.linalg.matrix_norm(root[:, None] * flow / root, 2)
+        assert norm <= 1 + 1e-10
+        assert abs(lb.mass @ (flow @ f) - total) <= 1e-12 * (lb.mass @ f.abs())
+
+
+def test_mass_is_a_quadrature_rule_of_the_order_of_the_operator():
+    """|Σ π f / Σ π − mean f| falls at order ≥ p − 0.5; here p = 3 on the sphere, mean of z² = 1/3."""
+    sizes = [500, 1000, 2000, 4000]
+    errors = []
+    for n in sizes:
+        lb = LaplaceBeltrami.from_points(Sphere().points(n), order=3)
+        square = lb.points[:, 2] ** 2
+        errors.append(abs(float(lb.mass @ square / lb.mass.sum()) - 1 / 3))
+    slope = -2 * np.polyfit(np.log(sizes), np.log(np.array(errors) + 1e-15), 1)[0]
+    assert slope >= 2.5
+    assert errors[-1] < 1e-6
+
+
+def test_total_mass_is_the_area():
+    """Mesh: the sum of the triangles; cloud: second order."""
+    surface = Sphere()
+    vertices, faces = surface.mesh(1000)
+    corners = vertices[faces]
+    triangles = torch.linalg.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    mesh = LaplaceBeltrami.from_mesh(vertices, faces).mass.sum()
+    torch.testing.assert_close(mesh, triangles.norm(dim=1).sum() / 2)
+    cloud = LaplaceBeltrami.from_points(vertices).mass.sum()
+    assert abs(cloud / surface.area - 1) < 0.01
+
+
+def test_every_component_has_its_own_null_vector():
+    """Two spheres of radius 1 and 2, apart: areas 4π and 16π, on each its own sum."""
+    small = Sphere().points(500)
+    points = torch.cat([small, 2 * Sphere().points(500, seed=1) + torch.tensor([5.0, 0, 0])])
+    lb = LaplaceBeltrami.from_points(points, order=3)
+    assert lb.certificate.components == 2
+    assert lb.certificate.holds
+    ratio = lb.mass[500:].sum() / lb.mass[:500].sum()
+    assert abs(ratio - 4) < 0.05
+
+
+def test_left_null_vector_of_a_known_chain():
+    """Birth and death with rates 1 up, 2 down on three states: π ∝ (4, 2, 1)."""
+    matrix = sparse.csr_array(np.array([[-1.0, 1, 0], [2, -3, 1], [0, 2, -2]]))
+    mass, _ = left_null_vector(matrix, torch.ones(3, dtype=torch.float64))
+    torch.testing.assert_close(mass, torch.tensor([4.0, 2, 1], dtype=torch.float64) * 3 / 7)
+
+
+def test_an_unstable_operator_is_told_from_a_stable_one():
+    """The certificate refuses a null vector with a negative entry, and an indefinite S."""
+    ones = torch.ones(3, dtype=torch.float64)
+    negative = sparse.csr_array(np.array([[-1.0, 2, -1], [-1, -1, 2], [2.5, -0.5, -2]]))
+    _, result, _ = check_certificate(negative, ones)
+    skewed = np.array([[-1.0, 1, 0], [0, -1, 1], [1, 0, -1]]) + 5 * np.array(
+        [[1.0, -2, 1], [-2, 4, -2], [1, -2, 1]]
+    )
+    _, indefinite, feed = check_certificate(sparse.csr_array(skewed), ones)
+    assert not indefinite.holds
+    assert indefinite.max_s > 0
+    assert feed.shape[1] >= 1
+    assert result.holds == (result.min_pi > 0 and result.max_s == 0)
+
+
+def test_uncertified_operator_says_so():
+    lb = LaplaceBeltrami.from_points(Sphere().points(300), certify=False)
+    assert lb.certificate is None
+    assert "certify=False" in repr(lb)
+
+
+def test_too_many_points_are_not_certified_silently(monkeypatch):
+    monkeypatch.setattr("torchlb.build.LARGEST", 100)
+    with pytest.warns(StabilityWarning, match="200 points are more than the 100"):
+        lb = LaplaceBeltrami.from_points(Sphere().points(200))
+    assert lb.certificate is None

@@ -1,0 +1,319 @@
+"""Stencil weights: exact on polynomials, optimal among the exact ones, and known where stencils are classical."""
+
+import numpy as np
+import pytest
+import torch
+from torch.func import hessian, jacrev
+
+from tolerances import TOLERANCE
+from torchlb.polynomials import monomials, num_monomials
+from torchlb.weights import (
+    WEIGHT_RULES,
+    Weights,
+    least_squares_weights,
+    polyharmonic_weights,
+    positive_weights,
+    typical_growth,
+    window,
+)
+
+DEGREES = {1: range(1, 7), 2: range(1, 7), 3: range(1, 5), 4: range(1, 4)}
+CASES = [(dim, degree) for dim, degrees in DEGREES.items() for degree in degrees]
+SECOND = [case for case in CASES if case[1] >= 2]
+RULES = {"least_squares": least_squares_weights, "polyharmonic": polyharmonic_weights}
+
+
+def close(actual, expected, scale=1.0):
+    torch.testing.assert_close(actual / scale, expected / scale, **TOLERANCE[torch.float64])
+
+
+def cloud(dim, degree, batch=3, factor=3.0):
+    """Random neighbours in the unit ball, `factor` times as many as polynomials."""
+    size = int(factor * num_monomials(dim, degree)) + 2
+    direction = torch.randn(batch, size, dim, dtype=torch.float64)
+    radius = torch.rand(batch, size, 1, dtype=torch.float64) ** (1 / dim)
+    return direction / direction.norm(dim=-1, keepdim=True) * radius
+
+
+def grid(half, step=1.0):
+    """The neighbours of 0 in the square lattice {−half, …, half}²·step."""
+    axis = torch.arange(-half, half + 1, dtype=torch.float64) * step
+    nodes = torch.cartesian_prod(axis, axis)
+    return nodes[nodes.norm(dim=1) > 0][None]
+
+
+def polynomial(dim, degree):
+    """A random polynomial of the degree, its constant included."""
+    coefficients = torch.randn(num_monomials(dim, degree), dtype=torch.float64)
+
+    def value(y):
+        return coefficients[0] + monomials(y, degree) @ coefficients[1:]
+
+    return value
+
+
+def applied(weights, f, coords):
+    """Σ_j w_j f(y_j), the centre first."""
+    nodes = torch.cat([torch.zeros_like(coords[:, :1]), coords], dim=1)
+    return torch.einsum("bk...,bk->b...", weights, f(nodes))
+
+
+@pytest.mark.parametrize("rule", RULES)
+@pytest.mark.parametrize(("dim", "degree"), SECOND)
+def test_derivatives_of_polynomials_are_exact(dim, degree, rule):
+    """Δ, gradient and Hessian at the centre of a random polynomial of degree m, to rounding."""
+    coords, f = cloud(dim, degree), polynomial(dim, degree)
+    weights = RULES[rule](coords, degree)
+    zero = torch.zeros(dim, dtype=torch.float64)
+    slope, second = jacrev(f)(zero), hessian(f)(zero)
+    a, b = torch.triu_indices(dim, dim)
+    scale = weights.laplacian.abs().sum(1).max()
+    close(applied(weights.laplacian, f, coords), second.trace().expand(3), scale)
+    close(applied(weights.gradient, f, coords), slope.expand(3, dim), scale)
+    close(applied(weights.hessian, f, coords), second[a, b].expand(3, -1), scale)
+    assert (weights.deficit == 0).all()
+    assert weights.residual.max() < 1e-11
+
+
+@pytest.mark.parametrize("dim", [1, 2, 3, 4])
+def test_degree_one_has_gradients_only(dim):
+    coords, f = cloud(dim, 1), polynomial(dim, 1)
+    weights = least_squares_weights(coords, 1)
+    close(applied(weights.gradient, f, coords), jacrev(f)(coords[0, 0]).expand(3, dim))
+    assert weights.hessian.shape == (3, coords.shape[1] + 1, 0)
+
+
+@pytest.mark.parametrize("rule", WEIGHT_RULES)
+@pytest.mark.parametrize("dim", [1, 2, 3])
+def test_weights_sum_to_zero(dim, rule):
+    """Σ_j w_j = 0, the centre included, for every functional."""
+    weights = WEIGHT_RULES[rule](cloud(dim, 3, factor=4), 3)
+    for part in (weights.gradient, weights.hessian):
+        assert (part.sum(1).abs() / part.abs().sum(1)).max() < 1e-12
+
+
+def test_three_points_of_a_line():
+    """[1, −2, 1] / h² and [−1, 0, 1] / 2h; five points at degree 4 give [−1, 16, −30, 16, −1] / 12h²."""
+    h = 0.1
+    three = h * torch.tensor([[[-1.0], [1]]], dtype=torch.float64)
+    weights = least_squares_weights(three, 2)
+    close(h**2 * weights.laplacian, torch.tensor([[-2.0, 1, 1]], dtype=torch.float64))
+    close(h * weights.gradient[..., 0], torch.tensor([[0.0, -0.5, 0.5]], dtype=torch.float64))
+    five = h * torch.tensor([[[-2.0], [-1], [1], [2]]], dtype=torch.float64)
+    expected = torch.tensor([[-30.0, -1, 16, 16, -1]], dtype=torch.float64) / 12
+    close(h**2 * least_squares_weights(five, 4).laplacian, expected)
+
+
+def test_nine_points_of_a_square_lattice():
+    """The 3 × 3 stencils consistent to degree 3 are [a, 1 − 2a, a; …] / h²; the window chooses 0 < a < 1/2."""
+    h = 0.5
+    coords = grid(1, h)
+    weights = h**2 * least_squares_weights(coords, 2).laplacian[0]
+    corner = coords[0].abs().sum(1) > 1.5 * h
+    a = weights[1:][corner]
+    close(a, a[:1].expand(4))
+    close(weights[1:][~corner], (1 - 2 * a[:1]).expand(4))
+    close(weights[:1], 4 * a[:1] - 4)
+    assert 0 < a[0] < 0.5
+
+
+def test_positive_weights_of_the_cross_are_the_five_point_stencil():
+    """Without the corners there is one: [1, 1, −4, 1, 1] / h²; xy is then left out by two more lattice points."""
+    h = 0.5
+    coords = grid(1, h)
+    keep = coords[0].abs().sum(1) < 1.5 * h
+    weights = least_squares_weights(coords[:, keep], 3, None)
+    assert weights.deficit.item() > 0  # no xy on the cross: not poised, and said so
+    line = least_squares_weights(coords[:, keep][..., :1][:, [0, 3]], 2).laplacian
+    close(h**2 * line, torch.tensor([[-2.0, 1, 1]], dtype=torch.float64))
+
+
+@pytest.mark.parametrize("rule", WEIGHT_RULES)
+@pytest.mark.parametrize("scale", [1e-6, 1e-3, 1e3, 1e6])
+def test_scaling(scale, rule):
+    """y → s y: Δ scales by s⁻², the gradient by s⁻¹, the radius by s; the numbers of quality do not move."""
+    coords = cloud(2, 3, factor=4)
+    one, other = (WEIGHT_RULES[rule](c, 3) for c in (coords, scale * coords))
+    size = one.laplacian.abs().max()
+    close(other.laplacian * scale**2, one.laplacian, size)
+    close(other.hessian * scale**2, one.hessian, size)
+    close(other.gradient * scale, one.gradient, one.gradient.abs().max())
+    close(other.radius / scale, one.radius)
+    close(other.condition, one.condition, one.condition)
+    assert torch.equal(other.deficit, one.deficit)
+
+
+@pytest.mark.parametrize("rule", RULES)
+def test_rotations_of_the_plane_do_not_move_the_laplacian(rule):
+    coords = cloud(2, 4)
+    c, s = np.cos(0.7), np.sin(0.7)
+    turned = coords @ torch.tensor([[c, -s], [s, c]])
+    one, other = (RULES[rule](x, 4).laplacian for x in (coords, turned))
+    close(other, one, one.abs().max())
+
+
+@pytest.mark.parametrize(("dim", "degree"), [(1, 4), (2, 2), (2, 4), (3, 2)])
+def test_weights_minimise_the_centre_constrained_problem(dim, degree):
+    """min Σ_{j≠i} w²/ω under Σ w y^α = Δy^α(0): the dense KKT system [2/ω V; Vᵀ 0] has the same solution."""
+    coords = cloud(dim, degree, batch=1)
+    scaled = coords[0] / coords[0].norm(dim=1).max()
+    v, omega = monomials(scaled, degree), window(scaled.norm(dim=1))
+    size, columns = v.shape
+    kkt = torch.zeros(size + columns, size + columns, dtype=torch.float64)
+    kkt[:size, :size] = (2 / omega).diag()
+    kkt[:size, size:], kkt[size:, :size] = v, v.T
+    zero = torch.zeros(dim, dtype=torch.float64)
+    right = torch.zeros(size + columns, dtype=torch.float64)
+    right[size:] = hessian(lambda y: monomials(y, degree))(zero).diagonal(dim1=1, dim2=2).sum(-1)
+    expected = torch.linalg.solve(kkt, right)[:size]
+    weights = least_squares_weights(coords, degree)
+    found = weights.laplacian[0] * weights.radius**2
+    close(found[1:], expected, expected.abs().max())
+    close(found[0], -expected.sum(), expected.abs().max())
+
+
+@pytest.mark.parametrize(("dim", "degree"), [(2, 3), (2, 4), (3, 3)])
+def test_polyharmonic_weights_are_derivatives_of_the_interpolant(dim, degree):
+    """s(y) = Σ c_j |y − y_j|⁵ + polynomial with s(y_j) = f_j, Σ c_j y_j^α = 0: w·f = Δs(0), by autograd."""
+    coords = cloud(dim, degree, batch=1)
+    nodes = torch.cat([torch.zeros(1, dim).double(), coords[0]])
+    nodes = nodes / nodes.norm(dim=1).max()
+    f = torch.randn(len(nodes), dtype=torch.float64)
+    kernel = torch.cdist(nodes, nodes) ** 5
+    v = torch.cat([torch.ones(len(nodes), 1).double(), monomials(nodes, degree)], 1)
+    size, columns = v.shape
+    system = torch.zeros(size + columns, size + columns, dtype=torch.float64)
+    system[:size, :size], system[:size, size:], system[size:, :size] = kernel, v, v.T
+    right = torch.cat([f, torch.zeros(columns).double()])
+    c, b = torch.linalg.solve(system, right).split([size, columns])
+
+    def spline(y):
+        square = (y - nodes).square().sum(1)
+        return (c * square.pow(2.5)).sum() + b[0] + monomials(y, degree) @ b[1:]
+
+    # Not at 0 itself, where the root of autograd is singular: the derivative of r⁵ there is 0.
+    here = torch.full((dim,), 1e-7, dtype=torch.float64)
+    expected = hessian(spline)(here).trace()
+    weights = polyharmonic_weights(coords, degree)
+    found = weights.laplacian[0] @ f * weights.radius[0] ** 2
+    assert abs(found - expected) <= 1e-4 * weights.laplacian.abs().sum() * weights.radius[0] ** 2
+    # And a node value alone gives its own weight: cardinality of the interpolant.
+    assert found.isfinite()
+
+
+@pytest.mark.parametrize(("dim", "degree"), [(1, 2), (2, 2), (2, 3), (3, 2)])
+def test_positive_weights_are_positive_and_consistent(dim, degree):
+    """w_j ≥ 0 for j ≠ i wherever a positive stencil is found, with all moments of degree ≤ m."""
+    coords = cloud(dim, degree, batch=40, factor=6)
+    weights = positive_weights(coords, degree)
+    good = weights.residual <= 1e-10
+    assert good.double().mean() > 0.9
+    w, others = weights.laplacian[good], weights.laplacian[good, 1:]
+    assert (others >= -1e-12 * others.abs().amax(1, keepdim=True)).all()
+    assert (w[:, 0] < 0).all()
+    f = polynomial(dim, degree)
+    exact = hessian(f)(torch.zeros(dim).double()).trace()
+    close(applied(w, f, coords[good]), exact.expand(len(w)), w.abs().sum(1).max())
+
+
+def test_positive_weights_give_up_where_there_are_none():
+    """All neighbours on one side: no positive weights have Σ w y = 0, and the residual or the deficit says so."""
+    coords = cloud(2, 2, factor=6)
+    coords[..., 0] = coords[..., 0].abs() + 0.05
+    weights = positive_weights(coords, 2)
+    negative = (weights.laplacian[:, 1:] < -1e-10 * weights.laplacian.abs().amax()).any(1)
+    assert (negative | (weights.residual > 1e-10) | (weights.deficit > 0)).all()
+
+
+@pytest.mark.parametrize("rule", RULES)
+def test_collinear_neighbours_are_reported(rule):
+    """Points of a line do not determine y₂: the rank falls short and nothing is raised."""
+    t = torch.linspace(-1, 1, 24, dtype=torch.float64)
+    coords = torch.stack([t, 2 * t], dim=1)[None]
+    assert RULES[rule](coords, 2).deficit.item() > 0
+
+
+def test_neighbours_on_a_conic_are_reported():
+    """y₁² + y₂² = 1 on all of them, so Δ is not determined at degree 2; the residual of the moments is not small."""
+    angle = 2 * torch.pi * torch.arange(12, dtype=torch.float64) / 12
+    coords = torch.stack([angle.cos(), angle.sin()], 1)[None]
+    poised = torch.cat([coords, 0.5 * coords], dim=1)
+    good = least_squares_weights(poised, 2)
+    assert good.deficit.item() == 0
+    assert good.residual.item() < 1e-12
+    # Without the constant, |y|² alone is still independent of the linear monomials: the circle is a fine stencil.
+    ring = least_squares_weights(coords, 2)
+    close(ring.laplacian[0, 1:], torch.full((12,), 4 / 12).double())
+    # |y|² (y₁ − 2) + y₁ (…) vanishes there at degree 3: y₁³ + y₁y₂² − y₁ = 0.
+    assert least_squares_weights(coords, 3).deficit.item() > 0
+
+
+def test_left_out_neighbours_have_no_weight():
+    coords = cloud(2, 2)
+    keep = torch.rand(coords.shape[:2]) < 0.8
+    weights = least_squares_weights(coords, 2, keep)
+    assert (weights.laplacian[:, 1:][~keep] == 0).all()
+    f = polynomial(2, 2)
+    exact = hessian(f)(torch.zeros(2).double()).trace()
+    close(applied(weights.laplacian, f, coords), exact.expand(3), weights.laplacian.abs().max())
+
+
+@pytest.mark.parametrize("degree", [2, 3, 4])
+def test_flux_data_stand_in_for_moments(degree):
+    """A polynomial with ∂_ν f = 0 at the boundary points of the stencil has the exact Δ from values alone.
+
+    Boundary y₁ = 0 with ν = −e₁, f even in y₁; all neighbours lie on y₁ ≥ 0 and the centre on it or off it.
+    """
+    for offset in (0.0, 0.3):
+        coords = cloud(2, degree)
+        coords[..., 0] = coords[..., 0].abs() - offset
+        coords[:, :6, 0] = -offset
+        flux = torch.zeros(3, coords.shape[1] + 1, 2, dtype=torch.float64)
+        flux[:, 1:7, 0] = -1
+        if offset == 0:
+            flux[:, 0, 0] = -1
+        weights = least_squares_weights(coords, degree, flux=flux)
+
+        def even(y, offset=offset):
+            x = y[..., 0] + offset
+            return (x**2 * (1.5 if degree < 4 else 1.5 + x**2)) + y[..., 1] ** 2 - 2 * y[..., 1]
+
+        exact = hessian(even)(torch.zeros(2, dtype=torch.float64)).trace()
+        scale = weights.laplacian.abs().sum(1).max()
+        close(applied(weights.laplacian, even, coords), exact.expand(3), scale)
+
+
+def test_condition_is_that_of_the_column_scaled_system():
+    coords = cloud(2, 3, batch=1)
+    weights = least_squares_weights(coords, 3)
+    scaled = coords[0] / weights.radius
+    system = window(scaled.norm(dim=1)).sqrt()[:, None] * monomials(scaled, 3)
+    expected = torch.linalg.cond(system / system.norm(dim=0))
+    close(weights.condition[0], expected, expected)
+
+
+def test_typical_growth_is_what_many_even_neighbours_give():
+    """ρ² Σ|w| over rings of a lattice of 700 points is near it; a lattice is scaled by its own radius."""
+    coords = grid(16)
+    coords = coords[:, coords[0].norm(dim=1) < 15]
+    for degree in (2, 4, 6):
+        weights = least_squares_weights(coords, degree)
+        growth = weights.radius**2 * weights.laplacian.abs().sum(1)
+        assert abs(growth.item() / typical_growth(2, degree) - 1) < 0.1
+    assert typical_growth(1, 2) < typical_growth(2, 2) < typical_growth(3, 2)
+
+
+def test_weights_can_be_picked_and_stacked():
+    weights = least_squares_weights(cloud(2, 2), 2)
+    again = Weights.stack([weights[torch.tensor([2])], weights[torch.tensor([0, 1])]])
+    assert torch.equal(again.laplacian, weights.laplacian[[2, 0, 1]])
+    assert torch.equal(again.condition, weights.condition[[2, 0, 1]])
+
+
+def test_window_decreases_from_one_to_zero():
+    """ω(r) = (1 − (r/1.1)²)⁴, 0 beyond 1.1."""
+    r = torch.linspace(0, 2, 201, dtype=torch.float64)
+    omega = window(r)
+    close(omega[100], torch.tensor((1 - 1 / 1.21) ** 4).double())
+    assert (omega.diff() <= 0).all()
+    assert (omega[r > 1.1] == 0).all()
