@@ -37,7 +37,7 @@ FOUR = {
 }
 OTHERS = {  # of other dimensions or codimensions, and how many fewer points they take
     "CliffordTorus": (surfaces.CliffordTorus(), 1),
-    "ThreeSphere": (surfaces.ThreeSphere(), 1),
+    "ThreeSphere": (surfaces.ThreeSphere(), 4),
     "Circle": (surfaces.Circle(), 16),
     "SpaceCurve": (surfaces.SpaceCurve(), 16),
 }
@@ -308,21 +308,21 @@ def orders(quick: bool, sizes: Sequence[int] | None) -> None:
 
 def orders_random(quick: bool, sizes: Sequence[int] | None) -> None:
     """The same on independent points, uniform in area."""
-    sizes = even_sizes(quick, sizes)[-3:]
+    sizes = sizes or ((500, 1000, 2000) if quick else (2000, 4000, 8000))
     print(f"\nMeans over 2 seeds, 1 at N={sizes[-1]}.")
     variants = [("tangent", p) for p in range(1, 6)]
     shapes = {k: (v, sizes) for k, v in FOUR.items()}
     sweep(AT_RANDOM, shapes, variants, lambda n: 1 + (n < sizes[-1]), 0.5)
-    certified(sizes[0])
+    certified(sizes[-2])
 
 
 def orders_dimensions(quick: bool, sizes: Sequence[int] | None) -> None:
     """The same on quasi-uniform points of manifolds of other dimensions and codimensions."""
     sizes = even_sizes(quick, sizes)
     variants = [(way, p) for way in ("tangent", "normal") for p in (1, 3)]
-    for dims in ((2, 3), (1,)):
-        chosen = {k: v for k, v in OTHERS.items() if v[0].dim in dims}
-        shapes = {k: (s, [n // fewer for n in sizes]) for k, (s, fewer) in chosen.items()}
+    for fewer in sorted({fewer for _, fewer in OTHERS.values()}):
+        few = [n // fewer for n in sizes]
+        shapes = {k: (shape, few) for k, (shape, share) in OTHERS.items() if share == fewer}
         sweep(EVENLY, shapes, variants, lambda n: 1, 0.3)
 
 
@@ -459,7 +459,7 @@ def sphere4070(quick: bool, sizes: Sequence[int] | None) -> None:
 
 def theorem(quick: bool, sizes: Sequence[int] | None) -> None:
     """Both terms of the error h^p + h^q, and p = q = 2 beside the cotangent formula."""
-    sizes = even_sizes(quick, sizes)
+    sizes = sizes or ((500, 1000, 2000) if quick else (2000, 4000, 8000))
     order, rows, misses = 4, [], []
     for label, ways in {"Torus": ("normal", "tangent"), "Sphere": ("normal",)}.items():
         surface = FOUR[label]

@@ -117,15 +117,18 @@ def test_nine_points_of_a_square_lattice():
     assert 0 < a[0] < 0.5
 
 
-def test_positive_weights_of_the_cross_are_the_five_point_stencil():
-    """Without the corners there is one: [1, 1, −4, 1, 1] / h²; xy is then left out by two more lattice points."""
+def test_five_points_of_a_square_lattice():
+    """[1, 1, −4, 1, 1] / h², forced by one corner more, whose own weight Σ w xy = 0 makes zero."""
     h = 0.5
-    coords = grid(1, h)
-    keep = coords[0].abs().sum(1) < 1.5 * h
-    weights = least_squares_weights(coords[:, keep], 3, None)
-    assert weights.deficit.item() > 0  # no xy on the cross: not poised, and said so
-    line = least_squares_weights(coords[:, keep][..., :1][:, [0, 3]], 2).laplacian
-    close(h**2 * line, torch.tensor([[-2.0, 1, 1]], dtype=torch.float64))
+    cross = h * torch.tensor([[1.0, 0], [-1, 0], [0, 1], [0, -1], [1, 1]], dtype=torch.float64)
+    weights = h**2 * least_squares_weights(cross[None], 2).laplacian[0]
+    close(weights, torch.tensor([-4.0, 1, 1, 1, 1, 0], dtype=torch.float64))
+
+
+def test_a_cross_without_corners_is_reported():
+    """y₁y₂ vanishes on all its eight points."""
+    unit = torch.tensor([[1.0, 0], [-1, 0], [0, 1], [0, -1]], dtype=torch.float64)
+    assert least_squares_weights(torch.cat([unit, 2 * unit])[None], 2).deficit.item() == 1
 
 
 @pytest.mark.parametrize("rule", WEIGHT_RULES)
@@ -134,11 +137,11 @@ def test_scaling(scale, rule):
     """y → s y: Δ scales by s⁻², the gradient by s⁻¹, the radius by s; the numbers of quality do not move."""
     coords = cloud(2, 3, factor=4)
     one, other = (WEIGHT_RULES[rule](c, 3) for c in (coords, scale * coords))
-    size = one.laplacian.abs().max()
-    close(other.laplacian * scale**2, one.laplacian, size)
-    close(other.hessian * scale**2, one.hessian, size)
-    close(other.gradient * scale, one.gradient, one.gradient.abs().max())
-    close(other.radius / scale, one.radius)
+    # The saddle system of the spline has a condition of about 1e7; least squares has next to none.
+    tolerance = 1e-5 if rule == "polyharmonic" else 1e-12
+    for name, power in (("laplacian", 2), ("hessian", 2), ("gradient", 1), ("radius", -1)):
+        a, b = getattr(one, name), getattr(other, name) * scale**power
+        assert (a - b).abs().max() <= tolerance * a.abs().max()
     close(other.condition, one.condition, one.condition)
     assert torch.equal(other.deficit, one.deficit)
 
@@ -197,8 +200,6 @@ def test_polyharmonic_weights_are_derivatives_of_the_interpolant(dim, degree):
     weights = polyharmonic_weights(coords, degree)
     found = weights.laplacian[0] @ f * weights.radius[0] ** 2
     assert abs(found - expected) <= 1e-4 * weights.laplacian.abs().sum() * weights.radius[0] ** 2
-    # And a node value alone gives its own weight: cardinality of the interpolant.
-    assert found.isfinite()
 
 
 @pytest.mark.parametrize(("dim", "degree"), [(1, 2), (2, 2), (2, 3), (3, 2)])
@@ -233,19 +234,13 @@ def test_collinear_neighbours_are_reported(rule):
     assert RULES[rule](coords, 2).deficit.item() > 0
 
 
-def test_neighbours_on_a_conic_are_reported():
-    """y₁² + y₂² = 1 on all of them, so Δ is not determined at degree 2; the residual of the moments is not small."""
+def test_neighbours_on_a_circle():
+    """At degree 2 they are 4 / (12 ρ²) each, the mean value property; y₁³ + y₁y₂² − y₁ = 0 there ends degree 3."""
     angle = 2 * torch.pi * torch.arange(12, dtype=torch.float64) / 12
-    coords = torch.stack([angle.cos(), angle.sin()], 1)[None]
-    poised = torch.cat([coords, 0.5 * coords], dim=1)
-    good = least_squares_weights(poised, 2)
-    assert good.deficit.item() == 0
-    assert good.residual.item() < 1e-12
-    # Without the constant, |y|² alone is still independent of the linear monomials: the circle is a fine stencil.
-    ring = least_squares_weights(coords, 2)
-    close(ring.laplacian[0, 1:], torch.full((12,), 4 / 12).double())
-    # |y|² (y₁ − 2) + y₁ (…) vanishes there at degree 3: y₁³ + y₁y₂² − y₁ = 0.
-    assert least_squares_weights(coords, 3).deficit.item() > 0
+    coords = 0.1 * torch.stack([angle.cos(), angle.sin()], 1)[None]
+    expected = torch.full((12,), 1 / 3, dtype=torch.float64)
+    close(least_squares_weights(coords, 2).laplacian[0, 1:] * 0.01, expected)
+    assert least_squares_weights(coords, 3).deficit.item() == 2
 
 
 def test_left_out_neighbours_have_no_weight():

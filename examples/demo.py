@@ -1,0 +1,146 @@
+"""A high-order Laplacian on a real surface: its report, its accuracy beside the cotangent's, two pictures.
+
+Usage: python examples/demo.py [--mesh FILE] [--order 3] [--out demo_output] [--quick]
+"""
+
+import argparse
+import sys
+import time
+from pathlib import Path
+
+import matplotlib as mpl
+
+mpl.use("Agg")  # pictures go to files; no screen is needed
+import matplotlib.pyplot as plt
+import numpy as np
+import torch
+import trimesh
+from tqdm import tqdm
+
+from torchlb import LaplaceBeltrami, clean_mesh
+from torchlb.plot import plot_convergence, plot_orders, plot_points, plot_surface
+from torchlb.surfaces import Ellipsoid, Torus, smooth_function
+
+SIDES = [(15.0, 200.0), (15.0, 20.0)]  # views of the user's surface: elevation, azimuth
+
+
+def cortex():
+    """The left cortical surface fsaverage5, mm: 10,242 vertices that come with nilearn. A torus without it."""
+    try:
+        from nilearn.datasets import fetch_surf_fsaverage
+        from nilearn.surface import load_surf_mesh
+    except ImportError:
+        print("nilearn is not installed, so a torus stands in for its cortex (pip install nilearn)")
+        return *Torus().mesh(6000), "torus", ""
+    surface = load_surf_mesh(fetch_surf_fsaverage("fsaverage5")["pial_left"])  # no download
+    vertices = np.asarray(surface.coordinates, dtype=np.float64)
+    faces = np.asarray(surface.faces, dtype=np.int64)
+    return torch.tensor(vertices), torch.tensor(faces), "fsaverage5 (left pial surface)", "mm"
+
+
+def read(path):
+    """Vertices, faces (None for a cloud), name and unit of a file; ValueError if it is not a surface or cloud."""
+    if not path.is_file():
+        raise ValueError(f"{path}: no such file")
+    try:
+        shape = trimesh.load(path, process=False)
+        if isinstance(shape, trimesh.Scene):
+            shape = trimesh.util.concatenate(shape.dump())
+        vertices = torch.tensor(np.array(shape.vertices, dtype=np.float64))
+        faces = torch.tensor(np.array(getattr(shape, "faces", [])), dtype=torch.int64)
+    except Exception as error:  # each reader of trimesh has its own
+        raise ValueError(
+            f"{path}: not a file that trimesh reads as a mesh or cloud, such as .ply, .obj, .off, .stl ({error})"
+        ) from error
+    places, merged = torch.unique(vertices, dim=0, return_inverse=True)
+    if len(places) < len(vertices):
+        print(f"{len(vertices) - len(places)} vertices share a place with another and are merged")
+        vertices, faces = places, merged[faces]
+    if len(faces) == 0:
+        print(f"{path.name} has no faces: it is taken for a cloud")
+        return vertices, None, path.name, ""
+    count = len(vertices)
+    vertices, faces, kept = clean_mesh(vertices, faces)
+    if len(kept) < count:
+        print(f"{count - len(kept)} vertices belong to no face and are left out (clean_mesh)")
+    return vertices, faces, path.name, ""
+
+
+def accuracy(sizes, orders=(1, 3, 5)):
+    """Relative errors of Δf on meshes of an ellipsoid: torchlb's orders and the cotangent's."""
+    surface = Ellipsoid()
+    errors = {"cotangent": []} | {f"order {p}": [] for p in orders}
+    with tqdm(total=len(sizes) * len(errors), desc="accuracy", delay=2, leave=False) as bar:
+        for n in sizes:
+            vertices, faces = surface.mesh(n)
+            f, exact = smooth_function(vertices), surface.laplacian(smooth_function, vertices)
+            for name, column in errors.items():
+                if name == "cotangent":
+                    lb = LaplaceBeltrami.from_cotangent(vertices, faces)
+                else:
+                    order = int(name.split()[1])
+                    lb = LaplaceBeltrami.from_mesh(vertices, faces, order=order, progress=False)
+                column.append(float((lb(f) - exact).norm() / exact.norm()))
+                bar.update()
+    print("\nrelative error of Δf on an ellipsoid with N vertices")
+    print(f"{'N':>6}" + "".join(f"{name:>12}" for name in errors))
+    for n, *row in zip(sizes, *errors.values(), strict=True):
+        print(f"{n:>6}" + "".join(f"{error:12.1e}" for error in row))
+    return errors
+
+
+def draw_accuracy(sizes, errors, path):
+    figure, ax = plt.subplots(figsize=(7, 5), layout="constrained")
+    plot_convergence(sizes, errors, ax=ax, title="Δf of a smooth f on an ellipsoid")
+    figure.savefig(path, dpi=150)
+    plt.close(figure)
+
+
+def draw_surface(vertices, faces, lb, name, unit, path):
+    """f, Δf and the order reached, side by side, each from two sides."""
+    low, high = vertices.amin(0), vertices.amax(0)
+    f = smooth_function(3 * (vertices - (low + high) / 2) / (high - low).max())  # in [−1.5, 1.5]³
+    figure, axes = plt.subplots(1, 3, figsize=(15, 6.5), layout="constrained")
+    panels = [(f, "a smooth function f", ""), (lb(f), "Δf", f"1/{unit}²" if unit else "1/length²")]
+    for ax, (values, title, label) in zip(axes, panels, strict=False):
+        if faces is None:
+            plot_points(vertices, values, ax=ax, title=title, label=label, view=SIDES)
+        else:
+            plot_surface(vertices, faces, values, ax=ax, title=title, label=label, view=SIDES)
+    plot_orders(vertices, faces, lb.report.order, ax=axes[2], view=SIDES)
+    figure.suptitle(f"{name}, {len(vertices):,} points\n", fontsize="x-large")
+    figure.savefig(path, dpi=130)
+    plt.close(figure)
+
+
+def main(arguments=None):
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--mesh", type=Path, help="a mesh or cloud, any file that trimesh reads")
+    parser.add_argument("--order", type=int, default=3, help="order of accuracy (default: 3)")
+    parser.add_argument("--out", type=Path, default=Path("demo_output"), help="for the pictures")
+    parser.add_argument("--quick", action="store_true", help="a smaller table")
+    options = parser.parse_args(arguments)
+    try:
+        vertices, faces, name, unit = read(options.mesh) if options.mesh else cortex()
+        start = time.perf_counter()
+        if faces is None:
+            lb = LaplaceBeltrami.from_points(vertices, order=options.order)
+        else:
+            lb = LaplaceBeltrami.from_mesh(vertices, faces, order=options.order)
+    except ValueError as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 1
+    print(f"\n{name}\n{lb}\nbuilt in {time.perf_counter() - start:.1f} s\n\n{lb.report}")
+    if lb.certificate is not None:
+        print(lb.certificate)
+    sizes = [250, 500, 1000] if options.quick else [500, 1000, 2000, 4000, 8000]
+    errors = accuracy(sizes)
+    options.out.mkdir(parents=True, exist_ok=True)
+    draw_accuracy(sizes, errors, options.out / "accuracy.png")
+    draw_surface(vertices, faces, lb, name, unit, options.out / "surface.png")
+    print(f"\n{options.out / 'accuracy.png'}\n{options.out / 'surface.png'}")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,134 @@
+"""Every example runs, writes its pictures, and says what is wrong with a file that it cannot use."""
+
+import importlib.util
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+
+from torchlb.surfaces import Ellipsoid
+
+pytest.importorskip("matplotlib")
+EXAMPLES = Path(__file__).parents[1] / "examples"
+PNG = b"\x89PNG"
+
+
+def load(name):
+    """The module of an example."""
+    spec = importlib.util.spec_from_file_location(f"example_{name}", EXAMPLES / f"{name}.py")
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+@pytest.fixture(scope="module")
+def demo():
+    return load("demo")
+
+
+@pytest.fixture
+def table(demo, monkeypatch):
+    """Leave the table of errors, which every run of the demo has, to the one test that is about it."""
+    monkeypatch.setattr(demo, "accuracy", lambda sizes: {"made up": [1 / n for n in sizes]})
+
+
+@pytest.fixture(scope="module")
+def ellipsoid():
+    vertices, faces = Ellipsoid().mesh(250)
+    return trimesh.Trimesh(vertices.numpy(), faces.numpy(), process=False)
+
+
+def pictures_in(folder):
+    names = sorted(path.name for path in folder.iterdir())
+    assert all(path.read_bytes().startswith(PNG) for path in folder.iterdir())
+    return names
+
+
+def test_demo_prints_report_certificate_and_table_and_writes_two_pictures(
+    demo, ellipsoid, tmp_path, capsys
+):
+    ellipsoid.export(tmp_path / "ellipsoid.ply")
+    out = tmp_path / "new" / "folder"
+    assert demo.main(["--mesh", str(tmp_path / "ellipsoid.ply"), "--out", str(out), "--quick"]) == 0
+    printed = capsys.readouterr().out
+    assert pictures_in(out) == ["accuracy.png", "surface.png"]
+    for part in (
+        "ellipsoid.ply\nLaplaceBeltrami(250 points",
+        "built in",
+        "250 points, order 3 requested",
+        "certificate holds",
+        "cotangent",
+        "   250 ",
+        "  1000 ",
+        str(out / "accuracy.png"),
+        str(out / "surface.png"),
+    ):
+        assert part in printed, part
+
+
+@pytest.mark.usefixtures("table")
+def test_demo_takes_a_cloud_for_a_file_without_faces(demo, ellipsoid, tmp_path, capsys):
+    trimesh.PointCloud(ellipsoid.vertices).export(tmp_path / "cloud.ply")
+    out = tmp_path / "out"
+    assert (
+        demo.main(["--mesh", str(tmp_path / "cloud.ply"), "--out", str(out), "--order", "2"]) == 0
+    )
+    printed = capsys.readouterr().out
+    assert "has no faces: it is taken for a cloud" in printed
+    assert "from points, order=2" in printed
+    assert pictures_in(out) == ["accuracy.png", "surface.png"]
+
+
+def test_demo_leaves_out_vertices_without_faces_and_says_so(demo, ellipsoid, tmp_path, capsys):
+    vertices = np.concatenate([ellipsoid.vertices, [[9.0, 9, 9], [8, 8, 8]]])
+    trimesh.Trimesh(vertices, ellipsoid.faces, process=False).export(tmp_path / "more.ply")
+    read, faces, name, _ = demo.read(tmp_path / "more.ply")
+    assert (len(read), len(faces), name) == (250, len(ellipsoid.faces), "more.ply")
+    assert "2 vertices belong to no face and are left out" in capsys.readouterr().out
+
+
+def test_demo_merges_the_corners_of_loose_triangles(demo, ellipsoid, tmp_path, capsys):
+    ellipsoid.export(tmp_path / "soup.stl")  # each triangle with corners of its own
+    vertices, faces, _, _ = demo.read(tmp_path / "soup.stl")
+    assert (len(vertices), len(faces)) == (250, len(ellipsoid.faces))
+    assert "share a place with another and are merged" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "message"),
+    [
+        ("missing.ply", None, "no such file"),
+        ("prose.txt", "no mesh", "not a file that trimesh reads"),
+        ("prose.ply", "no mesh", "not a file that trimesh reads"),
+        ("prose.obj", "no mesh", "not a file that trimesh reads"),
+        ("few.xyz", "0 0 0\n1 0 0\n0 1 0\n", "3 points are fewer than the 15"),
+    ],
+)
+def test_demo_ends_with_1_and_a_message_for_a_file_that_is_no_use(
+    demo, tmp_path, capsys, name, content, message
+):
+    if content is not None:
+        (tmp_path / name).write_text(content)
+    out = tmp_path / "out"
+    assert demo.main(["--mesh", str(tmp_path / name), "--out", str(out), "--quick"]) == 1
+    error = capsys.readouterr().err
+    assert error.startswith("error: ")
+    assert message in error
+    assert not out.exists()
+
+
+def test_demo_brings_a_closed_surface(demo):
+    pytest.importorskip("nilearn")
+    vertices, faces, name, unit = demo.cortex()
+    assert (tuple(vertices.shape), tuple(faces.shape)) == ((10242, 3), (20480, 3))
+    assert ("fsaverage5" in name, unit) == (True, "mm")
+    assert trimesh.Trimesh(vertices.numpy(), faces.numpy(), process=False).is_watertight
+
+
+def test_demo_draws_a_torus_where_nilearn_is_missing(demo, monkeypatch, capsys):
+    monkeypatch.setitem(sys.modules, "nilearn.datasets", None)
+    vertices, _, name, _ = demo.cortex()
+    assert (len(vertices), name) == (6000, "torus")
+    assert "nilearn is not installed" in capsys.readouterr().out

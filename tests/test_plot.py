@@ -1,0 +1,171 @@
+"""Pictures: what is drawn is what was given, in the order and the colours that the documentation says."""
+
+import builtins
+
+import numpy as np
+import pytest
+import torch
+from jaxtyping import TypeCheckError
+
+from torchlb.plot import plot_convergence, plot_orders, plot_points, plot_surface
+from torchlb.surfaces import Sphere, smooth_function
+
+plt = pytest.importorskip("matplotlib.pyplot")
+WRONG = (ValueError, TypeCheckError)  # the suite checks the shapes in the signatures, too
+
+
+@pytest.fixture(autouse=True)
+def close_figures():
+    yield
+    plt.close("all")
+
+
+@pytest.fixture(scope="module")
+def sphere():
+    return Sphere().mesh(200)
+
+
+def colorbar_limits(ax):
+    """Limits of the colours, from the colour bar that stands beside the axes."""
+    (bar,) = [other for other in ax.figure.axes if other is not ax]
+    return bar.get_ylim()
+
+
+def test_surface_draws_every_triangle_once_from_back_to_front(sphere):
+    vertices, faces = sphere
+    ax = plot_surface(vertices, faces, smooth_function(vertices), view=(90.0, -90.0), title="f")
+    (triangles,) = ax.collections
+    drawn = np.array([path.vertices[:3] for path in triangles.get_paths()])
+    assert len(drawn) == len(faces)
+    assert ax.get_title() == "f"
+    assert ax.get_aspect() == 1
+    depth = vertices[faces][..., 2].mean(1).sort()
+    expected = vertices[faces[depth.indices]][:, :, :2].numpy()  # seen from above: x right, y up
+    size = np.ptp(expected, axis=(1, 2))
+    assert np.allclose(np.ptp(drawn, axis=(1, 2)), size, rtol=1e-5)
+
+
+def test_several_views_do_not_overlap(sphere):
+    vertices, faces = sphere
+    ax = plot_surface(vertices, faces, vertices[:, 0], view=[(0.0, 0.0), (0.0, 180.0)])
+    above, below = [
+        np.concatenate([path.vertices for path in views.get_paths()]) for views in ax.collections
+    ]
+    assert below[:, 1].max() < above[:, 1].min()
+
+
+@pytest.mark.parametrize("draw", ["surface", "cloud"])
+def test_colors_are_around_zero_for_both_signs_and_ignore_outliers(sphere, draw):
+    vertices, faces = sphere
+    values = vertices[:, 0].clone()
+    values[0] = 1e6
+    if draw == "surface":
+        ax = plot_surface(vertices, faces, values)
+    else:
+        ax = plot_points(vertices, values)
+    low, high = colorbar_limits(ax)
+    assert low == -high
+    assert 0.8 < high < 1.2
+
+
+def test_colors_of_one_sign_start_at_the_least_value_and_a_constant_has_a_range(sphere):
+    vertices, faces = sphere
+    low, high = colorbar_limits(plot_surface(vertices, faces, 5 + vertices[:, 0]))
+    assert 4 <= low < 4.2
+    assert 5.8 < high <= 6
+    low, high = colorbar_limits(plot_surface(vertices, faces, torch.full((200,), 3.0)))
+    assert low < 3 < high
+
+
+def test_nan_is_grey(sphere):
+    vertices, _ = sphere
+    ax = plot_points(vertices, torch.full((200,), torch.nan))
+    colors = ax.collections[0].get_facecolors()
+    assert np.ptp(colors[:, :3], axis=1).max() < 1e-12
+
+
+def test_arrays_and_tensors_that_require_gradients_are_taken_too(sphere):
+    vertices, faces = sphere
+    values = smooth_function(vertices)
+    plot_surface(vertices.numpy(), faces.numpy(), values.numpy())
+    plot_surface(vertices.requires_grad_(), faces, values.float())
+    vertices.requires_grad_(False)
+
+
+def test_points_of_the_plane_keep_their_coordinates_apart_from_a_shift():
+    points = torch.rand(50, 2)
+    ax = plot_points(points, points[:, 0], size=4.0)
+    drawn = np.asarray(ax.collections[0].get_offsets())
+    assert np.allclose(np.ptp(drawn, axis=0), np.ptp(points.numpy(), axis=0), atol=1e-6)
+
+
+def test_order_map_counts_points_and_shows_the_lowest_order_of_a_triangle():
+    vertices = torch.tensor([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [1, 1, 0]])
+    faces = torch.tensor([[0, 1, 2], [1, 3, 2]])
+    order = torch.tensor([0, 3, 3, 9])
+    ax = plot_orders(vertices, faces, order)
+    texts = [text.get_text() for text in ax.get_legend().get_texts()]
+    assert texts == ["order 9: 1", "order 3: 2", "fallback: 1"]
+    hues = ax.collections[0].get_facecolors()[:, :3]
+    hues = hues / hues.max(axis=1, keepdims=True)
+    expected = np.array([[0xD5, 0x5E, 0x00], [0x56, 0xB4, 0xE9]])
+    expected = expected / expected.max(axis=1, keepdims=True)
+    distance = np.abs(hues[:, None] - expected).max(axis=2)
+    assert sorted(distance.argmin(axis=1)) == [0, 1]
+    assert distance.min(axis=1).max() < 1e-6
+    cloud = plot_orders(vertices, None, order)
+    assert [text.get_text() for text in cloud.get_legend().get_texts()] == texts
+
+
+@pytest.mark.parametrize(("dim", "expected"), [(2, "4.0"), (1, "2.0")])
+def test_measured_order_is_the_slope_against_the_spacing(dim, expected):
+    sizes = [100, 400, 1600, 6400]
+    errors = {"squared": [n**-2.0 for n in sizes], "exact": [0.0] * 4}
+    ax = plot_convergence(sizes, errors, dim=dim)
+    squared, exact = [text.get_text() for text in ax.get_legend().get_texts()]
+    assert squared == f"squared:  $h^{{{expected}}}$"
+    assert exact == "exact"
+    assert ax.get_xscale() == ax.get_yscale() == "log"
+
+
+def test_reference_lines_have_whole_slopes_and_stay_inside():
+    sizes = [100, 200, 400]
+    ax = plot_convergence(sizes, {"p": [n**-1.9 for n in sizes], "q": [n**-0.6 for n in sizes]})
+    fan = [line for line in ax.lines if line.get_linestyle() == "--"]
+    powers = []
+    for line in fan:
+        x, y = np.log(line.get_xdata()), np.log(line.get_ydata())
+        powers.append(-2 * (y[1] - y[0]) / (x[1] - x[0]))
+        assert ax.get_ylim()[0] <= line.get_ydata()[1] * (1 + 1e-9)
+    assert np.allclose(powers, [1, 4])
+
+
+def test_what_does_not_fit_is_refused(sphere):
+    vertices, faces = sphere
+    values = vertices[:, 0]
+    with pytest.raises(WRONG):
+        plot_surface(vertices, faces, values[:-1])
+    with pytest.raises(WRONG):
+        plot_surface(vertices[:, :2], faces, values)
+    with pytest.raises(ValueError, match=r"indices 0 … 199, got 0 … 200"):
+        plot_surface(vertices, torch.tensor([[0, 1, 200]]), values)
+    with pytest.raises(ValueError, match=r"choose the coordinates to draw"):
+        plot_points(torch.rand(9, 4), torch.rand(9))
+    with pytest.raises(ValueError, match=r"expected 2, one for a size, got 1"):
+        plot_convergence([10, 20], {"p": [0.1]})
+    with pytest.raises(ValueError, match=r"expected some that are positive"):
+        plot_convergence([10, 20], {"p": [0.0, 0.0]})
+
+
+def test_without_matplotlib_the_error_says_what_to_install(sphere, monkeypatch):
+    vertices, faces = sphere
+    real = builtins.__import__
+
+    def without(name, *args, **kwargs):
+        if name.startswith("matplotlib"):
+            raise ImportError(name)
+        return real(name, *args, **kwargs)
+
+    monkeypatch.setattr(builtins, "__import__", without)
+    with pytest.raises(ImportError, match=r"pip install torchlb\[plot\]"):
+        plot_surface(vertices, faces, vertices[:, 0])

@@ -1,0 +1,123 @@
+"""The report counts every point, and says why a point is below the order that was asked for."""
+
+from functools import cache
+
+import pytest
+import torch
+import trimesh
+
+from torchlb import LaplaceBeltrami
+from torchlb.rows import REASONS
+from torchlb.surfaces import Sphere, Torus
+from torchlb.weights import typical_growth
+
+
+@cache
+def cube():
+    """The unit cube with 386 vertices and its sharp edges, and the operator at order 3."""
+    mesh = trimesh.creation.box()
+    for _ in range(3):
+        mesh = mesh.subdivide()
+    vertices, faces = torch.tensor(mesh.vertices), torch.tensor(mesh.faces)
+    return vertices.double(), LaplaceBeltrami.from_mesh(vertices.double(), faces.long(), order=3)
+
+
+@cache
+def sphere():
+    return LaplaceBeltrami.from_points(Sphere().points(500), order=3)
+
+
+def edges_near(vertices):
+    """How many of the three coordinates are within 0.01 of the rim: 1 in a face, 2 on an edge, 3 at a corner."""
+    return ((vertices.abs() - 0.5).abs() < 0.01).sum(1)
+
+
+def test_counts_add_up():
+    for lb in (sphere(), cube()[1]):
+        report = lb.report
+        assert sum(report.order_counts.values()) == lb.num_points
+        assert list(report.order_counts) == [3, 2, 1, 0]
+        below = int((report.order < 3).sum())
+        assert sum(report.reason_counts.values()) == below
+        assert set(report.reason_counts) <= set(REASONS[1:])
+        assert torch.equal(report.reason > 0, report.order < 3)
+
+
+def test_a_smooth_cloud_reaches_the_order_everywhere():
+    report = sphere().report
+    assert report.order_counts == {3: 500, 2: 0, 1: 0, 0: 0}
+    assert report.reason_counts == {}
+    assert (report.normal_order == 4).all()
+
+
+def test_numbers_are_those_of_the_matrix():
+    """Entries of each row, Σ_{j≠i}|w| / |w_ii|, and ρ² Σ|w| with ρ in the tangent plane."""
+    lb = sphere()
+    matrix, report = lb.matrix.to_dense(), lb.report
+    assert torch.equal(report.num_neighbors, lb.crow.diff())
+    center = matrix.diagonal().abs()
+    total = matrix.abs().sum(1)
+    torch.testing.assert_close(report.dominance, (total - center) / center)
+    offset = torch.einsum("ijn,ind->ijd", lb.points - lb.points[:, None], lb.frames)
+    radius = (offset.norm(dim=-1) * (matrix != 0)).amax(1)
+    torch.testing.assert_close(report.growth, radius**2 * total)
+    assert (report.growth <= 3 * typical_growth(2, 4)).all()
+    assert (report.condition >= 1).all()
+
+
+def test_it_prints_a_summary():
+    text = str(cube()[1].report)
+    assert text.startswith("386 points, order 3 requested")
+    assert "why below the requested order" in text
+    for name in ("num_neighbors", "growth", "condition", "dominance"):
+        assert name in text
+    for reason, count in cube()[1].report.reason_counts.items():
+        assert reason in text
+        assert str(count) in text
+    assert len(text.splitlines()) < 25
+    assert "why below" not in str(sphere().report)
+
+
+@pytest.mark.parametrize("build", ["cotangent", "empty"])
+def test_operators_without_stencils_have_a_report_too(build):
+    if build == "empty":
+        assert str(LaplaceBeltrami().report).startswith("0 points")
+    else:
+        report = LaplaceBeltrami.from_cotangent(*Torus().mesh(200)).report
+        assert report.order_counts == {0: 200}
+        assert "fallback" in str(report)
+
+
+def test_a_crease_falls_below_the_order_and_says_why():
+    """On edges and corners of the cube nothing of order 3 exists; in the middle of the faces it does."""
+    vertices, lb = cube()
+    near = edges_near(vertices)
+    assert (lb.report.order[near >= 2] < 3).all()
+    middle = vertices.abs().sort(dim=1).values[:, 1] < 0.2
+    assert (lb.report.order[middle] == 3).double().mean() > 0.5
+    assert (lb.report.reason[near >= 2] > 0).all()
+
+
+def test_every_row_of_a_creased_mesh_is_valid():
+    """Finite, Σ_j w_ij = 0, w_ii < 0, and stable as a whole."""
+    _, lb = cube()
+    matrix = lb.matrix.to_dense()
+    assert matrix.isfinite().all()
+    assert (matrix.sum(1).abs() <= 1e-12 * matrix.abs().amax(1)).all()
+    assert (matrix.diagonal() < 0).all()
+    assert lb.gradient_values.isfinite().all()
+    assert lb.certificate.holds
+    assert (lb.mass > 0).all()
+    torch.testing.assert_close(lb.mass.sum().item(), 6.0)
+
+
+def test_fallback_rows_are_m_matrix_rows():
+    """At order 0: off-diagonal entries ≥ 0, dominance 1."""
+    _, lb = cube()
+    rows = lb.report.order == 0
+    if not rows.any():
+        pytest.skip("no point of the cube fell back")
+    matrix = lb.matrix.to_dense()
+    off = matrix - matrix.diagonal().diag()
+    assert (off[rows] >= 0).all()
+    torch.testing.assert_close(lb.report.dominance[rows], torch.ones(int(rows.sum())).double())
