@@ -47,6 +47,8 @@ def read(path):
         if isinstance(shape, trimesh.Scene):
             shape = trimesh.util.concatenate(shape.dump())
         vertices = torch.tensor(np.array(shape.vertices, dtype=np.float64))
+        if len(vertices) == 0:
+            raise ValueError("it has no vertices")
         faces = torch.tensor(np.array(getattr(shape, "faces", [])), dtype=torch.int64)
     except Exception as error:  # each reader of trimesh has its own
         raise ValueError(
@@ -108,7 +110,8 @@ def draw_surface(vertices, faces, lb, name, unit, path):
         else:
             plot_surface(vertices, faces, values, ax=ax, title=title, label=label, view=SIDES)
     plot_orders(vertices, faces, lb.report.order, ax=axes[2], view=SIDES)
-    figure.suptitle(f"{name}, {len(vertices):,} points\n", fontsize="x-large")
+    figure.suptitle(f"{name}, {len(vertices):,} points", fontsize="x-large")
+    figure.get_layout_engine().set(h_pad=0.12)
     figure.savefig(path, dpi=130)
     plt.close(figure)
 

@@ -130,7 +130,9 @@ def test_natural_neighbours_bridge_a_void():
     assert csgraph.connected_components(graph)[0] == 1
 
 
-@pytest.mark.parametrize("surface", [Sphere(), Torus(), Ellipsoid()], ids=["sphere", "torus", "ellipsoid"])
+@pytest.mark.parametrize(
+    "surface", [Sphere(), Torus(), Ellipsoid()], ids=["sphere", "torus", "ellipsoid"]
+)
 @pytest.mark.parametrize("sampling", ["points", "random_points"])
 def test_graph_of_a_cloud_is_connected_and_symmetric(surface, sampling):
     graph = cloud_balls(getattr(surface, sampling)(1000)).graph
@@ -162,7 +164,7 @@ def test_balls_start_at_the_centre_and_ascend_without_repetition():
 
 
 def test_everything_in_a_ball_is_admissible():
-    points = Ellipsoid((1, 1, 0.1)).points(800)
+    points = Ellipsoid((1.0, 1.0, 0.1)).points(800)
     balls = cloud_balls(points)
     index, count = balls(torch.arange(800), 30)
     row, others = real_pairs(index, count)

@@ -1,5 +1,7 @@
 """Tangent frames of order q, both projections, and orientation."""
 
+from functools import cache
+
 import numpy as np
 import pytest
 import torch
@@ -30,6 +32,7 @@ from torchlb.tangent import (
 
 MANIFOLDS = [Sphere(), Torus(), CliffordTorus(), ThreeSphere(), SpaceCurve()]
 HYPERSURFACES = [Sphere(), Ellipsoid(), StarShaped(), Torus()]
+points_of = cache(lambda surface, n: surface.points(n))
 
 
 def each(cases):
@@ -64,7 +67,7 @@ def slope_of(sizes, errors, dim=2):
 @each(MANIFOLDS)
 def test_frames_are_orthonormal(surface):
     """EᵀE = I for poor, refined and exact frames in every dimension."""
-    points = surface.points(400)
+    points = points_of(surface, 400)
     eye = torch.eye(surface.dim, dtype=torch.float64)
     frames, order = refined(surface, points, 3)
     for found in (poor_and_balls(surface, points)[0], frames):
@@ -74,12 +77,12 @@ def test_frames_are_orthonormal(surface):
 
 
 @pytest.mark.parametrize("surface", [Sphere(), Ellipsoid()], ids=["sphere", "ellipsoid"])
-@pytest.mark.parametrize(("q", "bound"), [(1, 2e-2), (2, 5e-3), (3, 2e-3), (4, 5e-4)])
+@pytest.mark.parametrize(("q", "bound"), [(1, 4e-2), (2, 5e-3), (3, 1e-3), (4, 2e-4)])
 def test_frames_have_order_q(surface, q, bound):
     """rms tilt = O(h^q): slope ≥ q − 0.3 over N = 500 … 4000, and a bound at the finest."""
     sizes, errors = [500, 1000, 2000, 4000], []
     for n in sizes:
-        points = surface.points(n)
+        points = points_of(surface, n)
         frames, order = refined(surface, points, q)
         assert (order == q).double().mean() > 0.98
         errors.append(float(tilt(frames, surface.frames(points)).square().mean().sqrt()))
@@ -87,14 +90,18 @@ def test_frames_have_order_q(surface, q, bound):
     assert errors[-1] <= bound
 
 
-@each([CliffordTorus(), SpaceCurve(), ThreeSphere()])
-def test_frames_in_other_codimensions_and_dimensions(surface):
-    """Degree 3 fits of 2000 points beat the poor frames at least fivefold."""
-    points = surface.points(2000)
+@pytest.mark.parametrize(
+    ("surface", "factor"),
+    [(CliffordTorus(), 5), (SpaceCurve(), 5), (ThreeSphere(), 2)],
+    ids=lambda case: type(case).__name__,
+)
+def test_frames_in_other_codimensions_and_dimensions(surface, factor):
+    """Degree 3 fits of 2000 points beat the poor frames: fivefold, on the coarser S³ (h = 0.2) twofold."""
+    points = points_of(surface, 2000)
     exact = surface.frames(points)
     poor, _ = poor_and_balls(surface, points)
     frames, _ = refined(surface, points, 3)
-    assert tilt(frames, exact).norm() < 0.2 * tilt(poor, exact).norm()
+    assert tilt(frames, exact).norm() < tilt(poor, exact).norm() / factor
 
 
 @each([Sphere(), Torus()])
@@ -155,7 +162,7 @@ def test_offsets_are_the_vectors_themselves_in_a_flat_space(surface, projection)
 @each(HYPERSURFACES)
 def test_normal_projection_is_the_formula_of_the_note_with_a_minus(surface):
     """e − n_k (e·n_i)/(n_k·n_i), in the frame of i, whatever the signs of the two normals."""
-    points = surface.points(500)
+    points = points_of(surface, 500)
     frames, normals = surface.frames(points), surface.normals(points)
     normals = normals * torch.randint(0, 2, (500, 1)).mul(2).sub(1)
     centers, neighbors = torch.arange(500), nearest_neighbors(points, 12)[:, 1:]
@@ -167,12 +174,12 @@ def test_normal_projection_is_the_formula_of_the_note_with_a_minus(surface):
     close(found, projected @ frames)
 
 
-@each([Sphere(), Torus(), CliffordTorus(), SpaceCurve()])
+@each([Sphere(), Ellipsoid(), Torus(), SpaceCurve()])
 def test_both_projections_agree_to_third_order(surface):
     """max |y_t − y_n| = O(h³): slope ≥ 2.7 over four sizes; at the nearest eight neighbours, with exact frames."""
-    sizes, apart, spacing = [1000, 2000, 4000, 8000], [], []
+    sizes, apart, spacing = [500, 1000, 2000, 4000], [], []
     for n in sizes:
-        points = surface.points(n)
+        points = points_of(surface, n)
         centers = torch.arange(0, n, 10)
         neighbors = nearest_neighbors(points, 9)[centers, 1:]
         frames = surface.frames(points)

@@ -308,8 +308,7 @@ def _colors(
     slack = 0.02 * (high - low)  # an end is pointed only where the colours hide something
     beyond = finite.min() < low - slack, finite.max() > high + slack
     extend = {(0, 0): "neither", (1, 0): "min", (0, 1): "max", (1, 1): "both"}[beyond]
-    table = colormaps[cmap or (diverging if symmetric else "viridis")].copy()
-    table.set_bad(MISSING)
+    table = colormaps[cmap or (diverging if symmetric else "viridis")].with_extremes(bad=MISSING)
     return cm.ScalarMappable(colors.Normalize(low, high), table), extend
 
 
