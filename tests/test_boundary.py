@@ -37,7 +37,7 @@ def test_neumann_spectrum(surface, order, bound):
         assert lb.certificate.holds
 
 
-@pytest.mark.parametrize("order", [3, 4, 5])
+@pytest.mark.parametrize("order", [3, 4])
 def test_neumann_spectrum_converges_at_the_order(order):
     """Slope of the worst of 9 eigenvalues ≥ p − 0.5 over N = 350, 700, 1400."""
     sizes, errors = [350, 700, 1400], []

@@ -70,7 +70,9 @@ class LaplaceBeltrami(nn.Module):
             self.register_buffer(name, torch.zeros(0))
         self.crow, self.col = torch.zeros(1, dtype=torch.int64), torch.zeros(0, dtype=torch.int64)
         for name in REPORT_FIELDS:
-            self.register_buffer(f"report_{name}", torch.zeros(0))
+            real = name in ("growth", "condition", "dominance")
+            empty = torch.zeros(0, dtype=torch.get_default_dtype() if real else torch.int64)
+            self.register_buffer(f"report_{name}", empty)
         for name in ("crow_t", "col_t", "order_t"):  # of the transpose, for the backward pass
             self.register_buffer(name, torch.zeros(0, dtype=torch.int64), persistent=False)
 

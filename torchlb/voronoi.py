@@ -23,7 +23,8 @@ def unit_directions(dim: int) -> Float[Tensor, "u d"]:
     if dim == 2:
         angle = 2 * pi * torch.arange(128, dtype=torch.float64) / 128
         return torch.stack([angle.cos(), angle.sin()], dim=1)
-    uniform = torch.quasirandom.SobolEngine(dim).draw(1025)[1:].double()  # the first is zero
+    # Scrambled: the plain sequence holds its centre, which has no direction.
+    uniform = torch.quasirandom.SobolEngine(dim, scramble=True, seed=0).draw(1024).double()
     normal = torch.special.ndtri(uniform)
     return normal / normal.norm(dim=1, keepdim=True)
 

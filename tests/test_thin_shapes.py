@@ -1,0 +1,91 @@
+"""Thin shapes: no stencil reaches through to the other side, though it is nearer than many a neighbour."""
+
+import math
+from functools import cache
+
+import pytest
+import torch
+
+from torchlb import LaplaceBeltrami
+from torchlb.surfaces import Ellipsoid, smooth_function
+
+SIZE = 1500  # points of each sheet
+
+
+def low_discrepancy():
+    """The additive sequence of Roberts, shifted between the sheets."""
+    step = torch.tensor([0.7548776662466927, 0.5698402909980532], dtype=torch.float64)
+    index = torch.arange(SIZE, dtype=torch.float64)[:, None]
+    return (0.5 + index * step) % 1, (0.87 + index * step) % 1
+
+
+def jittered():
+    """A grid of spacing h, each point moved by up to 0.3 h."""
+    side = round(math.sqrt(SIZE))
+    axis = (torch.arange(side, dtype=torch.float64) + 0.5) / side
+    grid = torch.cartesian_prod(axis, axis)
+    return tuple(grid + 0.6 / side * (torch.rand(len(grid), 2).double() - 0.5) for _ in range(2))
+
+
+def aligned():
+    """The same grid twice, point above point."""
+    side = round(math.sqrt(SIZE))
+    axis = (torch.arange(side, dtype=torch.float64) + 0.5) / side
+    return (torch.cartesian_prod(axis, axis),) * 2
+
+
+def crossings(lb, side):
+    """Entries of the matrix between the two sides."""
+    row = torch.arange(lb.num_points).repeat_interleave(lb.crow.diff())
+    return int((side[row] != side[lb.col]).sum())
+
+
+@pytest.mark.parametrize("order", [1, 3])
+@pytest.mark.parametrize("sampling", [low_discrepancy, jittered, aligned])
+def test_no_row_crosses_between_two_sheets(sampling, order):
+    """Gap 2h, h = 1/√n: rows, those of last resort included, stay on their own sheet."""
+    sheets = sampling()
+    count = len(sheets[0])
+    height = torch.tensor([0.0, 2 / math.sqrt(count)], dtype=torch.float64)
+    points = torch.cat([torch.cat(sheets), height.repeat_interleave(count)[:, None]], 1)
+    lb = LaplaceBeltrami.from_points(points, order=order, certify=False)
+    assert crossings(lb, torch.arange(2 * count) >= count) == 0
+    # Away from the rim most rows are of the order that was asked for.
+    inside = ((points[:, :2] - 0.5).abs() < 0.35).all(1)
+    assert (lb.report.order[inside] == order).double().mean() > 0.95
+
+
+@cache
+def lens():
+    """2 wide and 0.2 thick, 1000 points: some 3 spacings from side to side in the middle."""
+    surface = Ellipsoid((1.0, 1.0, 0.1))
+    return surface, *surface.mesh(1000)
+
+
+@pytest.mark.parametrize("order", [1, 3])
+@pytest.mark.parametrize("kind", ["points", "mesh"])
+def test_thin_closed_surface(kind, order):
+    """No entry joins the two flat sides, |xy| < 0.8, and Δf is off by less than 0.8 (relative l2).
+
+    A point just around the rim is near along the surface; one through it is not.
+    """
+    surface, points, faces = lens()
+    if kind == "points":
+        lb = LaplaceBeltrami.from_points(points, order=order, certify=False)
+    else:
+        lb = LaplaceBeltrami.from_mesh(points, faces, order=order, certify=False)
+    exact = surface.laplacian(smooth_function, points)
+    assert (lb(smooth_function(points)) - exact).norm() < 0.8 * exact.norm()
+    row = torch.arange(1000).repeat_interleave(lb.crow.diff())
+    flat = points[:, :2].norm(dim=1) < 0.8
+    inside = flat[row] & flat[lb.col]
+    across = points[row, 2].sign() != points[lb.col, 2].sign()
+    assert not (inside & across).any()
+
+
+@pytest.mark.parametrize("order", [1, 3])
+def test_thin_closed_surface_is_stable(order):
+    _, points, _ = lens()
+    lb = LaplaceBeltrami.from_points(points, order=order)
+    assert lb.certificate.holds
+    assert (lb.mass > 0).all()
