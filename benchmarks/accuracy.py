@@ -3,7 +3,7 @@
 Errors are printed as l2 / max: the relative l2 error over the points, and the largest error over the largest |Δf|.
 A slope is the least-squares fit of log error against log h over the three finest sizes, h = N^(-1/d), so an operator
 of order p is expected to show p. Operators are raw (`certify=False`) unless a table says otherwise: on quasi-uniform
-points the certificate holds without changing a row. Peers that are not installed are left out, with a note.
+points the certificate mostly holds as it is. Peers that are not installed are left out, with a note.
 """
 
 from __future__ import annotations

@@ -28,7 +28,7 @@ from tqdm import tqdm
 
 from torchlb.rows import REASONS, Rows
 from torchlb.sparse import to_scipy
-from torchlb.stencil import Ladder
+from torchlb.stencil import Ladder, StencilError
 
 __all__ = ["Certificate", "StabilityWarning", "certify", "check_certificate"]
 
@@ -113,7 +113,13 @@ def left_null_vector(
     area = areas.numpy()
     weighted = sparse.diags_array(area) @ matrix
     shift = 1e-9 * np.median(np.abs(matrix.diagonal()))
-    lu = _factorized(sparse.csc_array((weighted - shift * sparse.diags_array(area)).T), 1e-2)
+    try:
+        lu = _factorized(sparse.csc_array((weighted - shift * sparse.diags_array(area)).T), 1e-2)
+    except RuntimeError as error:
+        raise StencilError(
+            "certificate: the operator is singular beyond its constants; is `dim` the dimension of the manifold? "
+            "Pass the right one, or certify=False to look at the raw operator"
+        ) from error
     count, component = csgraph.connected_components(matrix, directed=True, connection="weak")
     total = np.bincount(component, area, minlength=count)
     density = np.ones(len(area))

@@ -33,6 +33,8 @@ __all__ = ["Ladder", "StencilError", "build_stencil", "matrix_rows"]
 
 MAX_DOMINANCE = 3.0
 MAX_GROWTH = 3.0
+MAX_GROWTH_OF_SPLINES = 12.0
+"""Good splines have 3 to 5 times the growth of good least squares."""
 MAX_GROWTH_AT_BOUNDARY = 12.0
 """One-sided stencils have larger weights; there dominance decides."""
 MAX_RESIDUAL = 1e-10
@@ -81,7 +83,7 @@ class Ladder:
 
         def attempt(rows: Tensor, index: Tensor, rung: Rung) -> tuple[Tensor, Rows]:
             weights = self._weights(rows, index, rung)
-            failure = _failure(weights, self._growth_limit(index, rung.degree))
+            failure = _failure(weights, self._growth_limit(index, rung))
             if rung.degree == top and rung.rule != "positive":
                 reason[place[rows]] = failure
             return failure == 0, _stencil_rows(index, weights, rung.degree)
@@ -113,11 +115,12 @@ class Ladder:
         order = torch.cat([(~touching).nonzero()[:, 0], touching.nonzero()[:, 0]]).argsort()
         return Weights.stack(parts)[order]
 
-    def _growth_limit(self, index: Tensor, degree: int) -> Float[Tensor, " B"]:
-        factor = torch.full((len(index),), MAX_GROWTH, dtype=self.points.dtype)
+    def _growth_limit(self, index: Tensor, rung: Rung) -> Float[Tensor, " B"]:
+        largest = MAX_GROWTH_OF_SPLINES if rung.rule == "polyharmonic" else MAX_GROWTH
+        factor = torch.full((len(index),), largest, dtype=self.points.dtype)
         if self.boundary is not None:
             factor[self.boundary.mask[index].any(1)] = MAX_GROWTH_AT_BOUNDARY
-        return factor * typical_growth(self.frames.shape[-1], degree)
+        return factor * typical_growth(self.frames.shape[-1], rung.degree)
 
     def _neumann_weights(self, centers: Tensor, index: Tensor, rung: Rung) -> Weights:
         """Second derivatives that use ∂_ν f = 0; first derivatives that do not, since they serve any f.

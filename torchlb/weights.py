@@ -223,7 +223,7 @@ def positive_weights(
 def polyharmonic_weights(coords: Float[Tensor, "B neighbors d"], degree: int) -> Weights:
     r"""Derivatives of the interpolant by the spline :math:`|y|^5` plus polynomials of degree m.
 
-    Three to ten times smaller errors than least squares on quasi-uniform points, but less robust on random ones
+    Against least squares on Deserno's sphere with 2,022 nodes: 3 times smaller an error at p = 5, 2.4 times larger at p = 3
     (`method.md`, section 2). Same arguments and result as `least_squares_weights`; m ≥ 2.
     """
     radius, scaled, values, root = _scaled_system(coords, degree)
