@@ -223,8 +223,8 @@ def positive_weights(
 def polyharmonic_weights(coords: Float[Tensor, "B neighbors d"], degree: int) -> Weights:
     r"""Derivatives of the interpolant by the spline :math:`|y|^5` plus polynomials of degree m.
 
-    Against least squares on Deserno's sphere with 2,022 nodes the error is 3 times smaller at p = 5 and 2.4 times larger
-    at p = 3 (`method.md`, section 2). Same arguments and result as `least_squares_weights`; m ≥ 2.
+    Against least squares on Deserno's sphere with 2,022 nodes the error is 3 times smaller at p = 5 and
+    2.4 times larger at p = 3 (`method.md`, section 2). Same arguments and result as `least_squares_weights`; m ≥ 2.
     """
     radius, scaled, values, root = _scaled_system(coords, degree)
     batch, _, dim = coords.shape
