@@ -38,7 +38,7 @@ STRICTNESS = 1e-12
 """S passes if it is negative up to this share of its spectral radius; a hundred times the rounding of its sums."""
 MAX_ROUNDS = 40
 LARGEST = 150_000
-"""Beyond this many points the sparse factors (5 GB at 144,000, p = 3) outgrow an ordinary machine."""
+"""Beyond this many points the sparse factors outgrow an ordinary machine."""
 MAX_VECTORS = 32
 ROUGH: dict[str, Any] = {"tol": 1e-3}
 """Eigenvalues of S are wanted to a few digits only; the inertia decides."""
