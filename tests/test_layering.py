@@ -14,6 +14,7 @@ ORDER = [
     "ladder",
     "weights",
     "tangent",
+    "orientation",
     "boundary",
     "sparse",
     "cotangent",

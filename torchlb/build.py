@@ -17,6 +17,7 @@ from torchlb.checks import (
     check_normals,
     check_options,
     check_points,
+    warn_of_coincident,
 )
 from torchlb.cotangent import cotangent_laplacian
 from torchlb.geometry import Geometry, cloud_geometry, mesh_geometry
@@ -52,7 +53,7 @@ class Options:
             ambient_dim,
             dim,
             self.order,
-            self.q,
+            self.normal_order or 0,
             self.num_neighbors,
             projection=(self.projection, list(PROJECTIONS)),
             weights=(self.weights, WEIGHTS),
@@ -92,7 +93,14 @@ def build_cloud(
         boundary=check_boundary(boundary, len(points)),
         progress=progress,
     )
-    return _finished(geometry, "points", options, progress)
+    built = _finished(geometry, "points", options, progress)
+    if not (built.rows.order > 0).any():
+        warnings.warn(
+            f"no point has a stencil, only rows of last resort: do the points lie on a manifold of dimension {d}? "
+            "If not, pass its dimension as `dim`; else `report` says what is wrong",
+            stacklevel=3,
+        )
+    return built
 
 
 def build_mesh(
@@ -102,6 +110,7 @@ def build_mesh(
     vertices = check_points(vertices, "vertices")
     faces = check_faces(faces, len(vertices))
     options.check(len(vertices), vertices.shape[1], faces.shape[1] - 1)
+    warn_of_coincident(vertices)
     if boundary not in ("neumann", None):
         raise ValueError(f"boundary: expected 'neumann' or None, got {boundary!r}")
     geometry = mesh_geometry(

@@ -220,6 +220,8 @@ class LaplaceBeltrami(nn.Module):
 
     def _apply_rows(self, values: Tensor, f: Tensor) -> Tensor:
         """The product with one set of values on the pattern, for any layout of f."""
+        if not isinstance(f, Tensor):
+            raise TypeError(f"expected f as a tensor, got {type(f)}; torch.as_tensor(f) makes one")
         if f.ndim == 1:
             return self._apply_rows(values, f[:, None])[:, 0]
         torch._check(

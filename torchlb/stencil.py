@@ -66,7 +66,7 @@ class Ladder:
     ) -> None:
         self.points, self.frames = geometry.points, geometry.frames
         self.fallback, self.boundary = geometry.fallback, geometry.boundary
-        self.balls = GraphBalls(geometry.points, geometry.graph, geometry.frames)
+        self.balls = GraphBalls(geometry.points, geometry.graph, geometry.frames, geometry.sides)
         self.projection = projection
         dim = self.frames.shape[-1]
         rules = [weights] if weights == "least_squares" else [weights, "least_squares"]
