@@ -17,6 +17,7 @@ from torchlb.checks import (
     check_normals,
     check_options,
     check_points,
+    check_scale,
     warn_of_coincident,
 )
 from torchlb.cotangent import cotangent_laplacian
@@ -76,6 +77,7 @@ def build_cloud(
 ) -> Built:
     """Operator on a point cloud; arguments as for `LaplaceBeltrami.from_points`."""
     points = check_points(points)
+    check_scale(points)
     ambient = points.shape[1]
     d = max(ambient - 1, 1) if dim is None else dim
     options.check(len(points), ambient, d)
@@ -108,6 +110,7 @@ def build_mesh(
 ) -> Built:
     """Operator on a mesh; arguments as for `LaplaceBeltrami.from_mesh`."""
     vertices = check_points(vertices, "vertices")
+    check_scale(vertices)
     faces = check_faces(faces, len(vertices))
     options.check(len(vertices), vertices.shape[1], faces.shape[1] - 1)
     warn_of_coincident(vertices)
@@ -127,6 +130,7 @@ def build_mesh(
 def build_cotangent(vertices: Any, faces: Any) -> Built:
     """The cotangent operator with its mass; arguments as for `LaplaceBeltrami.from_cotangent`."""
     vertices = check_points(vertices, "vertices")
+    check_scale(vertices)
     faces = check_faces(faces, len(vertices))
     if faces.shape[1] != 3:
         raise ValueError(f"faces: the cotangent operator needs triangles, got {tuple(faces.shape)}")

@@ -21,6 +21,7 @@ __all__ = [
     "check_normals",
     "check_options",
     "check_points",
+    "check_scale",
     "clean_mesh",
     "warn_of_coincident",
 ]
@@ -58,13 +59,17 @@ def check_points(points: Any, what: str = "points") -> Float[Tensor, "N n"]:
         raise ValueError(
             f"{what}: {len(bad)} are NaN or infinite ({_some(bad)}); remove or repair them"
         )
+    return points
+
+
+def check_scale(points: Float[Tensor, "N n"]) -> None:
+    """ValueError if the points extend so far, or so little, that 1/ℓ² leaves the range of numbers."""
     extent = float((points - points[0]).abs().max())
     if len(points) > 1 and not 1 / MAX_EXTENT < extent < MAX_EXTENT:
         raise ValueError(
-            f"{what}: they extend over {extent:.3g}, and 1/ℓ² of that leaves the range of numbers; "
+            f"points: they extend over {extent:.3g}, and 1/ℓ² of that leaves the range of numbers; "
             "rescale them to an extent near 1"
         )
-    return points
 
 
 def _twins(points: Float[Tensor, "N n"]) -> tuple[Int[Tensor, " N"], Int[Tensor, " T"]]:
