@@ -28,6 +28,7 @@ from torchlb.tangent import PROJECTIONS
 
 __all__ = ["Built", "Options", "build_cloud", "build_cotangent", "build_mesh"]
 
+CONDITIONS = ["neumann", "dirichlet"]
 WEIGHTS = ["least_squares", "polyharmonic"]
 
 
@@ -73,7 +74,14 @@ class Built:
 
 
 def build_cloud(
-    points: Any, dim: int | None, options: Options, *, normals: Any, boundary: Any, progress: bool
+    points: Any,
+    dim: int | None,
+    options: Options,
+    *,
+    normals: Any,
+    boundary: Any,
+    condition: str,
+    progress: bool,
 ) -> Built:
     """Operator on a point cloud; arguments as for `LaplaceBeltrami.from_points`."""
     points = check_points(points)
@@ -82,6 +90,8 @@ def build_cloud(
     d = max(ambient - 1, 1) if dim is None else dim
     options.check(len(points), ambient, d)
     check_distinct(points)
+    if condition not in CONDITIONS:
+        raise ValueError(f"condition: expected one of {CONDITIONS}, got {condition!r}")
     if normals is not None:
         if d != ambient - 1:
             raise ValueError(f"normals: only hypersurfaces have them, not dim={d} in R^{ambient}")
@@ -93,6 +103,7 @@ def build_cloud(
         num_neighbors=options.num_neighbors,
         normals=normals,
         boundary=check_boundary(boundary, len(points)),
+        condition=condition,
         progress=progress,
     )
     built = _finished(geometry, "points", options, progress)
@@ -114,14 +125,14 @@ def build_mesh(
     faces = check_faces(faces, len(vertices))
     options.check(len(vertices), vertices.shape[1], faces.shape[1] - 1)
     warn_of_coincident(vertices)
-    if boundary not in ("neumann", None):
-        raise ValueError(f"boundary: expected 'neumann' or None, got {boundary!r}")
+    if boundary not in (*CONDITIONS, None):
+        raise ValueError(f"boundary: expected one of {CONDITIONS} or None, got {boundary!r}")
     geometry = mesh_geometry(
         vertices,
         faces,
         options.q,
         num_neighbors=options.num_neighbors,
-        boundary=boundary is not None,
+        boundary=boundary,
         progress=progress,
     )
     return _finished(geometry, "mesh", options, progress)
@@ -135,7 +146,7 @@ def build_cotangent(vertices: Any, faces: Any) -> Built:
     if faces.shape[1] != 3:
         raise ValueError(f"faces: the cotangent operator needs triangles, got {tuple(faces.shape)}")
     matrix, mass = cotangent_laplacian(vertices, faces)
-    geometry = mesh_geometry(vertices, faces, 0, boundary=False)
+    geometry = mesh_geometry(vertices, faces, 0, boundary=None)
     everything: Tensor = torch.arange(len(vertices))
     rows = matrix_rows(matrix, geometry.points, geometry.frames, everything)
     return Built(rows, replace(geometry, areas=mass), "cotangent", {}, None)

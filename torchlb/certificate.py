@@ -32,6 +32,8 @@ from torchlb.stencil import Ladder, StencilError
 
 __all__ = ["Certificate", "StabilityWarning", "certify", "check_certificate"]
 
+LOSS = 1e-9
+"""A row whose sum is above this share of its diagonal loses heat; all others sum to zero up to rounding."""
 MARGIN = 0.02
 """A point whose π is below this share of its area asks the rows around it to step down while they can."""
 STRICTNESS = 1e-12
@@ -108,7 +110,9 @@ def left_null_vector(
 ) -> tuple[Float[Tensor, " N"], np.ndarray]:
     """π with πᵀL = 0, scaled on each component to the sum of the areas there, and the component of each point.
 
-    Inverse iteration with the LU of (AL)ᵀ, A the areas, shifted by 1e-9 of its diagonal; four solves.
+    Inverse iteration with the LU of (AL)ᵀ, A the areas, shifted by 1e-9 of its diagonal; four solves. On a component
+    with rows that lose heat (L1 < 0, next to a Dirichlet boundary) π solves πᵀL = −q instead, where q ≥ 0 is what the
+    areas lose there, the positive part of −aᵀL in the columns of those rows.
     """
     area = areas.numpy()
     weighted = sparse.diags_array(area) @ matrix
@@ -122,11 +126,15 @@ def left_null_vector(
         ) from error
     count, component = csgraph.connected_components(matrix, directed=True, connection="weak")
     total = np.bincount(component, area, minlength=count)
+    losing = np.abs(matrix.sum(axis=1)) > LOSS * np.abs(matrix.diagonal())
+    lost = losing * np.maximum(-(matrix.T @ area), 0)
+    lossless = np.bincount(component, losing, minlength=count) == 0
     density = np.ones(len(area))
     for _ in range(4):
-        density = lu.solve(area * density)
-        # Each component has its own null vector, with its own scale and sign.
-        density *= (total / np.bincount(component, area * density, minlength=count))[component]
+        density = -lu.solve(lost + shift * area * density)
+        # Each component without a loss has its own null vector, with its own scale and sign.
+        share = total / np.bincount(component, area * density, minlength=count)
+        density *= np.where(lossless, share, 1.0)[component]
     return torch.from_numpy(area * density), component
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -71,11 +71,12 @@ def cloud_geometry(
     num_neighbors: int | None = None,
     normals: Float[Tensor, "N n"] | None = None,
     boundary: Bool[Tensor, " N"] | str | None = None,
+    condition: str = "neumann",
     progress: bool = True,
 ) -> Geometry:
     """Geometry of a point cloud: graph and frames from the nearest neighbours.
 
-    `boundary` is the mask of its boundary points, or "detect".
+    `boundary` is the mask of its boundary points, or "detect"; `condition` what holds there.
     """
     candidates = nearest_neighbors(points, min(CANDIDATES.get(dim, 128), len(points)))
     poor = cloud_frames(points, candidates, dim) if normals is None else complete_frames(normals)
@@ -92,6 +93,7 @@ def cloud_geometry(
     mask = detect_boundary(points, frames, balls) if isinstance(boundary, str) else boundary
     rim = None if mask is None else boundary_of_cloud(points, mask, frames, normal_order)
     fallback = CloudFallback(balls, rim, surface=dim == 2 and points.shape[1] <= 3)
+    rim = None if rim is None else replace(rim, condition=condition)
     return _oriented(balls, normals, order, fallback, rim)
 
 
@@ -101,12 +103,12 @@ def mesh_geometry(
     normal_order: int,
     *,
     num_neighbors: int | None = None,
-    boundary: bool = True,
+    boundary: str | None = "neumann",
     progress: bool = True,
 ) -> Geometry:
     """Geometry of a mesh of triangles (or of segments, or tetrahedra in Rⁿ): graph and frames from the faces.
 
-    Its boundary is found unless `boundary` is False.
+    `boundary` is the condition on its boundary; None leaves it alone.
     """
     poor = mesh_frames(vertices, faces)
     graph = mesh_graph(faces, len(vertices))
@@ -126,6 +128,7 @@ def mesh_geometry(
         fallback = MeshFallback(vertices, faces)
     else:
         fallback = CloudFallback(balls, rim, surface=False)
+    rim = None if rim is None or boundary is None else replace(rim, condition=boundary)
     return _oriented(balls, reference, order, fallback, rim)
 
 

@@ -98,12 +98,20 @@ class Ladder:
             blocks.append(self._fallback_rows(centers[left]))
             taken.append(left.nonzero()[:, 0])
         rows = Rows.stack(blocks)[torch.cat(taken).argsort()]
+        if self.boundary is not None and self.boundary.condition == "dirichlet":
+            rows = replace(rows, laplacian=self._without_boundary(centers, rows))
         return replace(rows, reason=torch.where(rows.order < top - 1, reason, rows.reason))
 
+    def _without_boundary(self, centers: Tensor, rows: Rows) -> Float[Tensor, " nnz"]:
+        """Entries of Δ for f = 0 on the boundary: none joins a boundary point to another point."""
+        assert self.boundary is not None
+        row, mask = centers.repeat_interleave(rows.length), self.boundary.mask
+        return rows.laplacian * ~((mask[row] | mask[rows.col]) & (row != rows.col))
+
     def _weights(self, centers: Tensor, index: Tensor, rung: Rung) -> Weights:
-        """Weights of a batch; stencils that hold boundary points use the Neumann data there."""
+        """Weights of a batch; stencils that hold boundary points use the Neumann data there, if they have some."""
         touching = torch.zeros(len(centers), dtype=torch.bool)
-        if self.boundary is not None:
+        if self.boundary is not None and self.boundary.condition == "neumann":
             touching = self.boundary.mask[index].any(1)
         parts = []
         if not touching.all():
