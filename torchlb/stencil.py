@@ -8,6 +8,7 @@ order 1; then the fallback row. How far down each point had to step is part of t
 from __future__ import annotations
 
 from dataclasses import replace
+from math import ceil
 
 import torch
 from jaxtyping import Float, Int
@@ -18,6 +19,7 @@ from tqdm import tqdm
 from torchlb.geometry import Geometry
 from torchlb.ladder import Rung, chunks, ladder_rungs, walk_ladder
 from torchlb.neighbors import GraphBalls
+from torchlb.polynomials import num_monomials
 from torchlb.rows import Rows
 from torchlb.sparse import from_scipy
 from torchlb.tangent import local_offsets
@@ -36,7 +38,10 @@ MAX_GROWTH = 3.0
 MAX_GROWTH_OF_SPLINES = 12.0
 """Good splines have 3 to 5 times the growth of good least squares."""
 MAX_GROWTH_AT_BOUNDARY = 12.0
-"""One-sided stencils have larger weights; there dominance decides."""
+MAX_DOMINANCE_AT_BOUNDARY = 6.0
+"""One-sided stencils have larger weights, and wide ones would be balanced but poor: a lower order is better there."""
+MAX_SIZE_AT_BOUNDARY = 2.5
+"""Points of a stencil per polynomial that holds points of the boundary."""
 MAX_RESIDUAL = 1e-10
 
 
@@ -67,7 +72,7 @@ class Ladder:
         self.points, self.frames = geometry.points, geometry.frames
         self.fallback, self.boundary = geometry.fallback, geometry.boundary
         self.balls = GraphBalls(geometry.points, geometry.graph, geometry.frames, geometry.sides)
-        self.projection = projection
+        self.projection, self.fixed_size = projection, num_neighbors is not None
         dim = self.frames.shape[-1]
         rules = [weights] if weights == "least_squares" else [weights, "least_squares"]
         self.rungs = ladder_rungs(dim, range(order + 1, 1, -1), rules, num_neighbors)
@@ -83,7 +88,7 @@ class Ladder:
 
         def attempt(rows: Tensor, index: Tensor, rung: Rung) -> tuple[Tensor, Rows]:
             weights = self._weights(rows, index, rung)
-            failure = _failure(weights, self._growth_limit(index, rung))
+            failure = _failure(weights, *self._limits(index, rung))
             if rung.degree == top and rung.rule != "positive":
                 reason[place[rows]] = failure
             return failure == 0, _stencil_rows(index, weights, rung.degree)
@@ -123,12 +128,19 @@ class Ladder:
         order = torch.cat([(~touching).nonzero()[:, 0], touching.nonzero()[:, 0]]).argsort()
         return Weights.stack(parts)[order]
 
-    def _growth_limit(self, index: Tensor, rung: Rung) -> Float[Tensor, " B"]:
+    def _limits(self, index: Tensor, rung: Rung) -> tuple[Float[Tensor, " B"], Float[Tensor, " B"]]:
+        """Bounds on growth and dominance; none passes where points of the boundary make a wide stencil lopsided."""
+        dim = self.frames.shape[-1]
         largest = MAX_GROWTH_OF_SPLINES if rung.rule == "polyharmonic" else MAX_GROWTH
-        factor = torch.full((len(index),), largest, dtype=self.points.dtype)
+        growth = torch.full((len(index),), largest, dtype=self.points.dtype)
+        dominance = torch.full_like(growth, MAX_DOMINANCE)
         if self.boundary is not None:
-            factor[self.boundary.mask[index].any(1)] = MAX_GROWTH_AT_BOUNDARY
-        return factor * typical_growth(self.frames.shape[-1], rung.degree)
+            touching = self.boundary.mask[index].any(1)
+            wide = rung.size > ceil(MAX_SIZE_AT_BOUNDARY * num_monomials(dim, rung.degree))
+            refused = wide and rung.degree > 2 and not self.fixed_size
+            growth[touching] = 0.0 if refused else MAX_GROWTH_AT_BOUNDARY
+            dominance[touching] = MAX_DOMINANCE_AT_BOUNDARY
+        return growth * typical_growth(dim, rung.degree), dominance
 
     def _neumann_weights(self, centers: Tensor, index: Tensor, rung: Rung) -> Weights:
         """Second derivatives that use ∂_ν f = 0; first derivatives that do not, since they serve any f.
@@ -159,7 +171,9 @@ class Ladder:
         return rows
 
 
-def _failure(weights: Weights, max_growth: Float[Tensor, " B"]) -> Int[Tensor, " B"]:
+def _failure(
+    weights: Weights, max_growth: Float[Tensor, " B"], max_dominance: Float[Tensor, " B"]
+) -> Int[Tensor, " B"]:
     """Which of the local tests a stencil fails first, as an index into `REASONS`; 0 if none."""
     laplacian = weights.laplacian
     center, others = laplacian[:, 0], laplacian[:, 1:].abs().sum(1)
@@ -168,7 +182,7 @@ def _failure(weights: Weights, max_growth: Float[Tensor, " B"]) -> Int[Tensor, "
         (2, weights.deficit == 0),
         (3, weights.residual <= MAX_RESIDUAL),  # false for NaN
         (4, center < 0),
-        (5, others <= MAX_DOMINANCE * center.abs()),
+        (5, others <= max_dominance * center.abs()),
         (6, weights.radius.square() * (others + center.abs()) <= max_growth),
     ):
         failure = torch.where((failure == 0) & ~passed, code, failure)
