@@ -28,6 +28,7 @@ ORDER = [
     "eigensolver",
     "batching",
     "storage",
+    "heat",
     "galerkin",
     "build",
     "laplace_beltrami",

@@ -19,7 +19,7 @@ from torchlb import (
 )
 from torchlb.eigensolver import solve_eigenbasis
 from torchlb.sparse import to_scipy
-from torchlb.surfaces import Circle, CliffordTorus, UnitDisk, Sphere, Torus
+from torchlb.surfaces import Circle, CliffordTorus, Sphere, Torus, UnitDisk
 
 BUILDERS = {
     "points": lambda n: LaplaceBeltrami.from_points(Torus().points(n)),

@@ -1,13 +1,15 @@
 """High-order Laplace–Beltrami operators on meshes and point clouds, for PyTorch.
 
 The walk: points become neighbours (`neighbors`), frames (`tangent`), offsets and weights (`weights`), rows of one
-sparse operator (`stencil`), stored in a module (`laplace_beltrami`). Its eigenpairs (`eigenbasis`) and what is made of
-them (`spectral`) come after it. `surfaces` has shapes with exact answers.
+sparse operator (`stencil`), stored in a module (`laplace_beltrami`). Its eigenpairs (`eigensolver`), what is made of
+them (`spectral`) and the layers that learn (`diffusion`, `diffusion_net`) take that module as an argument. `surfaces`
+has shapes with exact answers.
 """
 
 from torchlb import surfaces
 from torchlb.certificate import Certificate, StabilityWarning
 from torchlb.checks import clean_mesh
+from torchlb.diffusion import Diffusion, heat_flow
 from torchlb.eigenbasis import Eigenbasis
 from torchlb.laplace_beltrami import LaplaceBeltrami
 from torchlb.report import StencilReport
@@ -23,6 +25,7 @@ from torchlb.stencil import StencilError
 
 __all__ = [
     "Certificate",
+    "Diffusion",
     "Eigenbasis",
     "LaplaceBeltrami",
     "SpectralConv",
@@ -32,6 +35,7 @@ __all__ = [
     "clean_mesh",
     "diffusion_distance",
     "diffusion_map",
+    "heat_flow",
     "heat_kernel_signature",
     "spectral_wavelets",
     "surfaces",
