@@ -10,6 +10,7 @@ from torchlb import surfaces
 from torchlb.certificate import Certificate, StabilityWarning
 from torchlb.checks import clean_mesh
 from torchlb.diffusion import Diffusion, heat_flow
+from torchlb.diffusion_net import DiffusionNet, DiffusionNetBlock, GradientFeatures
 from torchlb.eigenbasis import Eigenbasis
 from torchlb.laplace_beltrami import LaplaceBeltrami
 from torchlb.report import StencilReport
@@ -26,7 +27,10 @@ from torchlb.stencil import StencilError
 __all__ = [
     "Certificate",
     "Diffusion",
+    "DiffusionNet",
+    "DiffusionNetBlock",
     "Eigenbasis",
+    "GradientFeatures",
     "LaplaceBeltrami",
     "SpectralConv",
     "StabilityWarning",
