@@ -49,20 +49,20 @@ class Eigenbasis:
         cut = (self.eigenvalues[..., :k], self.eigenvectors[:, :k], self.mass, self.left[:, :k])
         return Eigenbasis(*cut, sizes=self.sizes)
 
-    def to_basis(self, f: Float[Tensor, "*B N C"]) -> Float[Tensor, "*B k C"]:
+    def to_basis(self, f: Float[Tensor, "*B N C"]) -> Float[Tensor, "*S k C"]:
         """Coefficients Φᵀ(πf), (…, k, C), or (…, S, k, C) for a batch of shapes."""
         return self._analyse(self.eigenvectors * self.mass[:, None], f)
 
-    def to_basis_obliquely(self, f: Float[Tensor, "*B N C"]) -> Float[Tensor, "*B k C"]:
+    def to_basis_obliquely(self, f: Float[Tensor, "*B N C"]) -> Float[Tensor, "*S k C"]:
         """Coefficients Wᵀf: zero on every left-over eigenvector of Δ, which Φᵀ(πf) is not."""
         return self._analyse(self.left, f)
 
-    def from_basis(self, coefficients: Float[Tensor, "*B k C"]) -> Float[Tensor, "*B N C"]:
+    def from_basis(self, coefficients: Float[Tensor, "*S k C"]) -> Float[Tensor, "*B N C"]:
         """The function Φc with the given coefficients, (…, N, C)."""
         return self.synthesise(self.eigenvectors, coefficients)
 
     def synthesise(
-        self, functions: Float[Tensor, "N k"], coefficients: Float[Tensor, "*B k C"]
+        self, functions: Float[Tensor, "N k"], coefficients: Float[Tensor, "*S k C"]
     ) -> Float[Tensor, "*B N C"]:
         """Σ_k functions[:, k] c_k, with the coefficients of its own shape at every point."""
         functions = functions.to(coefficients.dtype)
