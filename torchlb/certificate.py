@@ -30,7 +30,14 @@ from torchlb.rows import REASONS, Rows
 from torchlb.sparse import to_scipy
 from torchlb.stencil import Ladder, StencilError
 
-__all__ = ["Certificate", "StabilityWarning", "certify", "check_certificate"]
+__all__ = [
+    "Certificate",
+    "StabilityWarning",
+    "certify",
+    "check_certificate",
+    "factorized",
+    "left_null_vector",
+]
 
 LOSS = 1e-9
 """A row whose sum is above this share of its diagonal loses heat; all others sum to zero up to rounding."""
@@ -84,7 +91,7 @@ class Certificate:
         )
 
 
-def _factorized(matrix: sparse.csc_array, threshold: float) -> SuperLU:
+def factorized(matrix: sparse.csc_array, threshold: float) -> SuperLU:
     """Sparse LU with an ordering for nearly symmetric patterns, several times faster here than the default."""
     return splu(
         matrix,
@@ -118,7 +125,7 @@ def left_null_vector(
     weighted = sparse.diags_array(area) @ matrix
     shift = 1e-9 * np.median(np.abs(matrix.diagonal()))
     try:
-        lu = _factorized(sparse.csc_array((weighted - shift * sparse.diags_array(area)).T), 1e-2)
+        lu = factorized(sparse.csc_array((weighted - shift * sparse.diags_array(area)).T), 1e-2)
     except RuntimeError as error:
         raise StencilError(
             "certificate: the operator is singular beyond its constants; is `dim` the dimension of the manifold? "
@@ -157,7 +164,7 @@ def dissipation(
     symmetric = sparse.csc_array((scaled + scaled.T) / 2)
     radius = abs(float(eigsh(symmetric, 1, which="LM", return_eigenvectors=False, **ROUGH)[0]))
     shift = STRICTNESS * radius
-    lu = _factorized(sparse.csc_array(shift * sparse.eye_array(len(root)) - symmetric), 0.0)
+    lu = factorized(sparse.csc_array(shift * sparse.eye_array(len(root)) - symmetric), 0.0)
     positive = int((lu.U.diagonal() < 0).sum())
     if positive == 0:
         return 0.0, torch.zeros(len(root), 0)

@@ -2,33 +2,26 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict
+from collections.abc import Sequence
 from typing import Any
 
 import torch
 from jaxtyping import Float
-from torch import Tensor, nn
+from torch import Tensor
 
+from torchlb.batching import join_buffers, join_certificates
 from torchlb.build import Built, Options, build_cloud, build_cotangent, build_mesh
 from torchlb.certificate import Certificate
+from torchlb.eigenbasis import Eigenbasis, stack_eigenbases
+from torchlb.eigensolver import blockwise_eigenbasis
 from torchlb.report import StencilReport
-from torchlb.sparse import matmul, transpose_pattern
+from torchlb.sparse import matmul, to_scipy
+from torchlb.storage import REPORT_FIELDS, OperatorStorage
 
 __all__ = ["LaplaceBeltrami"]
 
-REPORT_FIELDS = (
-    "order",
-    "normal_order",
-    "num_neighbors",
-    "growth",
-    "condition",
-    "dominance",
-    "reason",
-)
-BUFFERS = ("crow", "col", "values", "gradient_values", "mass", "points", "frames", "normals")
 
-
-class LaplaceBeltrami(nn.Module):
+class LaplaceBeltrami(OperatorStorage):
     """The Laplace–Beltrami operator Δ of a surface (or any manifold in Rⁿ) as a sparse matrix.
 
     Build it with `from_points`, `from_mesh` or `from_cotangent`; ``LaplaceBeltrami()`` alone is empty and takes any
@@ -42,6 +35,7 @@ class LaplaceBeltrami(nn.Module):
     certificate : what is proved of the stability of Δ; None where it was not asked for, and for the cotangent.
     points : (N, n), ℓ.  frames : (N, n, d), orthonormal tangent vectors.
     normals : (N, n), unit normals of a hypersurface, empty (0, n) otherwise.
+    sizes : numbers of points of the shapes of a `batch`; None for a single shape.
 
     Examples
     --------
@@ -51,30 +45,6 @@ class LaplaceBeltrami(nn.Module):
     >>> bool(torch.allclose(lb(circle[:, 0]), -circle[:, 0], atol=0.02))
     True
     """
-
-    crow: Tensor
-    col: Tensor
-    values: Tensor
-    gradient_values: Tensor
-    mass: Tensor
-    points: Tensor
-    frames: Tensor
-    normals: Tensor
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.kind = "empty"
-        self.options: dict[str, Any] = {}
-        self.certificate: Certificate | None = None
-        for name in BUFFERS:
-            self.register_buffer(name, torch.zeros(0))
-        self.crow, self.col = torch.zeros(1, dtype=torch.int64), torch.zeros(0, dtype=torch.int64)
-        for name in REPORT_FIELDS:
-            real = name in ("growth", "condition", "dominance")
-            empty = torch.zeros(0, dtype=torch.get_default_dtype() if real else torch.int64)
-            self.register_buffer(f"report_{name}", empty)
-        for name in ("crow_t", "col_t", "order_t"):  # of the transpose, for the backward pass
-            self.register_buffer(name, torch.zeros(0, dtype=torch.int64), persistent=False)
 
     @classmethod
     def from_points(
@@ -179,6 +149,32 @@ class LaplaceBeltrami(nn.Module):
         return cls._of(build_cotangent(vertices, faces), vertices)
 
     @classmethod
+    def batch(cls, shapes: Sequence[LaplaceBeltrami]) -> LaplaceBeltrami:
+        """Several shapes as one block-diagonal operator, which every layer takes like any other.
+
+        Features are the shapes' below each other, (ΣN, C). Indices of shape s (its faces, say) move by
+        ``lb.offsets[s]``. Eigenbases that the shapes hold are taken over; the others are solved when asked for.
+        Raises ValueError for shapes of different dimension, floating type or device, or for none.
+        """
+        if len(shapes) == 0:
+            raise ValueError("batch: got no shapes")
+        lb = cls()
+        stored = [dict(shape.named_buffers()) for shape in shapes]
+        for name, value in join_buffers(stored).items():
+            setattr(lb, name, value)
+        lb.kind, lb.options = "batch", dict(shapes[0].options)
+        lb.certificate = join_certificates([shape.certificate for shape in shapes])
+        lb.sizes = tuple(n for shape in shapes for n in shape.sizes or (shape.num_points,))
+        extents = [shape.spectral_extent for shape in shapes]
+        if None not in extents:
+            known = [extent for extent in extents if extent is not None]
+            lb.spectral_extent = max(e[0] for e in known), max(e[1] for e in known)
+        bases = [shape.eigenbasis(1, closed=True) for shape in shapes if len(shape.basis_left)]
+        if len(bases) == len(shapes) and not any(shape.sizes for shape in shapes):
+            lb._keep(stack_eigenbases(bases))
+        return lb
+
+    @classmethod
     def _of(cls, built: Built, given: Any) -> LaplaceBeltrami:
         """Store what was built, in the floating type of the input."""
         lb = cls()
@@ -194,16 +190,6 @@ class LaplaceBeltrami(nn.Module):
         lb._transpose()
         dtype = torch.as_tensor(given).dtype
         return lb.to(dtype if dtype.is_floating_point else torch.get_default_dtype())
-
-    def _transpose(self) -> None:
-        self.crow_t, self.col_t, self.order_t = transpose_pattern(
-            self.crow, self.col, self.num_points
-        )
-
-    @property
-    def num_points(self) -> int:
-        """Number of points N."""
-        return self.crow.shape[0] - 1
 
     @property
     def dim(self) -> int:
@@ -285,6 +271,36 @@ class LaplaceBeltrami(nn.Module):
         """Δx, 1/ℓ: the mean-curvature vector, −(κ₁ + κ₂) times the outer normal; −2x on the unit sphere."""
         return self(self.points)
 
+    def eigenbasis(self, k: int, *, store: bool = False, closed: bool = False) -> Eigenbasis:
+        """The k smallest eigenpairs of −Δ: real, ascending, orthonormal in the mass; min(k, N) of them.
+
+        Solved once, in float64 on the CPU (`method.md`, section 7), and kept: a smaller k is a slice of what there is,
+        a larger one is solved anew. For a batch each shape has its own.
+
+        Parameters
+        ----------
+        k : number of pairs, the constants among them.
+        store : whether `state_dict` holds the basis from now on; it then loads into any operator.
+        closed : whether to return all that was solved, at least k: a span that is invariant under Δ.
+
+        Raises
+        ------
+        StencilError : where the solver does not converge, or the operator is not stable.
+        """
+        if k < 1:
+            raise ValueError(f"k: expected at least 1 eigenvector, got {k}")
+        if self.basis_left.shape[-1] < min(k, max(self.sizes or (self.num_points,))):
+            n = self.num_points
+            matrix = to_scipy(self.crow, self.col, self.values, (n, n))
+            rounding = torch.finfo(self.values.dtype).eps
+            self._keep(blockwise_eigenbasis(matrix, self.mass, k, self.sizes, rounding=rounding))
+        if store:
+            self._keep(None, store=True)
+        rates, mixing = (t if len(t) else None for t in (self.basis_rates, self.basis_mixing))
+        pairs = (self.basis_eigenvalues, self.basis_eigenvectors, self.mass, self.basis_left)
+        basis = Eigenbasis(*pairs, self.sizes, rates, mixing)
+        return basis if closed else basis.truncate(k)
+
     def extra_repr(self) -> str:
         """N, d, n, kind and options."""
         if self.kind == "empty":
@@ -294,43 +310,6 @@ class LaplaceBeltrami(nn.Module):
         certified = "" if self.certificate is None or self.certificate.holds else "NOT STABLE"
         last = [f"{self.col.shape[0]} entries", str(self.values.dtype), certified]
         return ", ".join(part for part in [size, *options, *last] if part)
-
-    def get_extra_state(self) -> dict[str, Any]:
-        """Kind, options and certificate, plain types only."""
-        certificate = None if self.certificate is None else asdict(self.certificate)
-        return {"kind": self.kind, "options": self.options, "certificate": certificate}
-
-    def set_extra_state(self, state: dict[str, Any]) -> None:
-        """Inverse of `get_extra_state`."""
-        self.kind, self.options = state["kind"], dict(state["options"])
-        found = state["certificate"]
-        self.certificate = None if found is None else Certificate(**found)
-
-    def _load_from_state_dict(
-        self,
-        state_dict: Any,
-        prefix: str,
-        local_metadata: Any,
-        strict: bool,
-        missing_keys: Any,
-        unexpected_keys: Any,
-        error_msgs: Any,
-    ) -> None:
-        """Take buffers of any size: an operator is data, not parameters of a fixed shape."""
-        for name, buffer in list(self.named_buffers()):
-            incoming = state_dict.get(prefix + name)
-            if incoming is not None:
-                setattr(self, name, torch.empty_like(incoming, device=buffer.device))
-        super()._load_from_state_dict(
-            state_dict,
-            prefix,
-            local_metadata,
-            strict,
-            missing_keys,
-            unexpected_keys,
-            error_msgs,
-        )
-        self._transpose()
 
 
 # A whole module can be read back with torch.load(weights_only=True) where torchlb is imported.

@@ -1,0 +1,251 @@
+"""The eigenbasis against known spectra, its exact properties, how it is kept, and what is computed from it."""
+
+import copy
+
+import numpy as np
+import pytest
+import torch
+from scipy import linalg
+
+from torchlb import (
+    LaplaceBeltrami,
+    SpectralConv,
+    StencilError,
+    diffusion_distance,
+    diffusion_map,
+    heat_kernel_signature,
+    spectral_wavelets,
+    wave_kernel_signature,
+)
+from torchlb.eigensolver import solve_eigenbasis
+from torchlb.sparse import to_scipy
+from torchlb.surfaces import Circle, CliffordTorus, Sphere, Torus, UnitDisk
+
+BUILDERS = {
+    "points": lambda n: LaplaceBeltrami.from_points(Torus().points(n)),
+    "random points": lambda n: LaplaceBeltrami.from_points(Torus().random_points(n)),
+    "mesh": lambda n: LaplaceBeltrami.from_mesh(*Sphere().mesh(n)),
+    "boundary": lambda n: LaplaceBeltrami.from_mesh(*UnitDisk().mesh(n)),
+    "cotangent": lambda n: LaplaceBeltrami.from_cotangent(*Sphere().mesh(n)),
+    "curve": lambda n: LaplaceBeltrami.from_points(Circle().points(n)),
+    "surface in R^4": lambda n: LaplaceBeltrami.from_points(CliffordTorus().points(n), dim=2),
+    "not certified": lambda n: LaplaceBeltrami.from_points(Sphere().points(n), certify=False),
+}
+every_builder = pytest.mark.parametrize("build", BUILDERS.values(), ids=BUILDERS.keys())
+
+
+def worst(eigenvalues, exact):
+    return float(((eigenvalues[1:] - exact[1:]) / exact[1:]).abs().max())
+
+
+def sphere_eigenvalues(k):
+    order = torch.arange(20)
+    return (order * (order + 1)).repeat_interleave(2 * order + 1)[:k].double()
+
+
+@every_builder
+@pytest.mark.parametrize(("n", "k"), [(120, 30), (120, 500), (600, 40)])
+def test_contract(build, n, k):
+    """ΦᵀΠΦ = I, WᵀΦ = I, λ ascending, λ_0 = 0 and φ_0 constant exactly, −ΔΦ = ΦB on the closed span."""
+    lb = build(n)
+    basis = lb.eigenbasis(k)
+    phi, eye = basis.eigenvectors, torch.eye(min(k, n), dtype=torch.float64)
+    assert phi.shape == (n, min(k, n))
+    assert (phi.T @ (lb.mass[:, None] * phi) - eye).abs().max() <= 1e-10
+    assert (basis.left.T @ phi - eye).abs().max() <= 1e-10
+    assert basis.eigenvalues[0] == 0
+    assert (phi[:, 0] == phi[0, 0]).all()
+    assert basis.eigenvalues[1] > 0
+    assert (basis.eigenvalues.diff() >= 0).all()
+    whole = lb.eigenbasis(k, closed=True)
+    action = -lb(whole.eigenvectors)
+    b = whole.left.T @ action
+    assert (action - whole.eigenvectors @ b).abs().max() <= 1e-8 * b.abs().max()
+
+
+@every_builder
+def test_exact_flow_on_the_span_is_the_exponential_of_the_small_matrix(build):
+    """V e^{−t rates} V⁻¹ = e^{−tB}, B = −WᵀΔΦ."""
+    basis = build(500).eigenbasis(50, closed=True)
+    assert basis.is_closed
+    lb = build(500)
+    b = -basis.left.T @ lb(basis.eigenvectors)
+    v, inverse, turned = basis.mixing
+    for t in (0.01, 1.0):
+        decay, angle = torch.exp(-t * basis.rates[0])[:, None], t * basis.rates[1][:, None]
+        flow = v @ (decay * (angle.cos() * inverse + angle.sin() * turned))
+        assert (flow - torch.matrix_exp(-t * b)).abs().max() < 1e-9
+
+
+@pytest.mark.parametrize(
+    ("order", "weights", "first", "second"),
+    [
+        (3, "least_squares", 7e-5, 1.5e-3),
+        (5, "least_squares", 8e-7, 8e-5),
+        (5, "polyharmonic", 4e-7, 8e-5),
+    ],
+)
+def test_spectrum_of_the_sphere(order, weights, first, second):
+    """λ = l(l+1), 2l + 1 times; the worst relative error of the first 36 and 100."""
+    lb = LaplaceBeltrami.from_points(Sphere().points(4070), order=order, weights=weights)
+    values = lb.eigenbasis(100).eigenvalues
+    assert worst(values[:36], sphere_eigenvalues(36)) <= first
+    assert worst(values, sphere_eigenvalues(100)) <= second
+
+
+def test_spectrum_of_the_torus():
+    """R = 1, r = 0.5: the exact eigenvalues of `method.md`, section 11."""
+    exact = [0] + [0.997472228] * 2 + [3.17827121] * 2 + [3.90692525, 4.48915308]
+    exact += [5.05486779] * 2 + [6.18060331] * 2 + [6.65205815] * 2 + [8.16247260] * 2
+    exact += [10.0568008] * 2 + [12.6129542] * 2 + [12.7010054] * 2 + [14.8217076] * 2
+    exact = torch.tensor([*exact, 16.1307959, 16.2068949], dtype=torch.float64)
+    lb = LaplaceBeltrami.from_points(Torus(1.0, 0.5).points(4000), order=5)
+    assert worst(lb.eigenbasis(len(exact)).eigenvalues, exact) < 1.2e-4
+
+
+def test_cotangent_basis_solves_its_pencil():
+    """C φ = −λ M φ, against a dense symmetric solver."""
+    lb = LaplaceBeltrami.from_cotangent(*Sphere().mesh(600))
+    root = lb.mass.sqrt().numpy()
+    scaled = root[:, None] * lb.matrix.to_dense().numpy() / root
+    expected = linalg.eigvalsh(-(scaled + scaled.T) / 2)[:50]
+    found = lb.eigenbasis(50)
+    np.testing.assert_allclose(found.eigenvalues, expected, atol=1e-9 * expected[-1])
+    torch.testing.assert_close(found.left, lb.mass[:, None] * found.eigenvectors)
+
+
+def three_spheres():
+    points = Sphere().points(450)
+    moved = [points, 2 * points + torch.tensor([5.0, 0, 0]), points - torch.tensor([4.0, 0, 0])]
+    return LaplaceBeltrami.from_points(torch.cat(moved))
+
+
+def test_every_component_has_a_zero_and_equal_components_equal_eigenvalues():
+    """Radii 1, 2, 1: 0 three times, 1/2 three times, 3/2 five times, 2 six times."""
+    basis = three_spheres().eigenbasis(20)
+    values = torch.tensor([0.0] * 3 + [0.5] * 3 + [1.5] * 5 + [2.0] * 6).double()
+    assert (basis.eigenvalues[:3] == 0).all()
+    torch.testing.assert_close(basis.eigenvalues[:17], values, rtol=2e-3, atol=0)
+    phi = basis.eigenvectors
+    assert (phi[:, 0] == phi[0, 0]).all()
+    assert (phi.T @ (basis.mass[:, None] * phi) - torch.eye(20)).abs().max() <= 1e-10
+    assert three_spheres().eigenbasis(2).eigenvalues.tolist() == [0, 0]
+
+
+def test_neumann_spectrum_of_the_disk():
+    """Zeros of the derivatives of Bessel functions: J_1' at 1.8411838, J_2' at 3.0542369, J_0' at 3.8317060."""
+    values = LaplaceBeltrami.from_mesh(*UnitDisk().mesh(700), order=3).eigenbasis(6).eigenvalues
+    exact = torch.tensor([0, 1.8411838, 1.8411838, 3.0542369, 3.0542369, 3.8317060]).double() ** 2
+    assert worst(values, exact) < 2e-3
+
+
+def test_kept_sliced_stored_and_read_back():
+    """One solve; a smaller k is a slice; `state_dict` holds it when asked; types follow the module."""
+    lb = LaplaceBeltrami.from_points(Torus().points(500))
+    basis = lb.eigenbasis(30)
+    assert lb.eigenbasis(30).eigenvectors.data_ptr() == basis.eigenvectors.data_ptr()
+    torch.testing.assert_close(lb.eigenbasis(10).eigenvalues, basis.eigenvalues[:10])
+    assert lb.eigenbasis(10).eigenvectors.shape == (500, 10)
+    assert not any("basis" in key for key in lb.state_dict())
+    lb.eigenbasis(30, store=True)
+    other = LaplaceBeltrami()
+    other.load_state_dict(lb.state_dict())
+    assert other.state_dict().keys() == lb.state_dict().keys()
+    for twin in (other, copy.deepcopy(lb)):
+        torch.testing.assert_close(
+            twin.eigenbasis(30).eigenvectors, basis.eigenvectors, rtol=0, atol=0
+        )
+    assert lb.float().eigenbasis(30).eigenvectors.dtype == torch.float32
+    other.load_state_dict(LaplaceBeltrami.from_points(Torus().points(300)).state_dict())
+    assert other.eigenbasis(20).eigenvectors.shape == (300, 20)
+
+
+def test_basis_of_a_float32_operator():
+    points = Torus().points(500)
+    single = LaplaceBeltrami.from_points(points.float()).eigenbasis(40)
+    double = LaplaceBeltrami.from_points(points).eigenbasis(40)
+    torch.testing.assert_close(
+        single.eigenvalues.double(), double.eigenvalues, rtol=1e-4, atol=1e-6
+    )
+
+
+def test_a_solve_that_cannot_succeed_says_what_to_do():
+    lb = LaplaceBeltrami.from_points(Sphere().points(500))
+    matrix = to_scipy(lb.crow, lb.col, lb.values, (500, 500))
+    with pytest.raises(StencilError, match="not stable; build it with certify=True"):
+        solve_eigenbasis(-matrix, lb.mass, 10)
+    with pytest.raises(ValueError, match="at least 1 eigenvector"):
+        lb.eigenbasis(0)
+
+
+def test_heat_kernel_signature_of_the_sphere():
+    """Σ (2l + 1)/4π e^{−l(l+1)t}, the same at every point."""
+    lb = LaplaceBeltrami.from_points(Sphere().points(2000), order=5)
+    times = torch.tensor([0.2, 1.0], dtype=torch.float64)
+    order = torch.arange(30).double()
+    terms = (2 * order + 1) / (4 * torch.pi) * torch.exp(-order * (order + 1) * times[:, None])
+    signature = heat_kernel_signature(lb, times, k=100)
+    torch.testing.assert_close(signature, terms.sum(1).expand(2000, 2), rtol=2e-3, atol=0)
+
+
+def test_signatures_are_those_of_the_shape_at_any_scale_and_sum_to_one():
+    """Σ_i π_i HKS = Σ e^{−λt}; Σ_i π_i WKS = 1; both times ℓ² unchanged by a change of units."""
+    lb = LaplaceBeltrami.from_points(Torus().points(400))
+    big = LaplaceBeltrami.from_points(3 * Torus().points(400))
+    for signature in (heat_kernel_signature, wave_kernel_signature):
+        assert signature(lb, k=50).shape == (400, 16)
+        torch.testing.assert_close(9 * signature(big, k=50), signature(lb, k=50))
+    torch.testing.assert_close(lb.mass @ wave_kernel_signature(lb, k=50), torch.ones(16).double())
+    t = torch.tensor([0.3]).double()
+    trace = torch.exp(-0.3 * lb.eigenbasis(50).eigenvalues).sum()
+    torch.testing.assert_close(lb.mass @ heat_kernel_signature(lb, t, k=50), trace[None])
+
+
+def test_wavelets_are_a_tight_frame():
+    """Σ_s |W_s f|²_π = |f|²_π for f in the span."""
+    lb = LaplaceBeltrami.from_points(Torus().points(400))
+    f = lb.eigenbasis(40).from_basis(torch.randn(40, 2).double())
+    scales = torch.tensor([0.01, 0.1, 1.0]).double()
+    wavelets = spectral_wavelets(lb, f, scales, k=40)
+    assert wavelets.shape == (400, 4, 2)
+    energy = torch.einsum("n,ntc->c", lb.mass, wavelets**2)
+    torch.testing.assert_close(energy, lb.mass @ f**2)
+    constant = spectral_wavelets(lb, torch.ones(400, 1).double(), scales, k=40)
+    assert constant[:, 1:].abs().max() < 1e-10
+
+
+def test_diffusion_distance_is_the_distance_of_heat_kernels():
+    """d_t(x, y) = |e^{tΔ}δ_x − e^{tΔ}δ_y| in L², with all eigenvectors of a symmetric operator."""
+    lb = LaplaceBeltrami.from_cotangent(*Sphere().mesh(150))
+    kernel = torch.matrix_exp(0.1 * lb.matrix.to_dense()) / lb.mass  # of columns δ_y/π_y
+    sources = torch.tensor([3, 70])
+    difference = kernel[:, :, None] - kernel[:, None, sources]
+    expected = torch.einsum("n,nxs->xs", lb.mass, difference**2).sqrt()
+    torch.testing.assert_close(
+        diffusion_distance(lb, sources, 0.1, k=150), expected, rtol=1e-6, atol=1e-6
+    )
+
+
+def test_diffusion_map_of_a_circle_is_a_circle():
+    """e^{−t}(cos, sin)/√π, up to a rotation."""
+    lb = LaplaceBeltrami.from_points(Circle().points(100), order=3)
+    radius = diffusion_map(lb, 0.5).norm(dim=1)
+    torch.testing.assert_close(
+        radius, torch.full_like(radius, np.exp(-0.5) / np.sqrt(np.pi)), rtol=1e-3, atol=0
+    )
+
+
+def test_spectral_convolution_is_its_formula():
+    lb = LaplaceBeltrami.from_points(Torus().points(300))
+    layer = SpectralConv(3, 2, k=20, num_filters=2).double()
+    x = torch.randn(300, 3).double()
+    basis = lb.eigenbasis(20)
+    u = 2 * basis.eigenvalues / (basis.eigenvalues + layer.scale) - 1
+    filters = layer.weight[0] + u[:, None, None] * layer.weight[1]
+    expected = basis.eigenvectors @ torch.einsum("koi,ki->ko", filters, basis.to_basis(x))
+    torch.testing.assert_close(layer(x, lb), expected)
+    torch.testing.assert_close(layer(x.expand(4, 300, 3), lb)[2], expected)
+    layer(x, lb).sum().backward()
+    assert layer.weight.grad.isfinite().all()
+    with pytest.raises(RuntimeError, match="expected 3 channels"):
+        layer(x[:, :2], lb)
