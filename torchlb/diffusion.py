@@ -89,12 +89,10 @@ def _flow(
     lb: LaplaceBeltrami, x: Tensor, time: Tensor, method: str, k: int, tolerance: float
 ) -> Tensor:
     """e^{tΔ}x, computed in the wider of the types of x and the operator, at least float32, also under autocast."""
-    torch._check(
-        x.ndim in (2, 3) and x.shape[-2] == lb.num_points,
-        lambda: (
+    if not (x.ndim in (2, 3) and x.shape[-2] == lb.num_points):
+        raise ValueError(
             f"expected features of shape (N, C) or (B, N, C) with N = {lb.num_points}, got {tuple(x.shape)}"
-        ),
-    )
+        )
     dtype = torch.promote_types(torch.promote_types(x.dtype, lb.values.dtype), torch.float32)
     with torch.autocast(x.device.type, enabled=False):
         wide, time = x.to(dtype), time.to(dtype)
@@ -239,10 +237,8 @@ class Diffusion(nn.Module):
 
     def forward(self, x: Float[Tensor, "*B N C"], lb: LaplaceBeltrami) -> Float[Tensor, "*B N C"]:
         """The diffused features, of the shape of x: (N, C), or (B, N, C) on one surface."""
-        torch._check(
-            x.shape[-1] == self.channels,
-            lambda: f"expected {self.channels} channels, got x of shape {tuple(x.shape)}",
-        )
+        if not (x.shape[-1] == self.channels):
+            raise ValueError(f"expected {self.channels} channels, got x of shape {tuple(x.shape)}")
         return _flow(lb, x, self.time, self.method, self.k, self.tolerance)
 
     def extra_repr(self) -> str:
