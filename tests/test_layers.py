@@ -163,12 +163,10 @@ def compiled_and_not(name, batched):
 
 @needs_compiler
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    "name", ["full", "spectral", "chebyshev", "rational", "convolution", "net"]
-)
-def test_compiled_without_graph_breaks_it_gives_the_same(name):
+@pytest.mark.parametrize(("name", "batched"), [("classifier", True), ("convolution", False)])
+def test_compiled_without_graph_breaks_it_gives_the_same(name, batched):
     # In a process of its own: Dynamo cannot trace the types that the test run checks at every call.
-    command = [sys.executable, __file__, name]
+    command = [sys.executable, __file__, name, *["batched"][: int(batched)]]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr[-3000:]
 
@@ -183,7 +181,7 @@ def test_autocast_to_bfloat16_stays_close(eight, name):
         y = layer(x, lb)
         half = layer(x.bfloat16(), lb)
     exact = name in ("full", "spectral", "chebyshev", "rational", "convolution")
-    scale = float(expected.abs().max())
+    scale = float(expected.detach().abs().max())
     assert (y.float() - expected).abs().max() <= (1e-6 if exact else 0.2) * scale
     assert (half.float() - expected).abs().max() <= 0.2 * scale
     assert not exact or half.dtype == torch.bfloat16
@@ -263,6 +261,5 @@ def test_on_cuda_it_gives_the_same(eight, name):
 
 
 if __name__ == "__main__":
-    for batched in (False, True):
-        compiled, plain = compiled_and_not(sys.argv[1], batched)
-        torch.testing.assert_close(compiled, plain, rtol=1e-3, atol=1e-4)
+    compiled, plain = compiled_and_not(sys.argv[1], "batched" in sys.argv)
+    torch.testing.assert_close(compiled, plain, rtol=1e-3, atol=1e-4)
