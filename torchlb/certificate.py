@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from scipy import sparse
 from scipy.sparse import csgraph
 from scipy.sparse.linalg import (
@@ -45,6 +45,8 @@ MARGIN = 0.02
 """A point whose π is below this share of its area asks the rows around it to step down while they can."""
 STRICTNESS = 1e-12
 """S passes if it is negative up to this share of its spectral radius; a hundred times the rounding of its sums."""
+POSITIVE = 1e-10
+"""Share of its area that π must reach at every point; what is below has no inflow but rounding."""
 MAX_ROUNDS = 40
 LARGEST = 150_000
 """Beyond this many points the sparse factors outgrow an ordinary machine."""
@@ -190,7 +192,7 @@ def check_certificate(
     max_s, feed = np.nan, torch.zeros(len(areas), 0)
     if smallest > 0:
         max_s, feed = dissipation(matrix, mass)
-    holds = smallest > 0 and feed.shape[1] == 0
+    holds = smallest > POSITIVE and feed.shape[1] == 0
     result = Certificate(holds, smallest, max_s, rounds, stepped, int(component.max()) + 1)
     return mass, result, feed
 
@@ -217,7 +219,8 @@ def certify(
             mass, result, feed = check_certificate(matrix, areas, rounds, stepped)
             bar.set_postfix_str(f"min π {result.min_pi:.2g}, {stepped} rows down", refresh=False)
             bar.update()
-            blamed = _responsible(matrix, mass / areas, feed)
+            bottom = rows.rung == len(ladder.rungs)
+            blamed = _responsible(matrix, mass / areas, feed, bottom)
             movable = blamed[rows.rung[blamed] < len(ladder.rungs)]
             if len(movable) == 0 or rounds == MAX_ROUNDS:
                 break
@@ -230,12 +233,16 @@ def certify(
 
 
 def _responsible(
-    matrix: sparse.csr_array, density: Float[Tensor, " N"], feed: Float[Tensor, "N k"]
+    matrix: sparse.csr_array,
+    density: Float[Tensor, " N"],
+    feed: Float[Tensor, "N k"],
+    bottom: Bool[Tensor, " N"],
 ) -> Int[Tensor, " J"]:
     """Rows to step down.
 
-    Where π is small: the point's own row and those with a negative weight into it, unless slight. Where S fails: the
-    rows that feed its positive eigenvalues.
+    Where π is small: the point's own row and those with a negative weight into it, unless slight. If its row is at the
+    bottom already, also the points of that row: they may leave it out of theirs, as on both sides of a crease. Where S
+    fails: the rows that feed its positive eigenvalues.
     """
     blamed = (feed > FEED_SHARE * feed.amax(0)).any(1) if feed.shape[1] else density.isnan()
     small = (density <= MARGIN).numpy()
@@ -247,6 +254,8 @@ def _responsible(
         heavy = (columns.data < WEIGHT_SHARE * worst[col]) & (columns.data < 0)
         blamed[torch.from_numpy(row[heavy].astype(np.int64))] = True
         blamed |= torch.from_numpy(small)
+        stuck = np.flatnonzero(small & bottom.numpy())
+        blamed[torch.from_numpy(np.unique(matrix[stuck].indices).astype(np.int64))] = True
     return blamed.nonzero()[:, 0]
 
 

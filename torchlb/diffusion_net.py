@@ -55,9 +55,8 @@ class GradientFeatures(nn.Module):
         gradient = lb.local_gradient(x)  # (…, N, d, C)
         if not self.rotations:
             return torch.tanh((gradient * self.A(gradient)).sum(-2))
-        torch._check(
-            lb.dim == 2, lambda: f"rotations need a surface, got dim={lb.dim}; use rotations=False"
-        )
+        if not (lb.dim == 2):
+            raise ValueError(f"rotations need a surface, got dim={lb.dim}; use rotations=False")
         real, imaginary = self.A_re(gradient), self.A_im(gradient)
         first = real[..., 0, :] - imaginary[..., 1, :]
         second = real[..., 1, :] + imaginary[..., 0, :]
@@ -196,10 +195,10 @@ class DiffusionNet(nn.Module):
         lb : operator of one shape or of a batch, whose global mean is (S, C_out), one for each shape.
         faces, edges : for outputs there; in a batch, moved by `lb.offsets`.
         """
-        torch._check(
-            x.shape[-1] == self.C_in,
-            lambda: f"expected C_in = {self.C_in} channels, got x of shape {tuple(x.shape)}",
-        )
+        if not (x.shape[-1] == self.C_in):
+            raise ValueError(
+                f"expected C_in = {self.C_in} channels, got x of shape {tuple(x.shape)}"
+            )
         y = self.first_lin(x)
         for block in self.blocks:
             y = block(y, lb)

@@ -9,7 +9,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from torchlb.batching import join_buffers, join_certificates
+from torchlb.batching import join_buffers, join_certificates, join_extents
 from torchlb.build import Built, Options, build_cloud, build_cotangent, build_mesh
 from torchlb.certificate import Certificate
 from torchlb.eigenbasis import Eigenbasis, stack_eigenbases
@@ -165,10 +165,8 @@ class LaplaceBeltrami(OperatorStorage):
         lb.kind, lb.options = "batch", dict(shapes[0].options)
         lb.certificate = join_certificates([shape.certificate for shape in shapes])
         lb.sizes = tuple(n for shape in shapes for n in shape.sizes or (shape.num_points,))
-        extents = [shape.spectral_extent for shape in shapes]
-        if None not in extents:
-            known = [extent for extent in extents if extent is not None]
-            lb.spectral_extent = max(e[0] for e in known), max(e[1] for e in known)
+        extents = [e for e in (shape.spectral_extent for shape in shapes) if e is not None]
+        lb.spectral_extent = join_extents(extents) if len(extents) == len(shapes) else None
         bases = [shape.eigenbasis(1, closed=True) for shape in shapes if len(shape.basis_left)]
         if len(bases) == len(shapes) and not any(shape.sizes for shape in shapes):
             lb._keep(stack_eigenbases(bases))
@@ -220,13 +218,11 @@ class LaplaceBeltrami(OperatorStorage):
             raise TypeError(f"expected f as a tensor, got {type(f)}; torch.as_tensor(f) makes one")
         if f.ndim == 1:
             return self._apply_rows(values, f[:, None])[:, 0]
-        torch._check(
-            f.ndim in (2, 3) and f.shape[-2] == self.num_points,
-            lambda: (
+        if not (f.ndim in (2, 3) and f.shape[-2] == self.num_points):
+            raise ValueError(
                 f"expected f of shape (N,), (N, C) or (B, N, C) with N = {self.num_points}, "
                 f"got {tuple(f.shape)}"
-            ),
-        )
+            )
         columns = f if f.ndim == 2 else f.transpose(0, 1).flatten(1)
         pattern_t = (self.crow_t, self.col_t, self.order_t)
         result = matmul(self.crow, self.col, values, pattern_t, columns)
@@ -256,12 +252,10 @@ class LaplaceBeltrami(OperatorStorage):
         curvature. Units of v by 1/ℓ.
         """
         expected = (self.num_points, self.points.shape[1])
-        torch._check(
-            v.ndim in (2, 3) and v.shape[:2] == expected,
-            lambda: (
+        if not (v.ndim in (2, 3) and v.shape[:2] == expected):
+            raise ValueError(
                 f"expected a field of shape {expected} or {(*expected, 'C')}, got {tuple(v.shape)}"
-            ),
-        )
+            )
         field = v[..., None] if v.ndim == 2 else v
         local = self.local_gradient(field.flatten(1)).unflatten(-1, field.shape[1:])  # (N, d, n, C)
         result = torch.einsum("ind,idnc->ic", self.frames.to(local.dtype), local)
