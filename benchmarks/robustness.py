@@ -175,7 +175,7 @@ def run(
     cells += [f"{counts[order] / n:.1%}", f"{counts[0] / n:.1%}"]
     cells.append(f"{abscissa(lb):.0e}" if arnoldi or n <= DENSE else "–")
     values, exact = lb.eigenbasis(10).eigenvalues.numpy(), known()
-    low = exact > 1e-2 * exact[-1]  # beyond zeros and necks
+    low = exact > 0.1 / float(lb.mass.sum())  # beyond zeros and necks
     cells.append(f"{np.abs(values[low] / exact[low] - 1).max():.1%}" if low.any() else "–")
     cells.append(f"{stencils:.1f} + {max(whole - stencils, 0):.1f}")
     return "| " + " | ".join(cells) + " |"

@@ -31,6 +31,7 @@ from torchlb.sparse import to_scipy
 from torchlb.stencil import Ladder, StencilError
 
 __all__ = [
+    "LOSS",
     "Certificate",
     "StabilityWarning",
     "certify",

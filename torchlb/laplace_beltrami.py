@@ -79,7 +79,7 @@ class LaplaceBeltrami(OperatorStorage):
         boundary : (N,) mask of the points on the boundary, or "detect" (surfaces); None for a closed shape, or to do
             without a condition.
         condition : there: "neumann", ∂_ν f = 0, or "dirichlet", f = 0. With the latter the values of f at boundary
-            points are not used elsewhere, and have rows of their own, −c f, in which they decay at the grid's rate c.
+            points are not used elsewhere, and have rows of their own, −4d f/h² with h the distance to the nearest.
         certify : whether rows step down until the certificate of stability holds, whose π is then the mass. Without
             it the operator is the raw one, which may blow up under diffusion, and the mass is that of Voronoi cells.
         progress : whether to show a bar on what takes longer than two seconds.

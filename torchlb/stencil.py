@@ -108,10 +108,21 @@ class Ladder:
         return replace(rows, reason=torch.where(rows.order < top - 1, reason, rows.reason))
 
     def _without_boundary(self, centers: Tensor, rows: Rows) -> Float[Tensor, " nnz"]:
-        """Entries of Δ for f = 0 on the boundary: none joins a boundary point to another point."""
+        """Entries of Δ for f = 0 on the boundary: none joins a boundary point to another point.
+
+        A boundary point has −4d/h² for itself, as a grid's fastest wave, h its distance to the nearest point.
+        """
         assert self.boundary is not None
-        row, mask = centers.repeat_interleave(rows.length), self.boundary.mask
-        return rows.laplacian * ~((mask[row] | mask[rows.col]) & (row != rows.col))
+        mask, dim = self.boundary.mask, self.frames.shape[-1]
+        local = torch.arange(len(centers)).repeat_interleave(rows.length)
+        row, col = centers[local], rows.col
+        square = (self.points[col] - self.points[row]).square().sum(1)
+        square = torch.where(row == col, torch.inf, square)
+        nearest = square.new_full((len(centers),), torch.inf).scatter_reduce(
+            0, local, square, "amin"
+        )
+        kept = torch.where(mask[row] | mask[col], 0.0, rows.laplacian)
+        return torch.where(mask[row] & (row == col), -4 * dim / nearest[local], kept)
 
     def _weights(self, centers: Tensor, index: Tensor, rung: Rung) -> Weights:
         """Weights of a batch; stencils that hold boundary points use the Neumann data there, if they have some."""
