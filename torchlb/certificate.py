@@ -48,7 +48,9 @@ STRICTNESS = 1e-12
 """S passes if it is negative up to this share of its spectral radius; a hundred times the rounding of its sums."""
 POSITIVE = 1e-10
 """Share of its area that π must reach at every point; what is below has no inflow but rounding."""
-MAX_ROUNDS = 40
+MAX_ROUNDS = 80
+PATIENCE = 20
+"""Rounds after which rows step down to the bottom at once."""
 LARGEST = 150_000
 """Beyond this many points the sparse factors outgrow an ordinary machine."""
 MAX_VECTORS = 32
@@ -220,14 +222,18 @@ def certify(
             mass, result, feed = check_certificate(matrix, areas, rounds, stepped)
             bar.set_postfix_str(f"min π {result.min_pi:.2g}, {stepped} rows down", refresh=False)
             bar.update()
-            bottom = rows.rung == len(ladder.rungs)
-            blamed = _responsible(matrix, mass / areas, feed, bottom)
-            movable = blamed[rows.rung[blamed] < len(ladder.rungs)]
+            free = rows.rung < len(ladder.rungs)
+            blamed = _responsible(matrix, mass / areas, feed, free)
+            movable = blamed[free[blamed]]
+            if len(movable) == 0 and not result.holds:
+                blamed = _around(matrix, blamed)
+                movable = blamed[free[blamed]]
             if len(movable) == 0 or rounds == MAX_ROUNDS:
                 break
             rounds += 1
             steps[movable] += 1
-            rows = _step_down(ladder, rows, movable, steps[movable], first)
+            steps[movable] += 64 * (rounds > PATIENCE)
+            rows = _step_down(ladder, rows, movable, steps[movable].clamp_max(16), first)
     if not result.holds:
         _warn(result, mass / areas, feed)
     return rows, mass, result
@@ -237,13 +243,13 @@ def _responsible(
     matrix: sparse.csr_array,
     density: Float[Tensor, " N"],
     feed: Float[Tensor, "N k"],
-    bottom: Bool[Tensor, " N"],
+    free: Bool[Tensor, " N"],
 ) -> Int[Tensor, " J"]:
     """Rows to step down.
 
-    Where π is small: the point's own row and those with a negative weight into it, unless slight. If its row is at the
-    bottom already, also the points of that row: they may leave it out of theirs, as on both sides of a crease. Where S
-    fails: the rows that feed its positive eigenvalues.
+    Where π is small: the point's own row and those with a negative weight into it, unless slight. Also the
+    points of its row if that is at the bottom already, since they may leave it out of theirs, as on both sides of a
+    crease. Where S fails: the rows that feed its positive eigenvalues.
     """
     blamed = (feed > FEED_SHARE * feed.amax(0)).any(1) if feed.shape[1] else density.isnan()
     small = (density <= MARGIN).numpy()
@@ -255,9 +261,16 @@ def _responsible(
         heavy = (columns.data < WEIGHT_SHARE * worst[col]) & (columns.data < 0)
         blamed[torch.from_numpy(row[heavy].astype(np.int64))] = True
         blamed |= torch.from_numpy(small)
-        stuck = np.flatnonzero(small & bottom.numpy())
-        blamed[torch.from_numpy(np.unique(matrix[stuck].indices).astype(np.int64))] = True
+        starved = np.flatnonzero(small & ~free.numpy())
+        blamed[torch.from_numpy(np.unique(matrix[starved].indices).astype(np.int64))] = True
     return blamed.nonzero()[:, 0]
+
+
+def _around(matrix: sparse.csr_array, rows: Int[Tensor, " J"]) -> Int[Tensor, " K"]:
+    """Rows that share an entry with the given ones, where those are at the bottom: they are symmetric only together."""
+    inward = sparse.csc_array(matrix)[:, rows.numpy()].indices
+    joined = np.concatenate([matrix[rows.numpy()].indices, inward])
+    return torch.from_numpy(np.unique(joined).astype(np.int64))
 
 
 def _step_down(ladder: Ladder, rows: Rows, movable: Tensor, steps: Tensor, first: Tensor) -> Rows:
