@@ -8,6 +8,7 @@ import pytest
 PACKAGE = Path(__file__).parents[1] / "torchlb"
 # Lowest first. `import torchlb` counts as an import of __init__, which stands on all the rest.
 ORDER = [
+    "version",
     "voronoi",
     "neighbors",
     "polynomials",
@@ -34,6 +35,7 @@ ORDER = [
     "spectral",
     "diffusion",
     "diffusion_net",
+    "cache",
     "interop",
     "precompute",
     "manifold",

@@ -6,6 +6,14 @@ them (`spectral`) come after it. `surfaces` has shapes with exact answers.
 """
 
 from torchlb import surfaces
+from torchlb.cache import (
+    CacheWarning,
+    OperatorFileError,
+    load_operator,
+    load_or_build,
+    operator_key,
+    save_operator,
+)
 from torchlb.certificate import Certificate, StabilityWarning
 from torchlb.checks import clean_mesh
 from torchlb.eigenbasis import Eigenbasis
@@ -20,21 +28,28 @@ from torchlb.spectral import (
     wave_kernel_signature,
 )
 from torchlb.stencil import StencilError
+from torchlb.version import __version__
 
 __all__ = [
+    "CacheWarning",
     "Certificate",
     "Eigenbasis",
     "LaplaceBeltrami",
+    "OperatorFileError",
     "SpectralConv",
     "StabilityWarning",
     "StencilError",
     "StencilReport",
+    "__version__",
     "clean_mesh",
     "diffusion_distance",
     "diffusion_map",
     "heat_kernel_signature",
+    "load_operator",
+    "load_or_build",
+    "operator_key",
+    "save_operator",
     "spectral_wavelets",
     "surfaces",
     "wave_kernel_signature",
 ]
-__version__ = "0.1.0"
