@@ -29,6 +29,7 @@ ORDER = [
     "eigensolver",
     "batching",
     "storage",
+    "heat",
     "galerkin",
     "build",
     "laplace_beltrami",

@@ -19,7 +19,7 @@ from torchlb import (
 )
 from torchlb.eigensolver import solve_eigenbasis
 from torchlb.sparse import to_scipy
-from torchlb.surfaces import Circle, CliffordTorus, UnitDisk, Sphere, Torus
+from torchlb.surfaces import Circle, CliffordTorus, Sphere, Torus, UnitDisk
 
 BUILDERS = {
     "points": lambda n: LaplaceBeltrami.from_points(Torus().points(n)),
@@ -247,5 +247,5 @@ def test_spectral_convolution_is_its_formula():
     torch.testing.assert_close(layer(x.expand(4, 300, 3), lb)[2], expected)
     layer(x, lb).sum().backward()
     assert layer.weight.grad.isfinite().all()
-    with pytest.raises(RuntimeError, match="expected 3 channels"):
+    with pytest.raises(ValueError, match="expected 3 channels"):
         layer(x[:, :2], lb)

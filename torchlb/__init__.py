@@ -1,8 +1,9 @@
 """High-order Laplace–Beltrami operators on meshes and point clouds, for PyTorch.
 
 The walk: points become neighbours (`neighbors`), frames (`tangent`), offsets and weights (`weights`), rows of one
-sparse operator (`stencil`), stored in a module (`laplace_beltrami`). Its eigenpairs (`eigenbasis`) and what is made of
-them (`spectral`) come after it. `surfaces` has shapes with exact answers.
+sparse operator (`stencil`), stored in a module (`laplace_beltrami`). Its eigenpairs (`eigensolver`), what is made of
+them (`spectral`) and the layers that learn (`diffusion`, `diffusion_net`) take that module as an argument. `surfaces`
+has shapes with exact answers.
 """
 
 from torchlb import surfaces
@@ -16,6 +17,8 @@ from torchlb.cache import (
 )
 from torchlb.certificate import Certificate, StabilityWarning
 from torchlb.checks import clean_mesh
+from torchlb.diffusion import Diffusion, heat_flow
+from torchlb.diffusion_net import DiffusionNet, DiffusionNetBlock, GradientFeatures
 from torchlb.eigenbasis import Eigenbasis
 from torchlb.laplace_beltrami import LaplaceBeltrami
 from torchlb.report import StencilReport
@@ -33,7 +36,11 @@ from torchlb.version import __version__
 __all__ = [
     "CacheWarning",
     "Certificate",
+    "Diffusion",
+    "DiffusionNet",
+    "DiffusionNetBlock",
     "Eigenbasis",
+    "GradientFeatures",
     "LaplaceBeltrami",
     "OperatorFileError",
     "SpectralConv",
@@ -44,6 +51,7 @@ __all__ = [
     "clean_mesh",
     "diffusion_distance",
     "diffusion_map",
+    "heat_flow",
     "heat_kernel_signature",
     "load_operator",
     "load_or_build",

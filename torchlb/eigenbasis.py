@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import torch
 from jaxtyping import Float
 from torch import Tensor
@@ -11,7 +9,6 @@ from torch import Tensor
 __all__ = ["Eigenbasis", "stack_eigenbases"]
 
 
-@dataclass(frozen=True)
 class Eigenbasis:
     """Eigenpairs of −Δ: real, ascending, orthonormal in the mass.
 
@@ -29,13 +26,25 @@ class Eigenbasis:
         conjugate pair. Both are there only in a closed basis, whose span is invariant: see `is_closed`.
     """
 
-    eigenvalues: Float[Tensor, "*S k"]
-    eigenvectors: Float[Tensor, "N k"]
-    mass: Float[Tensor, " N"]
-    left: Float[Tensor, "N k"]
-    sizes: tuple[int, ...] | None = None
-    rates: Float[Tensor, "*S 2 k"] | None = None
-    mixing: Float[Tensor, "*S 3 k k"] | None = None
+    def __init__(
+        self,
+        eigenvalues: Float[Tensor, "*S k"],
+        eigenvectors: Float[Tensor, "N k"],
+        mass: Float[Tensor, " N"],
+        left: Float[Tensor, "N k"],
+        sizes: tuple[int, ...] | None = None,
+        rates: Float[Tensor, "*S 2 k"] | None = None,
+        mixing: Float[Tensor, "*S 3 k k"] | None = None,
+    ) -> None:
+        self.eigenvalues, self.eigenvectors = eigenvalues, eigenvectors
+        self.mass, self.left, self.sizes = mass, left, sizes
+        self.rates, self.mixing = rates, mixing
+
+    def __repr__(self) -> str:
+        n, k = self.eigenvectors.shape
+        shapes = "" if self.sizes is None else f", {len(self.sizes)} shapes"
+        last = float(self.eigenvalues.max()) if k else 0.0
+        return f"Eigenbasis({k} pairs of {n} points{shapes}, eigenvalues 0 to {last:.4g})"
 
     @property
     def is_closed(self) -> bool:
@@ -49,20 +58,20 @@ class Eigenbasis:
         cut = (self.eigenvalues[..., :k], self.eigenvectors[:, :k], self.mass, self.left[:, :k])
         return Eigenbasis(*cut, sizes=self.sizes)
 
-    def to_basis(self, f: Float[Tensor, "*B N C"]) -> Float[Tensor, "*B k C"]:
+    def to_basis(self, f: Float[Tensor, "*B N C"]) -> Float[Tensor, "*S k C"]:
         """Coefficients Φᵀ(πf), (…, k, C), or (…, S, k, C) for a batch of shapes."""
         return self._analyse(self.eigenvectors * self.mass[:, None], f)
 
-    def to_basis_obliquely(self, f: Float[Tensor, "*B N C"]) -> Float[Tensor, "*B k C"]:
+    def to_basis_obliquely(self, f: Float[Tensor, "*B N C"]) -> Float[Tensor, "*S k C"]:
         """Coefficients Wᵀf: zero on every left-over eigenvector of Δ, which Φᵀ(πf) is not."""
         return self._analyse(self.left, f)
 
-    def from_basis(self, coefficients: Float[Tensor, "*B k C"]) -> Float[Tensor, "*B N C"]:
+    def from_basis(self, coefficients: Float[Tensor, "*S k C"]) -> Float[Tensor, "*B N C"]:
         """The function Φc with the given coefficients, (…, N, C)."""
         return self.synthesise(self.eigenvectors, coefficients)
 
     def synthesise(
-        self, functions: Float[Tensor, "N k"], coefficients: Float[Tensor, "*B k C"]
+        self, functions: Float[Tensor, "N k"], coefficients: Float[Tensor, "*S k C"]
     ) -> Float[Tensor, "*B N C"]:
         """Σ_k functions[:, k] c_k, with the coefficients of its own shape at every point."""
         functions = functions.to(coefficients.dtype)

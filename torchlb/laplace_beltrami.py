@@ -208,13 +208,11 @@ class LaplaceBeltrami(OperatorStorage):
         """The product with one set of values on the pattern, for any layout of f."""
         if f.ndim == 1:
             return self._apply_rows(values, f[:, None])[:, 0]
-        torch._check(
-            f.ndim in (2, 3) and f.shape[-2] == self.num_points,
-            lambda: (
+        if not (f.ndim in (2, 3) and f.shape[-2] == self.num_points):
+            raise ValueError(
                 f"expected f of shape (N,), (N, C) or (B, N, C) with N = {self.num_points}, "
                 f"got {tuple(f.shape)}"
-            ),
-        )
+            )
         columns = f if f.ndim == 2 else f.transpose(0, 1).flatten(1)
         pattern_t = (self.crow_t, self.col_t, self.order_t)
         result = matmul(self.crow, self.col, values, pattern_t, columns)
@@ -244,12 +242,10 @@ class LaplaceBeltrami(OperatorStorage):
         curvature. Units of v by 1/ℓ.
         """
         expected = (self.num_points, self.points.shape[1])
-        torch._check(
-            v.ndim in (2, 3) and v.shape[:2] == expected,
-            lambda: (
+        if not (v.ndim in (2, 3) and v.shape[:2] == expected):
+            raise ValueError(
                 f"expected a field of shape {expected} or {(*expected, 'C')}, got {tuple(v.shape)}"
-            ),
-        )
+            )
         field = v[..., None] if v.ndim == 2 else v
         local = self.local_gradient(field.flatten(1)).unflatten(-1, field.shape[1:])  # (N, d, n, C)
         result = torch.einsum("ind,idnc->ic", self.frames.to(local.dtype), local)

@@ -17,7 +17,7 @@ from scipy import sparse
 from torch import Tensor
 from torch.nn.functional import embedding_bag
 
-__all__ = ["from_scipy", "matmul", "to_scipy", "transpose_pattern"]
+__all__ = ["csr_product", "from_scipy", "matmul", "to_scipy", "transpose_pattern"]
 
 
 def transpose_pattern(
@@ -57,6 +57,16 @@ def matmul(
     [[21.0], [30.0]]
     """
     return _product([crow, col, *pattern_t], values, x, False)
+
+
+def csr_product(
+    pattern: Sequence[Tensor],
+    values: Float[Tensor, " nnz"],
+    x: Float[Tensor, "M C"],
+    transposed: bool,
+) -> Float[Tensor, "K C"]:
+    """A x, or Aᵀ x, for the pattern [crow, col, crow_t, col_t, order_t]; otherwise as `matmul`."""
+    return _product(list(pattern), values, x, transposed)
 
 
 def _compute_dtype(left: Tensor, right: Tensor) -> torch.dtype:

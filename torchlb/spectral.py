@@ -218,10 +218,10 @@ class SpectralConv(nn.Module):
 
     def forward(self, x: Float[Tensor, "*B N C"], lb: LaplaceBeltrami) -> Float[Tensor, "*B N D"]:
         """Features (N, C_out) or (B, N, C_out) of x (N, C_in) or (B, N, C_in)."""
-        torch._check(
-            x.shape[-1] == self.in_channels,
-            lambda: f"expected {self.in_channels} channels, got x of shape {tuple(x.shape)}",
-        )
+        if not (x.shape[-1] == self.in_channels):
+            raise ValueError(
+                f"expected {self.in_channels} channels, got x of shape {tuple(x.shape)}"
+            )
         basis = lb.eigenbasis(self.k)
         dtype = torch.promote_types(x.dtype, torch.float32)
         with torch.autocast(x.device.type, enabled=False):

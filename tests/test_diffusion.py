@@ -1,0 +1,217 @@
+"""Heat flow by every method against the dense exponential, its conservation laws, and its derivatives."""
+
+import numpy as np
+import pytest
+import torch
+from torch.autograd import gradcheck
+
+from torchlb import Diffusion, LaplaceBeltrami, StencilError, heat_flow
+from torchlb.diffusion import find_spectral_extent
+from torchlb.heat import chebyshev_coefficients, hyperbola
+from torchlb.surfaces import Circle, Sphere, Torus, UnitDisk
+
+METHODS = ["full", "spectral", "chebyshev", "rational"]
+EXACT = ["full", "chebyshev", "rational"]
+every_method = pytest.mark.parametrize("method", METHODS)
+exact_method = pytest.mark.parametrize("method", EXACT)
+BUILDERS = {
+    "points": lambda: LaplaceBeltrami.from_points(Torus().points(300)),
+    "random points": lambda: LaplaceBeltrami.from_points(Torus().random_points(300)),
+    "mesh": lambda: LaplaceBeltrami.from_mesh(*Sphere().mesh(300)),
+    "boundary": lambda: LaplaceBeltrami.from_mesh(*UnitDisk().mesh(300)),
+    "cotangent": lambda: LaplaceBeltrami.from_cotangent(*Sphere().mesh(300)),
+    "curve": lambda: LaplaceBeltrami.from_points(Circle().points(300)),
+    "not certified": lambda: LaplaceBeltrami.from_points(Sphere().points(300), certify=False),
+}
+every_builder = pytest.mark.parametrize("build", BUILDERS.values(), ids=BUILDERS.keys())
+
+
+def rough(n, channels=3):
+    return torch.randn(n, channels, dtype=torch.float64)
+
+
+def norm(lb, f):
+    """|f|_π of all channels together."""
+    return float((lb.mass[:, None] * f**2).sum().sqrt())
+
+
+@pytest.mark.parametrize("sampling", ["points", "random_points"])
+def test_full_diffusion_is_the_dense_exponential_at_every_scale(sampling):
+    """|full − e^{tL}f| ≤ 1e-6 |f| for t from h²/10 to 10/λ_1, all in one call; what spectral alone loses beside it."""
+    lb = LaplaceBeltrami.from_points(getattr(Sphere(), sampling)(1000))
+    h2, last = float(lb.mass.mean()), 10 / float(lb.eigenbasis(128).eigenvalues[1])
+    times = torch.logspace(np.log10(h2 / 10), np.log10(last), 7).double()
+    f = rough(1000, 7)
+    exact = [torch.matrix_exp(t * lb.matrix.to_dense()) @ f[:, [i]] for i, t in enumerate(times)]
+    full, spectral = (heat_flow(lb, f, times, method=m) for m in ("full", "spectral"))
+    for i, expected in enumerate(exact):
+        assert norm(lb, full[:, [i]] - expected) <= 1e-6 * norm(lb, f[:, [i]])
+    assert norm(lb, spectral[:, [0]] - exact[0]) > 0.3 * norm(lb, f[:, [0]])
+
+
+@every_builder
+@exact_method
+def test_every_method_on_every_kind_of_operator(build, method):
+    """|y − e^{tL}f| ≤ 1e-6 |f| for (N,), (N, C) and (B, N, C)."""
+    lb = build()
+    f = torch.randn(2, 300, 2).double()
+    times = torch.tensor([0.003, 0.4]).double()
+    y = heat_flow(lb, f, times, method=method, k=40)
+    for c, t in enumerate(times):
+        expected = torch.matrix_exp(t * lb.matrix.to_dense()) @ f[..., c].T
+        assert norm(lb, y[..., c].T - expected) <= 1e-6 * norm(lb, f[..., c].T)
+    torch.testing.assert_close(heat_flow(lb, f[1], times, method=method, k=40), y[1])
+    alone = heat_flow(lb, f[1, :, 0], times[0], method=method, k=40)
+    torch.testing.assert_close(alone, y[1, :, 0], rtol=0, atol=1e-6)
+
+
+@every_builder
+def test_spectral_diffusion_is_its_formula(build):
+    """Φ e^{−λt} Φᵀ(πf)."""
+    lb, f = build(), rough(300)
+    basis = lb.eigenbasis(30)
+    phi = basis.eigenvectors
+    expected = phi @ (
+        torch.exp(-basis.eigenvalues * 0.1)[:, None] * (phi.T @ (lb.mass[:, None] * f))
+    )
+    torch.testing.assert_close(heat_flow(lb, f, 0.1, method="spectral", k=30), expected)
+
+
+@every_method
+@pytest.mark.parametrize("name", ["points", "random points", "mesh", "cotangent"])
+def test_heat_is_conserved_and_energy_never_grows(name, method):
+    """Σ π u = Σ π f to 1e-12; |u(t)|_π falls with t, and is at most |f|_π."""
+    lb, f = BUILDERS[name](), rough(300)
+    before = norm(lb, f)
+    for t in 10.0 ** torch.arange(-5, 3):
+        u = heat_flow(lb, f, t, method=method, k=40)
+        lost = lb.mass @ (u - f)
+        assert lost.abs().max() <= 1e-12 * (lb.mass @ f.abs()).max()
+        assert norm(lb, u) <= before * (1 + 1e-7)
+        before = norm(lb, u)
+
+
+@every_method
+def test_no_time_no_diffusion_and_long_times_leave_the_mean(method):
+    lb, f = BUILDERS["points"](), rough(300)
+    mean = (lb.mass @ f) / lb.mass.sum()
+    last = heat_flow(lb, f, 60.0, method=method, k=40)
+    torch.testing.assert_close(last, mean.expand(300, 3), rtol=0, atol=1e-5)
+    start = f if method != "spectral" else None
+    if start is not None:
+        torch.testing.assert_close(heat_flow(lb, f, 0.0, method=method, k=40), start)
+
+
+@every_method
+@pytest.mark.parametrize("name", ["random points", "cotangent"])
+def test_derivatives_in_the_features_and_in_the_times(name, method):
+    lb = BUILDERS[name]()
+    f = torch.randn(2, 300, 2).double()
+    weights = torch.randn(2, 300, 2).double()
+    times = torch.tensor([0.01, 0.2], dtype=torch.float64, requires_grad=True)
+    scale = torch.tensor(1.0, dtype=torch.float64, requires_grad=True)
+
+    def total(t, s):
+        y = heat_flow(lb, s * f + (1 - s) * weights, t, method=method, k=30, tolerance=1e-11)
+        return (weights * y).sum((0, 1))
+
+    assert gradcheck(total, (times, scale), eps=1e-5, atol=1e-4)
+
+
+@exact_method
+def test_derivative_in_every_entry_of_the_features(method):
+    lb = LaplaceBeltrami.from_points(Torus().random_points(40), order=1)
+    f = torch.randn(40, 2, dtype=torch.float64, requires_grad=True)
+    times = torch.tensor([0.02, 0.5], dtype=torch.float64)
+    assert gradcheck(lambda x: heat_flow(lb, x, times, method=method, k=10), f, eps=1e-2, atol=1e-6)
+
+
+@exact_method
+def test_time_derivative_is_the_laplacian(method):
+    """∂_t e^{tΔ}f = Δ e^{tΔ}f."""
+    lb, f = BUILDERS["random points"](), rough(300, 1)
+    t = torch.tensor(0.1, dtype=torch.float64, requires_grad=True)
+    u = heat_flow(lb, f, t, method=method, k=40, tolerance=1e-12)
+    (slope,) = torch.autograd.grad((u * f).sum(), t)
+    torch.testing.assert_close(slope, (lb(u.detach()) * f).sum(), rtol=1e-7, atol=1e-9)
+
+
+@pytest.mark.parametrize("height", [0.0, 0.1, 0.4])
+def test_chebyshev_series_in_the_ellipse(height):
+    """Σ c_k r^{−k} T_k((z + a)/d) = e^{tz} on the ellipse around −a that touches 0, with its derivative in t."""
+    radius, times = 50.0, np.array([0.0, 1e-3, 0.1, 3.0])
+    c, slope, d, r = chebyshev_coefficients(times, radius, height * radius / 2, 1e-10)
+    angle = np.linspace(0, 2 * np.pi, 50)[:, None]
+    z = radius / 2 * (np.cos(angle) - 1 + 1j * height * np.sin(angle))
+    w = np.arccosh((z + radius / 2) / d + 0j)
+    k = np.arange(len(c))
+    vectors = (np.exp(k * (w - np.log(r))) + np.exp(-k * (w + np.log(r)))) / 2
+    np.testing.assert_allclose(vectors @ c, np.exp(times * z), atol=1e-9)
+    np.testing.assert_allclose(vectors @ slope, z * np.exp(times * z), atol=1e-7)
+
+
+@pytest.mark.parametrize("spread", [1.0, 10.0])
+def test_rational_sum_in_the_sector(spread):
+    """Re Σ w e^{τz}/(z + x) = e^{−τx} within 20° of the axis, over fourteen decades of x."""
+    z, w = hyperbola(spread, 1e-8)
+    for angle in (0.0, 20.0):
+        x = np.logspace(-7, 7, 200) * np.exp(1j * np.radians(angle))
+        for tau in (1 / spread, 0.5 * (1 + 1 / spread), 1.0):
+            terms = (w * np.exp(tau * z))[:, None] / (z[:, None] + x)
+            below = (w * np.exp(tau * z))[:, None] / (z[:, None] + x.conj())
+            total = (terms + below.conj()).sum(0) / 2
+            assert np.abs(total - np.exp(-tau * x)).max() < 1e-7
+
+
+@pytest.mark.parametrize("name", ["random points", "cotangent", "curve"])
+def test_ellipse_holds_the_spectrum(name):
+    """Large and small operators alike: |λ + R/2| within the ellipse of half axes R/2 and b, to a per cent."""
+    lb = (
+        BUILDERS[name]()
+        if name != "random points"
+        else LaplaceBeltrami.from_points(Torus().random_points(900))
+    )
+    radius, height = find_spectral_extent(lb)
+    values = torch.linalg.eigvals(lb.matrix.to_dense())
+    assert values.abs().max() <= radius <= 1.1 * values.abs().max()
+    assert values.imag.abs().max() <= height + 1e-9 * radius
+    assert lb.spectral_extent == (radius, height)
+
+
+def test_learned_times_stay_positive_and_are_learned():
+    """A flow for t = 0.2 is found from t = 0.01, by unconstrained minimisation."""
+    lb = BUILDERS["points"]()
+    f = rough(300, 2)
+    target = heat_flow(lb, f, torch.tensor([0.2, 0.05]))
+    layer = Diffusion(2, k=40).double()
+    optimizer = torch.optim.LBFGS(layer.parameters(), max_iter=60, line_search_fn="strong_wolfe")
+
+    def loss():
+        optimizer.zero_grad()
+        value = (layer(f, lb) - target).square().sum()
+        value.backward()
+        return value
+
+    optimizer.step(loss)
+    torch.testing.assert_close(layer.time, torch.tensor([0.2, 0.05]).double(), rtol=1e-3, atol=0)
+    with torch.no_grad():
+        layer.raw_time.fill_(-3.0)
+    assert (layer.time > 0).all()
+
+
+def test_what_cannot_work_is_said():
+    lb = BUILDERS["points"]()
+    f = rough(300)
+    with pytest.raises(ValueError, match=r"expected one of \['full'.*got 'implicit'"):
+        Diffusion(3, method="implicit")
+    with pytest.raises(ValueError, match="times of at least 0"):
+        heat_flow(lb, f, -1.0)
+    with pytest.raises(ValueError, match="N = 300"):
+        heat_flow(lb, f[:100], 1.0)
+    with pytest.raises(ValueError, match="expected 2 channels"):
+        Diffusion(2)(f, lb)
+    with pytest.raises(ValueError, match=r"takes .* products"):
+        heat_flow(lb, f, 1e9, method="chebyshev")
+    two = torch.cat([Sphere().points(200), Sphere().points(200) + 5])
+    with pytest.raises(StencilError, match="ask for another k"):
+        heat_flow(LaplaceBeltrami.from_points(two), rough(400), 1.0, k=1)

@@ -1,0 +1,211 @@
+"""DiffusionNet: the original's formula with the original's weights, equivariance, outputs at every place."""
+
+import re
+
+import pytest
+import torch
+
+from torchlb import (
+    DiffusionNet,
+    DiffusionNetBlock,
+    GradientFeatures,
+    LaplaceBeltrami,
+    heat_flow,
+)
+from torchlb.surfaces import Circle, Sphere, Torus
+
+WIDTH, HIDDEN, BLOCKS = 8, [12, 10], 2
+
+
+@pytest.fixture(scope="module")
+def mesh():
+    vertices, faces = Torus().mesh(300)
+    return LaplaceBeltrami.from_mesh(vertices, faces), faces
+
+
+def original_weights(rotations=True, gradients=True):
+    """Random weights under the published names of a network of `BLOCKS` blocks."""
+    state = {}
+
+    def linear(name, inputs, outputs, bias=True):
+        state[f"{name}.weight"] = torch.randn(outputs, inputs).double() / inputs**0.5
+        if bias:
+            state[f"{name}.bias"] = torch.randn(outputs).double()
+
+    linear("first_lin", 3, WIDTH)
+    linear("last_lin", WIDTH, 5)
+    for i in range(BLOCKS):
+        block = f"block_{i}"
+        state[f"{block}.diffusion.diffusion_time"] = torch.rand(WIDTH).double() - 0.2
+        for name in ("A_re", "A_im") if rotations else ("A",):
+            if gradients:
+                linear(f"{block}.gradient_features.{name}", WIDTH, WIDTH, bias=False)
+        sizes = [(3 if gradients else 2) * WIDTH, *HIDDEN, WIDTH]
+        for j in range(len(sizes) - 1):
+            linear(f"{block}.mlp.miniMLP_mlp_layer_{j:03d}", sizes[j], sizes[j + 1])
+    return state
+
+
+def original_formula(state, x, lb, k, rotations=True, gradients=True):
+    """The network as its paper describes it, on plain tensors."""
+    basis = lb.eigenbasis(k)
+    phi, values = basis.eigenvectors, basis.eigenvalues
+    grad_x, grad_y = lb.local_gradient(torch.eye(lb.num_points).double()).unbind(1)
+    h = x @ state["first_lin.weight"].T + state["first_lin.bias"]
+    for i in range(BLOCKS):
+        part = {
+            key.split(".", 1)[1]: v for key, v in state.items() if key.startswith(f"block_{i}.")
+        }
+        time = part["diffusion.diffusion_time"].clamp(min=1e-8)
+        spread = phi @ (torch.exp(-values[:, None] * time) * (phi.T @ (lb.mass[:, None] * h)))
+        features = [h, spread]
+        if gradients:
+            z = torch.complex(grad_x @ spread, grad_y @ spread)
+            if rotations:
+                a = torch.complex(
+                    part["gradient_features.A_re.weight"], part["gradient_features.A_im.weight"]
+                )
+            else:
+                a = part["gradient_features.A.weight"].to(z.dtype)
+            features.append(torch.tanh((z.conj() * (z @ a.T)).real))
+        y = torch.cat(features, dim=1)
+        for j in range(len(HIDDEN) + 1):
+            layer = f"mlp.miniMLP_mlp_layer_{j:03d}"
+            y = (y if j == 0 else y.relu()) @ part[f"{layer}.weight"].T + part[f"{layer}.bias"]
+        h = h + y
+    return h @ state["last_lin.weight"].T + state["last_lin.bias"]
+
+
+@pytest.mark.parametrize(("gradients", "rotations"), [(True, True), (True, False), (False, False)])
+def test_original_weights_give_the_original_formula(mesh, gradients, rotations):
+    lb, _ = mesh
+    state = original_weights(rotations, gradients)
+    net = DiffusionNet(
+        3,
+        5,
+        WIDTH,
+        BLOCKS,
+        mlp_hidden_dims=HIDDEN,
+        with_gradient_features=gradients,
+        with_gradient_rotations=rotations,
+        diffusion_method="spectral",
+        k=40,
+    )
+    net = net.double().eval()
+    net.load_original_state_dict(state)
+    expected = original_formula(state, lb.points, lb, 40, rotations, gradients)
+    torch.testing.assert_close(net(lb.points, lb), expected, rtol=1e-6, atol=1e-6)
+
+
+def test_published_layout_of_the_default_network():
+    """4 blocks of width 128: 40 tensors."""
+    net = DiffusionNet(16, 8)
+    assert len(net.state_dict()) == 40
+    with pytest.raises(ValueError, match=r"missing \['block_0.diffusion.diffusion_time'"):
+        net.load_original_state_dict({})
+    state = original_weights()
+    small = DiffusionNet(3, 5, WIDTH, BLOCKS, mlp_hidden_dims=HIDDEN)
+    with pytest.raises(ValueError, match=re.escape("unexpected ['more']")):
+        small.load_original_state_dict({**state, "more": torch.zeros(1)})
+    state["last_lin.bias"] = torch.zeros(6)
+    with pytest.raises(ValueError, match=re.escape("last_lin.bias: expected shape (5,), got (6,)")):
+        small.load_original_state_dict(state)
+
+
+def test_gradient_features_do_not_depend_on_the_frames(mesh):
+    """Every tangent frame turned by an angle of its own: the same features."""
+    lb, _ = mesh
+    turned = LaplaceBeltrami.from_mesh(*Torus().mesh(300))
+    angle = torch.rand(300).double() * 6
+    entry = torch.repeat_interleave(angle, lb.crow.diff())
+    g = lb.gradient_values
+    turned.gradient_values = torch.stack(
+        [entry.cos() * g[0] + entry.sin() * g[1], -entry.sin() * g[0] + entry.cos() * g[1]]
+    )
+    layer, x = GradientFeatures(6).double(), torch.randn(300, 6).double()
+    torch.testing.assert_close(layer(x, turned), layer(x, lb))
+
+
+def test_network_of_intrinsic_features_does_not_see_rigid_motions():
+    points = Torus().random_points(300)
+    rotation = torch.linalg.qr(torch.randn(3, 3).double())[0]
+    rotation *= rotation.det()
+    net = DiffusionNet(2, 3, WIDTH, k=30).double().eval()
+    x = torch.randn(300, 2).double()
+    first = LaplaceBeltrami.from_points(points)
+    second = LaplaceBeltrami.from_points(points @ rotation.T + 1)
+    torch.testing.assert_close(net(x, first), net(x, second), rtol=1e-7, atol=1e-7)
+
+
+def test_outputs_at_every_place(mesh):
+    """Means of the corners; Σ π y / Σ π."""
+    lb, faces = mesh
+    edges = faces[:, :2]
+    nets = {
+        place: DiffusionNet(3, 5, WIDTH, outputs_at=place, k=30).double().eval()
+        for place in ("vertices", "faces", "edges", "global_mean")
+    }
+    for net in nets.values():
+        net.load_state_dict(nets["vertices"].state_dict())
+    x = torch.randn(2, 300, 3).double()
+    y = nets["vertices"](x, lb)
+    assert y.shape == (2, 300, 5)
+    torch.testing.assert_close(nets["faces"](x, lb, faces), y[:, faces].mean(2))
+    torch.testing.assert_close(nets["edges"](x, lb, edges=edges), y[:, edges].mean(2))
+    mean = torch.einsum("n,bnc->bc", lb.mass, y) / lb.mass.sum()
+    torch.testing.assert_close(nets["global_mean"](x, lb), mean)
+    torch.testing.assert_close(nets["global_mean"](x[0], lb), mean[0])
+    with pytest.raises(ValueError, match="needs faces, got None"):
+        nets["faces"](x, lb)
+
+
+def test_block_is_its_formula(mesh):
+    """x + MLP(x, e^{tΔ}x)."""
+    lb, _ = mesh
+    block = DiffusionNetBlock(4, [6], dropout=False, with_gradient_features=False, k=30).double()
+    x = torch.randn(300, 4).double()
+    diffused = heat_flow(lb, x, block.diffusion.time, k=30)
+    torch.testing.assert_close(block(x, lb), x + block.mlp(torch.cat([x, diffused], dim=1)))
+
+
+def test_dropout_is_there_while_training_only(mesh):
+    lb, _ = mesh
+    net = DiffusionNet(3, 5, WIDTH, k=30).double()
+    assert not torch.equal(net(lb.points, lb), net(lb.points, lb))
+    net.eval()
+    assert torch.equal(net(lb.points, lb), net(lb.points, lb))
+
+
+def test_a_curve_has_gradient_features_without_rotations():
+    lb = LaplaceBeltrami.from_points(Circle().points(60))
+    net = DiffusionNet(2, 3, WIDTH, with_gradient_rotations=False, k=20).double()
+    assert net(lb.points, lb).shape == (60, 3)
+    with pytest.raises(ValueError, match="rotations need a surface, got dim=1"):
+        DiffusionNet(2, 3, WIDTH, k=20).double()(lb.points, lb)
+
+
+def test_arguments_that_are_none():
+    with pytest.raises(ValueError, match="outputs_at: expected one of"):
+        DiffusionNet(3, 5, outputs_at="volumes")
+    with pytest.raises(ValueError, match="method: expected one of"):
+        DiffusionNet(3, 5, diffusion_method="implicit_dense")
+    with pytest.raises(ValueError, match="expected C_in = 3"):
+        DiffusionNet(3, 5)(
+            torch.zeros(100, 2), LaplaceBeltrami.from_points(Sphere().points(100).float())
+        )
+
+
+def test_it_learns_where_the_poles_are():
+    """Sign of z on the sphere from xyz: every step lowers the loss to a tenth in the end."""
+    lb = LaplaceBeltrami.from_points(Sphere().points(200).float())
+    net = DiffusionNet(3, 2, WIDTH, 2, dropout=False, k=20)
+    labels = (lb.points[:, 2] > 0).long()
+    optimizer = torch.optim.Adam(net.parameters(), lr=5e-3)
+    losses = []
+    for _ in range(60):
+        optimizer.zero_grad()
+        loss = torch.nn.functional.cross_entropy(net(lb.points, lb), labels)
+        loss.backward()
+        optimizer.step()
+        losses.append(float(loss.detach()))
+    assert losses[-1] < 0.2 * losses[0]

@@ -1,0 +1,265 @@
+"""What every layer has to bear: batches of shapes, compilers, half precision, copies, workers, devices."""
+
+import copy
+import shutil
+import subprocess
+import sys
+
+import pytest
+import torch
+from torch.utils.data import DataLoader
+
+from torchlb import (
+    Diffusion,
+    DiffusionNet,
+    GradientFeatures,
+    LaplaceBeltrami,
+    SpectralConv,
+    diffusion_map,
+    heat_flow,
+    heat_kernel_signature,
+    spectral_wavelets,
+    wave_kernel_signature,
+)
+from torchlb.surfaces import Circle, Ellipsoid, Sphere, Torus
+
+needs_compiler = pytest.mark.skipif(
+    not any(map(shutil.which, ("c++", "g++", "clang++", "cl"))),
+    reason="torch.compile needs a C++ compiler",
+)
+needs_cuda = pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device")
+CHANNELS, K = 4, 24
+LAYERS = {
+    "full": lambda: Diffusion(CHANNELS, k=K),
+    "spectral": lambda: Diffusion(CHANNELS, "spectral", k=K),
+    "chebyshev": lambda: Diffusion(CHANNELS, "chebyshev"),
+    "rational": lambda: Diffusion(CHANNELS, "rational"),
+    "convolution": lambda: SpectralConv(CHANNELS, 3, k=K),
+    "gradients": lambda: GradientFeatures(CHANNELS),
+    "net": lambda: DiffusionNet(CHANNELS, 5, 8, 2, k=K),
+    "original net": lambda: DiffusionNet(CHANNELS, 5, 8, 2, diffusion_method="spectral", k=K),
+    "classifier": lambda: DiffusionNet(CHANNELS, 5, 8, 1, outputs_at="global_mean", k=K),
+}
+every_layer = pytest.mark.parametrize("name", LAYERS)
+
+
+def layer_of(name, dtype=torch.float32):
+    """A layer with times that differ, in evaluation."""
+    layer = LAYERS[name]().to(dtype).eval()
+    for part in layer.modules():
+        if isinstance(part, Diffusion):
+            torch.nn.init.uniform_(part.raw_time, -0.02, 0.3)
+    return layer
+
+
+def shapes(dtype=torch.float32):
+    """Eight operators of five kinds and sizes, one smaller than the basis, one of another unit of length."""
+    clouds = [Sphere().points(90), Torus().points(150), Torus().random_points(120)]
+    built = [LaplaceBeltrami.from_points(points.to(dtype)) for points in clouds]
+    for surface in (Sphere(), Ellipsoid(), Torus()):
+        vertices, faces = surface.mesh(100)
+        built.append(LaplaceBeltrami.from_mesh(vertices.to(dtype), faces))
+    vertices, faces = Sphere().mesh(110)
+    built.append(LaplaceBeltrami.from_cotangent(3 * vertices.to(dtype), faces))
+    vertices, faces = Sphere().mesh(20)
+    built.append(LaplaceBeltrami.from_cotangent(vertices.to(dtype), faces))
+    return built
+
+
+@pytest.fixture(scope="module")
+def eight():
+    return shapes()
+
+
+def features(lb, channels=CHANNELS):
+    generator = torch.Generator().manual_seed(lb.num_points)
+    return torch.randn(lb.num_points, channels, generator=generator).to(lb.values)
+
+
+@every_layer
+def test_a_batch_of_eight_shapes_gives_what_they_give_one_by_one(eight, name):
+    """To 1e-6 of the largest value, in float32; gradients of the parameters too."""
+    layer = layer_of(name)
+    x = [features(lb) for lb in eight]
+    alone = [layer(f, lb) for f, lb in zip(x, eight, strict=True)]
+    expected = torch.stack(alone) if name == "classifier" else torch.cat(alone)
+    batch = LaplaceBeltrami.batch(eight)
+    together = layer(torch.cat(x), batch)
+    assert (together - expected).abs().max() <= 1e-6 * expected.abs().max()
+    parameters = list(layer.parameters())
+    ours, theirs = (torch.autograd.grad(y.square().sum(), parameters) for y in (together, expected))
+    for a, b in zip(ours, theirs, strict=True):
+        torch.testing.assert_close(a, b, rtol=1e-3, atol=1e-4 * float(b.abs().max()))
+
+
+def test_a_batch_is_block_diagonal(eight):
+    """Δ, gradient, Δx, mass, certificate and report of the shapes below each other; offsets, signatures."""
+    batch = LaplaceBeltrami.batch(eight)
+    assert batch.offsets == tuple(sum(lb.num_points for lb in eight[:i]) for i in range(9))
+    x = [features(lb) for lb in eight]
+    for apply in (
+        lambda lb, f: lb(f),
+        lambda lb, f: lb.gradient(f),
+        lambda lb, _: lb.mean_curvature_normal(),
+        lambda lb, _: lb.mass,
+        lambda lb, _: lb.report.order,
+        lambda lb, _: heat_kernel_signature(lb, k=K),
+        lambda lb, _: wave_kernel_signature(lb, k=K),
+        lambda lb, f: spectral_wavelets(lb, f, torch.tensor([0.1, 1.0]), k=K),
+        lambda lb, _: diffusion_map(lb, 0.1, dim=3),
+    ):
+        expected = torch.cat([apply(lb, f) for lb, f in zip(eight, x, strict=True)])
+        torch.testing.assert_close(apply(batch, torch.cat(x)), expected, rtol=1e-5, atol=1e-5)
+    assert batch.certificate is None  # the cotangent has none
+    assert LaplaceBeltrami.batch(eight[:3]).certificate.holds
+    dense = batch.matrix.to_dense()
+    torch.testing.assert_close(dense[:90, :90], eight[0].matrix.to_dense())
+    assert (dense[:90, 90:] == 0).all()
+
+
+def test_a_batch_takes_bases_over_solves_what_is_missing_and_is_stored():
+    fresh = shapes(torch.float64)[:3]
+    for lb in fresh:
+        lb.eigenbasis(K)
+    ready, later = LaplaceBeltrami.batch(fresh), LaplaceBeltrami.batch(shapes(torch.float64)[:3])
+    assert ready.basis_left.shape[1] >= K
+    assert later.basis_left.numel() == 0
+    for field in ("eigenvalues", "eigenvectors", "left"):
+        a, b = (getattr(lb.eigenbasis(K), field) for lb in (ready, later))
+        torch.testing.assert_close(a, b, rtol=1e-6, atol=1e-6)
+    assert ready.eigenbasis(K).eigenvalues.shape == (3, K)
+    again = LaplaceBeltrami()
+    ready.eigenbasis(K, store=True)
+    again.load_state_dict(ready.state_dict())
+    assert again.offsets == ready.offsets
+    f = torch.cat([features(lb) for lb in fresh])
+    torch.testing.assert_close(heat_flow(again, f, 0.1, k=K), heat_flow(ready, f, 0.1, k=K))
+    nested = LaplaceBeltrami.batch([LaplaceBeltrami.batch(fresh[:2]), fresh[2]])
+    torch.testing.assert_close(heat_flow(nested, f, 0.1, k=K), heat_flow(ready, f, 0.1, k=K))
+
+
+def test_shapes_that_do_not_go_together_are_refused():
+    sphere = LaplaceBeltrami.from_points(Sphere().points(60))
+    with pytest.raises(ValueError, match="got no shapes"):
+        LaplaceBeltrami.batch([])
+    with pytest.raises(ValueError, match="shape 1 has frames"):
+        LaplaceBeltrami.batch([sphere, LaplaceBeltrami.from_points(Circle().points(60))])
+    with pytest.raises(ValueError, match="one dimension, floating type and device"):
+        LaplaceBeltrami.batch([sphere, LaplaceBeltrami.from_points(Sphere().points(60).float())])
+
+
+def compiled_and_not(name, batched):
+    """Outputs and gradients in x of the compiled layer and of the layer itself."""
+    torch._dynamo.reset()
+    layer, operators = layer_of(name), shapes()
+    lb = LaplaceBeltrami.batch(operators[:3]) if batched else operators[1]
+    x = features(lb).requires_grad_()
+    results = []
+    expected = layer(x, lb)  # solves what is solved once
+    for y in (torch.compile(layer, fullgraph=True)(x, lb), expected):
+        results.append((y, torch.autograd.grad(y.square().sum(), x)[0]))
+    return results
+
+
+@needs_compiler
+@pytest.mark.slow
+@pytest.mark.parametrize(("name", "batched"), [("classifier", True), ("convolution", False)])
+def test_compiled_without_graph_breaks_it_gives_the_same(name, batched):
+    # In a process of its own: Dynamo cannot trace the types that the test run checks at every call.
+    command = [sys.executable, __file__, name, *["batched"][: int(batched)]]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr[-3000:]
+
+
+@every_layer
+def test_autocast_to_bfloat16_stays_close(eight, name):
+    """Diffusion itself is computed in float32: exact. The pointwise networks around it are not."""
+    layer, lb = layer_of(name), eight[1]
+    x = features(lb)
+    expected = layer(x, lb)
+    with torch.autocast("cpu", dtype=torch.bfloat16):
+        y = layer(x, lb)
+        half = layer(x.bfloat16(), lb)
+    exact = name in ("full", "spectral", "chebyshev", "rational", "convolution")
+    scale = float(expected.detach().abs().max())
+    assert (y.float() - expected).abs().max() <= (1e-6 if exact else 0.2) * scale
+    assert (half.float() - expected).abs().max() <= 0.2 * scale
+    assert not exact or half.dtype == torch.bfloat16
+    half.float().sum().backward()
+    assert all(p.grad is not None and p.grad.isfinite().all() for p in layer.parameters())
+
+
+@every_layer
+def test_float32_is_close_to_float64(name):
+    double = LaplaceBeltrami.from_points(Torus().points(150))
+    layer = layer_of(name, torch.float64)
+    expected = layer(features(double), double)
+    single = LaplaceBeltrami.from_points(Torus().points(150).float())
+    y = copy.deepcopy(layer).float()(features(double).float(), single)
+    assert y.dtype == torch.float32
+    assert (y - expected).abs().max() <= 1e-3 * expected.abs().max()
+
+
+@every_layer
+def test_copies_averages_and_states(eight, name):
+    """deepcopy of layer and operator, an exponential moving average, a strict state_dict."""
+    layer, lb = layer_of(name), eight[1]
+    x = features(lb)
+    expected = layer(x, lb)
+    torch.testing.assert_close(copy.deepcopy(layer)(x, copy.deepcopy(lb)), expected)
+    average = torch.optim.swa_utils.AveragedModel(layer)
+    average.update_parameters(layer)
+    torch.testing.assert_close(average(x, lb), expected)
+    other = LAYERS[name]().eval()
+    other.load_state_dict(layer.state_dict())
+    torch.testing.assert_close(other(x, lb), expected)
+
+
+def collate(items):
+    operators, inputs = zip(*items, strict=True)
+    return LaplaceBeltrami.batch(operators), torch.cat(inputs)
+
+
+class Shapes(torch.utils.data.Dataset):
+    def __init__(self, operators):
+        self.operators = operators
+
+    def __len__(self):
+        return len(self.operators)
+
+    def __getitem__(self, index):
+        return self.operators[index], features(self.operators[index])
+
+
+@pytest.mark.parametrize("workers", [0, 2])
+def test_data_loader_with_workers(eight, workers):
+    """Operators with their bases travel to the main process, batched by the workers."""
+    for lb in eight[:6]:
+        lb.eigenbasis(K)
+    layer = layer_of("net")
+    loader = DataLoader(Shapes(eight[:6]), batch_size=3, num_workers=workers, collate_fn=collate)
+    sizes = []
+    for batch, x in loader:
+        assert batch.basis_left.shape[1] >= K
+        assert layer(x, batch).isfinite().all()
+        sizes += batch.sizes
+    assert sizes == [lb.num_points for lb in eight[:6]]
+
+
+@needs_cuda
+@every_layer
+def test_on_cuda_it_gives_the_same(eight, name):
+    layer = layer_of(name)
+    for lb in (eight[1], LaplaceBeltrami.batch(eight)):
+        x = features(lb)
+        expected = layer(x, lb)
+        there = copy.deepcopy(layer).cuda()
+        y = there(x.cuda().requires_grad_(), copy.deepcopy(lb).cuda())
+        y.sum().backward()
+        torch.testing.assert_close(y.cpu(), expected, rtol=1e-3, atol=1e-4)
+        assert all(p.grad.isfinite().all() for p in there.parameters())
+
+
+if __name__ == "__main__":
+    compiled, plain = compiled_and_not(sys.argv[1], "batched" in sys.argv)
+    torch.testing.assert_close(compiled, plain, rtol=1e-3, atol=1e-4)
