@@ -21,6 +21,7 @@ from torchlb.diffusion import Diffusion, heat_flow
 from torchlb.diffusion_net import DiffusionNet, DiffusionNetBlock, GradientFeatures
 from torchlb.eigenbasis import Eigenbasis
 from torchlb.laplace_beltrami import LaplaceBeltrami
+from torchlb.precompute import PrecomputeReport, ShapeResult, precompute_operators
 from torchlb.report import StencilReport
 from torchlb.spectral import (
     SpectralConv,
@@ -43,6 +44,8 @@ __all__ = [
     "GradientFeatures",
     "LaplaceBeltrami",
     "OperatorFileError",
+    "PrecomputeReport",
+    "ShapeResult",
     "SpectralConv",
     "StabilityWarning",
     "StencilError",
@@ -56,6 +59,7 @@ __all__ = [
     "load_operator",
     "load_or_build",
     "operator_key",
+    "precompute_operators",
     "save_operator",
     "spectral_wavelets",
     "surfaces",
