@@ -36,6 +36,7 @@ ORDER = [
     "spectral",
     "diffusion",
     "diffusion_net",
+    "operators",
     "cache",
     "interop",
     "precompute",

@@ -9,12 +9,10 @@ all, whoever else writes the same.
 from __future__ import annotations
 
 import hashlib
-import inspect
 import json
 import os
 import uuid
 import warnings
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -22,12 +20,11 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchlb.checks import check_faces, check_points
 from torchlb.laplace_beltrami import LaplaceBeltrami
+from torchlb.operators import build_operator, builder_of, complete_options
 from torchlb.version import __version__
 
 __all__ = [
-    "OPERATORS",
     "CacheWarning",
     "OperatorFileError",
     "describe_file",
@@ -39,7 +36,6 @@ __all__ = [
 
 FORMAT = 1
 """Of the file. It changes when an older torchlb could not read it."""
-OPERATORS = ("stencil", "cotangent")
 Options = dict[str, Any]
 
 
@@ -93,16 +89,14 @@ def load_or_build(
     >>> torch.equal(first.values, again.values)
     True
     """
-    builder, points, corners = _builder(vertices, faces, operator)
-    options = _complete(builder, options)
+    builder, points, corners = builder_of(vertices, faces, operator)
+    options = complete_options(builder, options)
     key = _key(operator, points, corners, options)
     path = Path(cache) / f"{key}.npz"
     lb = None if overwrite else _cached(path, key)
     if lb is None or _num_eigenpairs(lb) < min(k, lb.num_points):
         if lb is None:
-            if "progress" in inspect.signature(builder).parameters:
-                options["progress"] = progress
-            lb = builder(points, **({} if corners is None else {"faces": corners}), **options)
+            lb = build_operator(points, corners, operator=operator, progress=progress, **options)
         if k > 0:
             lb.eigenbasis(k, store=True)
         save_operator(lb, path, key=key)
@@ -121,39 +115,8 @@ def operator_key(
     >>> operator_key(torch.eye(3), order=3) == operator_key(np.eye(3), weights="least_squares")
     True
     """
-    builder, points, corners = _builder(vertices, faces, operator)
-    return _key(operator, points, corners, _complete(builder, options))
-
-
-def _builder(
-    vertices: Any, faces: Any, operator: str
-) -> tuple[Callable[..., LaplaceBeltrami], Tensor, Tensor | None]:
-    """The classmethod that builds the operator, and its input checked: float64 positions, int64 faces."""
-    if operator not in OPERATORS:
-        raise ValueError(f"operator: expected one of {list(OPERATORS)}, got {operator!r}")
-    if faces is None or np.prod(np.shape(faces)) == 0:
-        if operator == "cotangent":
-            raise ValueError("the cotangent operator needs faces; operator='stencil' does not")
-        return LaplaceBeltrami.from_points, check_points(vertices), None
-    points = check_points(vertices, "vertices")
-    corners = check_faces(faces, len(points))
-    if operator == "cotangent":
-        return LaplaceBeltrami.from_cotangent, points, corners
-    return LaplaceBeltrami.from_mesh, points, corners
-
-
-def _complete(builder: Callable[..., LaplaceBeltrami], options: Options) -> Options:
-    """All options with their defaults, but `progress`, which changes nothing; TypeError for one that is none."""
-    parameters = inspect.signature(builder).parameters.values()
-    known = {p.name: p.default for p in parameters if p.kind is p.KEYWORD_ONLY}
-    known.pop("progress", None)
-    unknown = options.keys() - known.keys()
-    if unknown:
-        raise TypeError(
-            f"{builder.__name__} has no option {', '.join(sorted(unknown))}; its options are "
-            f"{', '.join(known) or 'none'}"
-        )
-    return known | options
+    builder, points, corners = builder_of(vertices, faces, operator)
+    return _key(operator, points, corners, complete_options(builder, options))
 
 
 def _key(operator: str, points: Tensor, faces: Tensor | None, options: Options) -> str:

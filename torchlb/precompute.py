@@ -8,7 +8,6 @@ machines of a Dask or Ray cluster (`docs/precompute.md`).
 from __future__ import annotations
 
 import csv
-import inspect
 import io
 import os
 import time
@@ -23,10 +22,10 @@ import joblib
 import torch
 from tqdm import tqdm
 
-from torchlb.cache import OPERATORS, load_or_build, operator_key
+from torchlb.cache import load_or_build, operator_key
 from torchlb.checks import clean_mesh
 from torchlb.interop.trimesh import SUFFIXES, read_shape
-from torchlb.laplace_beltrami import LaplaceBeltrami
+from torchlb.operators import check_options_of
 
 __all__ = ["PrecomputeReport", "ShapeResult", "precompute_operators"]
 
@@ -138,7 +137,7 @@ def precompute_operators(
     ------
     ValueError, TypeError : for options that are none, a folder that is missing or has no shapes, before any work.
     """
-    _check(operator, options)
+    check_options_of(operator, options)
     cache = Path(out)
     tasks = [
         _Task(name, source, str(cache.resolve()), operator, k, clean, options)
@@ -157,18 +156,6 @@ def precompute_operators(
         report = PrecomputeReport(tuple(results[i] for i in sorted(results)))
         _write_table(report, cache / TABLE)
     return report
-
-
-def _check(operator: str, options: dict[str, Any]) -> None:
-    """Refuse at once what would fail for every shape."""
-    if operator not in OPERATORS:
-        raise ValueError(f"operator: expected one of {list(OPERATORS)}, got {operator!r}")
-    builders = [LaplaceBeltrami.from_mesh, LaplaceBeltrami.from_points]
-    builders = [LaplaceBeltrami.from_cotangent] if operator == "cotangent" else builders
-    known = {name for builder in builders for name in inspect.signature(builder).parameters}
-    unknown = options.keys() - (known - {"vertices", "points", "faces", "progress"})
-    if unknown:
-        raise TypeError(f"operator {operator!r} has no option {', '.join(sorted(unknown))}")
 
 
 def _sources(shapes: str | Path | Iterable[Any], cache: Path) -> list[tuple[str, Any]]:

@@ -12,6 +12,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from torchlb.laplace_beltrami import LaplaceBeltrami
+from torchlb.operators import build_operator
 
 __all__ = ["SUFFIXES", "from_trimesh", "read_shape", "to_trimesh"]
 
@@ -38,16 +39,8 @@ def from_trimesh(shape: Any, *, operator: str = "stencil", **options: Any) -> La
     >>> from_trimesh(trimesh.creation.icosphere(subdivisions=2), order=3).num_points
     162
     """
-    if operator not in ("stencil", "cotangent"):
-        raise ValueError(f"operator: expected 'stencil' or 'cotangent', got {operator!r}")
     vertices, faces = _arrays(shape)
-    if operator == "cotangent":
-        if faces is None:
-            raise ValueError("the cotangent operator needs faces; operator='stencil' does not")
-        return LaplaceBeltrami.from_cotangent(vertices, faces, **options)
-    if faces is None:
-        return LaplaceBeltrami.from_points(vertices, **options)
-    return LaplaceBeltrami.from_mesh(vertices, faces, **options)
+    return build_operator(vertices, faces, operator=operator, **options)
 
 
 def to_trimesh(lb: LaplaceBeltrami, faces: Any = None, **attributes: Any) -> Any:
