@@ -10,7 +10,7 @@ from torch import Tensor
 
 from torchlb.certificate import Certificate
 
-__all__ = ["join_buffers", "join_certificates"]
+__all__ = ["join_buffers", "join_certificates", "join_extents"]
 
 Buffers = dict[str, Tensor]
 BY_POINT = ("mass", "points", "frames")
@@ -70,3 +70,15 @@ def join_certificates(certificates: Sequence[Certificate | None]) -> Certificate
         stepped_down=sum(c.stepped_down for c in known),
         components=sum(c.components for c in known),
     )
+
+
+def join_extents(extents: Sequence[tuple[float, float]]) -> tuple[float, float]:
+    """Length R and half height b of an ellipse around −R/2 that holds those of the shapes; all touch 0.
+
+    Near 0 an ellipse is a parabola of curvature R/2b², so that a longer one has to be higher too.
+
+    >>> join_extents([(1.0, 0.1), (4.0, 0.0)])
+    (4.0, 0.2)
+    """
+    radius = max(r for r, _ in extents)
+    return radius, max(b * (radius / r) ** 0.5 for r, b in extents)

@@ -10,7 +10,7 @@ from jaxtyping import Float
 from scipy import sparse
 from torch import Tensor
 
-from torchlb.batching import join_buffers, join_certificates
+from torchlb.batching import join_buffers, join_certificates, join_extents
 from torchlb.build import Built, Options, build_cloud, build_cotangent, build_mesh
 from torchlb.certificate import Certificate
 from torchlb.eigenbasis import Eigenbasis, stack_eigenbases
@@ -156,10 +156,8 @@ class LaplaceBeltrami(OperatorStorage):
         lb.kind, lb.options = "batch", dict(shapes[0].options)
         lb.certificate = join_certificates([shape.certificate for shape in shapes])
         lb.sizes = tuple(n for shape in shapes for n in shape.sizes or (shape.num_points,))
-        extents = [shape.spectral_extent for shape in shapes]
-        if None not in extents:
-            known = [extent for extent in extents if extent is not None]
-            lb.spectral_extent = max(e[0] for e in known), max(e[1] for e in known)
+        extents = [e for e in (shape.spectral_extent for shape in shapes) if e is not None]
+        lb.spectral_extent = join_extents(extents) if len(extents) == len(shapes) else None
         bases = [shape.eigenbasis(1, closed=True) for shape in shapes if len(shape.basis_left)]
         if len(bases) == len(shapes) and not any(shape.sizes for shape in shapes):
             lb._keep(stack_eigenbases(bases))
