@@ -43,6 +43,7 @@ ORDER = [
     "manifold",
     "surfaces",
     "plot",
+    "comparison",
     "__init__",
     "__main__",
 ]
