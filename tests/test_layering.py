@@ -8,6 +8,7 @@ import pytest
 PACKAGE = Path(__file__).parents[1] / "torchlb"
 # Lowest first. `import torchlb` counts as an import of __init__, which stands on all the rest.
 ORDER = [
+    "version",
     "voronoi",
     "neighbors",
     "polynomials",
@@ -36,11 +37,14 @@ ORDER = [
     "spectral",
     "diffusion",
     "diffusion_net",
+    "operators",
+    "cache",
     "interop",
     "precompute",
     "manifold",
     "surfaces",
     "plot",
+    "comparison",
     "__init__",
     "__main__",
 ]

@@ -7,6 +7,7 @@ from typing import Any
 
 import torch
 from jaxtyping import Float
+from scipy import sparse
 from torch import Tensor
 
 from torchlb.batching import join_buffers, join_certificates, join_extents
@@ -201,6 +202,13 @@ class LaplaceBeltrami(OperatorStorage):
         return torch.sparse_csr_tensor(
             self.crow, self.col, self.values, shape, check_invariants=False
         )
+
+    def to_scipy(self) -> sparse.csr_array:
+        """Δ as a scipy CSR matrix (N, N), 1/ℓ², negative semidefinite like `igl.cotmatrix`, but strong: no mass in it.
+
+        Weak matrices with the signs and masses of other libraries: `torchlb.interop.conventions`.
+        """
+        return to_scipy(self.crow, self.col, self.values, (self.num_points, self.num_points))
 
     @property
     def report(self) -> StencilReport:

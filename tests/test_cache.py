@@ -1,0 +1,367 @@
+"""One entry for one operator, whatever types it came in; and a file that is there whole or not at all."""
+
+import inspect
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+import warnings
+from pathlib import Path
+from unittest.mock import Mock
+
+import numpy as np
+import pytest
+import torch
+
+import torchlb.cache
+from torchlb import (
+    CacheWarning,
+    LaplaceBeltrami,
+    OperatorFileError,
+    load_operator,
+    load_or_build,
+    operator_key,
+    save_operator,
+)
+from torchlb.surfaces import Sphere
+
+ROOT = Path(__file__).parents[1]
+VERTICES, FACES = Sphere().mesh(100)
+VERTICES = VERTICES * (1 + 1 / 3)  # not representable in float32
+
+
+@pytest.fixture
+def no_building(monkeypatch):
+    """Fail on every attempt to build an operator."""
+
+    def install():
+        for name in ("from_mesh", "from_points", "from_cotangent"):
+            refuse = Mock(side_effect=AssertionError("built, though it was in the cache"))
+            refuse.__signature__ = inspect.signature(getattr(LaplaceBeltrami, name))
+            refuse.__name__ = name
+            monkeypatch.setattr(LaplaceBeltrami, name, refuse)
+
+    return install
+
+
+def files_of(folder):
+    return sorted(path.name for path in Path(folder).iterdir())
+
+
+def assert_same(a, b):
+    """Bit for bit, with everything that is plain beside the tensors."""
+    ours, theirs = a.state_dict(), b.state_dict()
+    assert ours.keys() == theirs.keys()
+    for name, value in ours.items():
+        if isinstance(value, torch.Tensor):
+            assert value.dtype == theirs[name].dtype, name
+            assert torch.equal(value.nan_to_num(-1), theirs[name].nan_to_num(-1)), name
+    assert repr(a) == repr(b)
+    assert a.certificate == b.certificate
+    assert str(a.report) == str(b.report)
+
+
+@pytest.mark.parametrize(
+    "make",
+    [
+        lambda: LaplaceBeltrami.from_mesh(VERTICES, FACES, order=2),
+        lambda: LaplaceBeltrami.from_points(VERTICES.float()),
+        lambda: LaplaceBeltrami.from_cotangent(VERTICES, FACES),
+        lambda: LaplaceBeltrami.from_mesh(VERTICES, FACES, certify=False).bfloat16(),
+        lambda: LaplaceBeltrami.batch([LaplaceBeltrami.from_cotangent(VERTICES, FACES)] * 2),
+        LaplaceBeltrami,
+    ],
+    ids=["mesh", "cloud float32", "cotangent", "bfloat16", "batch", "empty"],
+)
+def test_read_back_bit_for_bit(make, tmp_path):
+    lb = make()
+    if lb.num_points and not lb.sizes and lb.certificate:
+        lb.eigenbasis(5, store=True)
+    save_operator(lb, tmp_path / "new" / "lb.npz")
+    back = load_operator(tmp_path / "new" / "lb.npz")
+    assert_same(back, lb)
+    assert files_of(tmp_path / "new") == ["lb.npz"]
+    if len(lb.basis_left):
+        assert torch.equal(back.eigenbasis(5).eigenvectors, lb.eigenbasis(5).eigenvectors)
+
+
+def test_first_call_builds_and_later_ones_read(tmp_path, no_building):
+    first = load_or_build(VERTICES, FACES, cache=tmp_path, order=2)
+    assert_same(first, LaplaceBeltrami.from_mesh(VERTICES, FACES, order=2))
+    assert files_of(tmp_path) == [operator_key(VERTICES, FACES, order=2) + ".npz"]
+    no_building()
+    assert_same(load_or_build(VERTICES, FACES, cache=tmp_path, order=2), first)
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_the_type_is_that_of_the_input_and_the_numbers_those_without_a_cache(dtype, tmp_path):
+    vertices = VERTICES.to(dtype)
+    for _ in range(2):
+        lb = load_or_build(vertices, FACES, cache=tmp_path, order=2)
+        assert_same(lb, LaplaceBeltrami.from_mesh(vertices, FACES, order=2))
+
+
+def test_same_values_share_an_entry():
+    """float32 and its float64 copy, int32 and int64, arrays and tensors, defaults and defaults spelt out, ±0."""
+    vertices = VERTICES.float()
+    vertices[0, 0] = 0.0
+    signed = vertices.clone()
+    signed[0, 0] = -0.0
+    key = operator_key(vertices, FACES)
+    for other in (
+        operator_key(vertices.double(), FACES.int()),
+        operator_key(vertices.numpy(), FACES.numpy().astype(np.int32)),
+        operator_key(vertices.numpy().astype(np.float64, order="F"), FACES.tolist()),
+        operator_key(vertices, FACES, order=np.int64(3), boundary="neumann", certify=True),
+        operator_key(signed, FACES),
+        operator_key(vertices.clone().requires_grad_(), FACES),
+    ):
+        assert other == key
+    normals = vertices / vertices.norm(dim=1, keepdim=True)
+    assert operator_key(vertices, normals=normals) == operator_key(
+        vertices, normals=normals.double().numpy()
+    )
+
+
+def test_anything_that_changes_the_operator_changes_the_key(monkeypatch):
+    moved = VERTICES.clone()
+    moved[7, 1] += 1e-15
+    mask = torch.zeros(len(VERTICES), dtype=torch.bool)
+    keys = [
+        operator_key(VERTICES, FACES),
+        operator_key(moved, FACES),
+        operator_key(VERTICES, FACES.flip(1)),
+        operator_key(VERTICES, FACES[torch.arange(len(FACES)).flip(0)]),
+        operator_key(VERTICES, FACES, operator="cotangent"),
+        operator_key(VERTICES, FACES, order=4),
+        operator_key(VERTICES, FACES, normal_order=2),
+        operator_key(VERTICES, FACES, projection="normal"),
+        operator_key(VERTICES, FACES, weights="polyharmonic"),
+        operator_key(VERTICES, FACES, num_neighbors=40),
+        operator_key(VERTICES, FACES, boundary=None),
+        operator_key(VERTICES, FACES, certify=False),
+        operator_key(VERTICES),
+        operator_key(VERTICES, normals=VERTICES),
+        operator_key(VERTICES, normals=-VERTICES),
+        operator_key(VERTICES, boundary=mask),
+        operator_key(VERTICES, boundary="detect"),
+    ]
+    monkeypatch.setattr(torchlb.cache, "__version__", "0.0.1")
+    keys.append(operator_key(VERTICES, FACES))
+    assert len(set(keys)) == len(keys)
+
+
+def test_progress_is_no_part_of_the_key(tmp_path):
+    load_or_build(VERTICES, FACES, cache=tmp_path, order=1, progress=False)
+    load_or_build(VERTICES, FACES, cache=tmp_path, order=1, progress=True)
+    assert len(files_of(tmp_path)) == 1
+
+
+def test_a_file_is_completed_by_eigenpairs_and_serves_fewer(tmp_path, no_building):
+    cache = {"cache": tmp_path, "operator": "cotangent"}
+    load_or_build(VERTICES, FACES, **cache)
+    no_building()
+    more = load_or_build(VERTICES, FACES, k=8, **cache)
+    stored = load_operator(tmp_path / files_of(tmp_path)[0])
+    assert stored.basis_eigenvectors.shape[1] >= 8
+    fewer = load_or_build(VERTICES, FACES, k=5, **cache).eigenbasis(5)
+    assert torch.equal(fewer.eigenvectors, more.eigenbasis(8).eigenvectors[:, :5])
+    before = (tmp_path / files_of(tmp_path)[0]).stat().st_mtime_ns
+    load_or_build(VERTICES, FACES, k=8, **cache)
+    assert (tmp_path / files_of(tmp_path)[0]).stat().st_mtime_ns == before
+    assert len(load_or_build(VERTICES, FACES, k=1000, **cache).eigenbasis(1000).eigenvalues) == 100
+    assert len(files_of(tmp_path)) == 1
+
+
+def test_overwrite_builds_again(tmp_path):
+    arguments = {"cache": tmp_path, "operator": "cotangent"}
+    load_or_build(VERTICES, FACES, **arguments)
+    path = tmp_path / files_of(tmp_path)[0]
+    before = path.stat().st_mtime_ns
+    load_or_build(VERTICES, FACES, overwrite=True, **arguments)
+    assert path.stat().st_mtime_ns > before
+
+
+def damage(content, kind):
+    if kind == "empty":
+        return b""
+    if kind == "half":
+        return content[: len(content) // 2]
+    if kind == "without its end":
+        return content[:-1]
+    if kind == "text":
+        return b"no operator"
+    flipped = bytearray(content)
+    flipped[len(content) // 2] ^= 1
+    return bytes(flipped)
+
+
+@pytest.mark.parametrize("kind", ["empty", "half", "without its end", "text", "one bit"])
+def test_a_damaged_file_is_named_computed_again_and_replaced(kind, tmp_path):
+    arguments = {"cache": tmp_path, "operator": "cotangent"}
+    lb = load_or_build(VERTICES, FACES, **arguments)
+    path = tmp_path / files_of(tmp_path)[0]
+    path.write_bytes(damage(path.read_bytes(), kind))
+    with pytest.raises(OperatorFileError, match=path.name):
+        load_operator(path)
+    with pytest.warns(CacheWarning, match=f"{path.name}.*computed again and replaced"):
+        assert_same(load_or_build(VERTICES, FACES, **arguments), lb)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert_same(load_or_build(VERTICES, FACES, **arguments), lb)
+    assert len(files_of(tmp_path)) == 1
+
+
+def test_no_flipped_bit_gives_other_numbers(tmp_path):
+    """At 300 places of a file: it reads as before, or is refused."""
+    lb = LaplaceBeltrami.from_cotangent(VERTICES, FACES)
+    path = tmp_path / "lb.npz"
+    save_operator(lb, path)
+    content = path.read_bytes()
+    refused = 0
+    for place in torch.randint(len(content), (300,)).tolist():
+        changed = bytearray(content)
+        changed[place] ^= 1 << (place % 8)
+        path.write_bytes(bytes(changed))
+        try:
+            assert_same(load_operator(path), lb)
+        except OperatorFileError:
+            refused += 1
+    assert refused > 200
+
+
+def test_a_file_under_a_wrong_name_is_not_taken(tmp_path):
+    arguments = {"cache": tmp_path, "operator": "cotangent"}
+    load_or_build(VERTICES, FACES, **arguments)
+    path = tmp_path / files_of(tmp_path)[0]
+    other = operator_key(2 * VERTICES, FACES, operator="cotangent")
+    path.rename(tmp_path / f"{other}.npz")
+    with pytest.warns(CacheWarning, match="another operator"):
+        lb = load_or_build(2 * VERTICES, FACES, **arguments)
+    assert_same(lb, LaplaceBeltrami.from_cotangent(2 * VERTICES, FACES))
+
+
+def test_the_file_holds_no_pickle(tmp_path):
+    save_operator(LaplaceBeltrami.from_cotangent(VERTICES, FACES), tmp_path / "lb.npz")
+    with np.load(tmp_path / "lb.npz", allow_pickle=False) as archive:
+        assert all(archive[name].dtype != object for name in archive.files)
+        assert json.loads(str(archive["header"]))["state"]["kind"] == "cotangent"
+
+
+def test_a_pickle_is_refused_unopened(tmp_path):
+    trap = tmp_path / "opened"
+
+    class Trap:
+        def __reduce__(self):
+            return (Path.touch, (trap,))
+
+    np.save(tmp_path / "trap.npz", np.array([Trap()], dtype=object), allow_pickle=True)
+    (tmp_path / "trap.npz.npy").rename(tmp_path / "trap.npz")
+    with pytest.raises(OperatorFileError):
+        load_operator(tmp_path / "trap.npz")
+    assert not trap.exists()
+
+
+def test_a_failed_write_leaves_nothing(tmp_path, monkeypatch):
+    def full(*_, **__):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(torchlb.cache.np, "savez", full)
+    with pytest.raises(OSError, match="No space left"):
+        save_operator(LaplaceBeltrami(), tmp_path / "lb.npz")
+    assert files_of(tmp_path) == []
+
+
+def test_the_file_is_readable_by_whom_the_umask_allows(tmp_path):
+    old = os.umask(0o022)
+    try:
+        save_operator(LaplaceBeltrami(), tmp_path / "lb.npz")
+    finally:
+        os.umask(old)
+    assert (tmp_path / "lb.npz").stat().st_mode & 0o777 == 0o644
+
+
+WRITER = """
+import sys, torch
+from torchlb import LaplaceBeltrami, save_operator
+torch.set_num_threads(1)
+lb = LaplaceBeltrami()
+lb.crow = torch.tensor([0, 200_000])
+lb.values = torch.full((200_000,), float(sys.argv[2]))
+lb.col = torch.zeros(200_000, dtype=torch.int64)
+print("ready", flush=True)
+sys.stdin.readline()
+for _ in range(int(sys.argv[3])):
+    save_operator(lb, sys.argv[1])
+"""
+
+
+def start_writer(path, value, times):
+    process = subprocess.Popen(
+        [sys.executable, "-c", WRITER, str(path), str(value), str(times)],
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        text=True,
+        env={**os.environ, "PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1"},
+    )
+    assert process.stdout.readline() == "ready\n"
+    return process
+
+
+def test_two_processes_writing_one_file_leave_one_good_file(tmp_path):
+    path = tmp_path / "lb.npz"
+    writers = [start_writer(path, value, 30) for value in (1, 2)]
+    for writer in writers:
+        writer.stdin.write("go\n")
+        writer.stdin.flush()
+    seen = set()
+    while any(writer.poll() is None for writer in writers):
+        if path.exists():
+            values = load_operator(path).values  # whole at every moment
+            assert len(values.unique()) == 1
+            seen.add(float(values[0]))
+    assert [writer.wait() for writer in writers] == [0, 0]
+    assert seen <= {1.0, 2.0}
+    assert len(load_operator(path).values.unique()) == 1
+    assert files_of(tmp_path) == ["lb.npz"]
+
+
+def test_a_writer_killed_in_the_middle_leaves_the_file_as_it_was(tmp_path):
+    path = tmp_path / "lb.npz"
+    for _ in range(3):
+        writer = start_writer(path, 1, 10_000)
+        writer.stdin.write("go\n")
+        writer.stdin.flush()
+        while not path.exists():
+            time.sleep(0.001)
+        time.sleep(0.05 * torch.rand(()).item())
+        writer.send_signal(signal.SIGKILL)
+        writer.wait()
+        assert len(load_operator(path).values.unique()) == 1
+        assert all(name == "lb.npz" or name.endswith(".tmp") for name in files_of(tmp_path))
+
+
+def test_errors(tmp_path):
+    with pytest.raises(FileNotFoundError):
+        load_operator(tmp_path / "missing.npz")
+    with pytest.raises(ValueError, match=r"expected one of .*stencil.*got 'graph'"):
+        load_or_build(VERTICES, FACES, cache=tmp_path, operator="graph")
+    with pytest.raises(ValueError, match="needs faces"):
+        load_or_build(VERTICES, cache=tmp_path, operator="cotangent")
+    with pytest.raises(TypeError, match=r"from_mesh has no option dim.*projection"):
+        load_or_build(VERTICES, FACES, cache=tmp_path, dim=2)
+    with pytest.raises(TypeError, match="from_cotangent has no option order; its options are none"):
+        load_or_build(VERTICES, FACES, cache=tmp_path, operator="cotangent", order=3)
+    with pytest.raises(ValueError, match="NaN"):
+        load_or_build(VERTICES * float("nan"), FACES, cache=tmp_path)
+    assert files_of(tmp_path) == []
+
+
+def test_a_newer_format_is_refused_by_name(tmp_path, monkeypatch):
+    monkeypatch.setattr(torchlb.cache, "FORMAT", 2)
+    save_operator(LaplaceBeltrami(), tmp_path / "lb.npz")
+    monkeypatch.undo()
+    with pytest.raises(OperatorFileError, match="format 2, this torchlb reads 1"):
+        load_operator(tmp_path / "lb.npz")

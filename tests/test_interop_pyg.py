@@ -1,0 +1,189 @@
+"""PyG's own Batch and DataLoader keep the operator right: a batch is the shapes one by one."""
+
+import copy
+import functools
+
+import pytest
+import torch
+import torch_geometric.transforms as T
+from torch_geometric.data import Batch, Data
+from torch_geometric.loader import DataLoader
+from torch_geometric.nn import MessagePassing
+
+from torchlb import Diffusion, DiffusionNet, LaplaceBeltrami
+from torchlb.interop.pyg import LaplaceBeltramiTransform, to_operator
+from torchlb.surfaces import Circle, Ellipsoid, Sphere, Torus
+
+MESHES = [Sphere().mesh(120), Ellipsoid().mesh(90), Torus().mesh(150)]
+SIZES = [120, 90, 150]
+
+
+def data_of(vertices, faces=None, **more):
+    return Data(pos=vertices, face=None if faces is None else faces.T.contiguous(), **more)
+
+
+@functools.cache
+def direct(i, dtype=torch.float64):
+    """Operator of mesh i, without PyG."""
+    vertices, faces = MESHES[i]
+    return LaplaceBeltrami.from_mesh(vertices.to(dtype), faces, order=1)
+
+
+DATA = [data_of(*mesh) for mesh in MESHES]
+
+
+def assert_same(ours, theirs, channels=3):
+    """The products with everything that is stored, forward and backward."""
+    f = torch.randn(theirs.num_points, channels, dtype=theirs.values.dtype)
+    results = []
+    for lb in (ours, theirs):
+        g = f.clone().requires_grad_()
+        (lb(g) ** 2 + lb.divergence(lb.gradient(g))).sum().backward()
+        results.append([lb(f), lb.gradient(f), lb.mass, lb.frames, lb.normals, lb.points, g.grad])
+    for a, b in zip(*results, strict=True):
+        torch.testing.assert_close(a, b)
+    assert (ours.sizes, ours.offsets, ours.dim) == (theirs.sizes, theirs.offsets, theirs.dim)
+    assert ours.certificate == theirs.certificate
+    for name in ("crow", "col", "crow_t", "col_t", "order_t"):
+        assert torch.equal(getattr(ours, name), getattr(theirs, name)), name
+
+
+@pytest.mark.parametrize("operator", ["stencil", "cotangent"])
+def test_one_shape(operator):
+    data = LaplaceBeltramiTransform(operator=operator)(DATA[0])
+    build = getattr(LaplaceBeltrami, "from_mesh" if operator == "stencil" else "from_cotangent")
+    theirs = build(*MESHES[0])
+    assert_same(to_operator(data), theirs)
+    assert repr(to_operator(data)) == repr(theirs)
+    assert "lb_values" not in DATA[0]  # the given data is left alone
+
+
+@pytest.mark.parametrize("float_type", [torch.float32, torch.float64])
+def test_a_batch_is_the_shapes_one_by_one(float_type):
+    transform = LaplaceBeltramiTransform(order=1)
+    meshes = [(vertices.to(float_type), faces) for vertices, faces in MESHES]
+    batch = Batch.from_data_list([transform(data_of(*mesh)) for mesh in meshes])
+    single = [direct(i, float_type) for i in range(3)]
+    lb = to_operator(batch)
+    assert_same(lb, LaplaceBeltrami.batch(single))
+    f = torch.randn(sum(SIZES), 2, dtype=float_type)
+    torch.testing.assert_close(
+        lb(f), torch.cat([one(g) for one, g in zip(single, f.split(SIZES), strict=True)])
+    )
+    for back, one in zip(batch.to_data_list(), single, strict=True):  # and apart again
+        assert_same(to_operator(back), one)
+
+
+@pytest.mark.parametrize("num_workers", [0, 1])
+def test_pygs_loader(num_workers):
+    """Shuffled batches, in this process and in a worker of the loader, with faces and labels beside the operator."""
+    transform = LaplaceBeltramiTransform(order=1)
+    shapes = []
+    for i, data in enumerate(DATA):
+        data.y = torch.tensor([i])
+        shapes.append(transform(data))
+    loader = DataLoader(shapes, batch_size=2, shuffle=True, num_workers=num_workers)
+    seen = []
+    for batch in loader:
+        chosen = batch.y.tolist()
+        single = [direct(i) for i in chosen]
+        assert_same(to_operator(batch), LaplaceBeltrami.batch(single))
+        assert int(batch.face.max()) == batch.num_nodes - 1
+        seen += chosen
+    assert sorted(seen) == [0, 1, 2]
+
+
+@pytest.mark.parametrize("k", [6, 100])  # more than the smallest shape has points, too
+def test_eigenbases_come_along(k, monkeypatch):
+    transform = LaplaceBeltramiTransform(order=1, k=k)
+    shapes = [transform(data) for data in DATA]
+    single = [copy.deepcopy(direct(i)) for i in range(3)]
+    for one in single:
+        one.eigenbasis(k)
+    batch, theirs = Batch.from_data_list(shapes), LaplaceBeltrami.batch(single)
+    monkeypatch.setattr("torchlb.laplace_beltrami.blockwise_eigenbasis", None)  # nothing is solved
+    lb = to_operator(batch)
+    ours, expected = lb.eigenbasis(k), theirs.eigenbasis(k)
+    torch.testing.assert_close(ours.eigenvalues, expected.eigenvalues)
+    torch.testing.assert_close(ours.eigenvectors, expected.eigenvectors)
+    one = to_operator(shapes[1]).eigenbasis(k)
+    torch.testing.assert_close(one.eigenvectors, single[1].eigenbasis(k).eigenvectors)
+    closed, expected = lb.eigenbasis(k, closed=True), theirs.eigenbasis(k, closed=True)
+    assert closed.is_closed == expected.is_closed
+    torch.testing.assert_close(closed.left, expected.left)
+
+
+@pytest.mark.parametrize("method", ["full", "spectral"])
+def test_layers_train_on_a_batch(method):
+    batch = Batch.from_data_list([LaplaceBeltramiTransform(order=1, k=8)(d) for d in DATA])
+    lb = to_operator(batch).float()
+    net = DiffusionNet(3, 4, C_width=8, N_block=1, diffusion_method=method, k=8)
+    net(batch.pos.float(), lb).square().mean().backward()
+    assert all(p.grad is not None and p.grad.isfinite().all() for p in net.parameters())
+    f = torch.randn(batch.num_nodes, 2)
+    layer = Diffusion(2, method, k=8)
+    apart = [layer(g, copy.deepcopy(direct(i)).float()) for i, g in enumerate(f.split(SIZES))]
+    torch.testing.assert_close(layer(f, lb), torch.cat(apart), rtol=1e-3, atol=1e-4)
+
+
+def test_messages_along_the_keys_are_the_laplacian():
+    """Σ_j Δ_ij f_j by PyG's own message passing."""
+
+    class Weighted(MessagePassing):
+        def forward(self, x, edge_index, weight):
+            return self.propagate(edge_index, x=x, weight=weight)
+
+        def message(self, x_j, weight):
+            return weight[:, None] * x_j
+
+    batch = Batch.from_data_list([LaplaceBeltramiTransform(order=1)(d) for d in DATA])
+    f = torch.randn(batch.num_nodes, 2).double()
+    messages = Weighted(aggr="sum")(f, batch.lb_edge_index, batch.lb_values)
+    torch.testing.assert_close(messages, to_operator(batch)(f), rtol=1e-9, atol=1e-7)
+
+
+def test_clouds_their_normals_and_curves():
+    points = Sphere().points(100)
+    plain = LaplaceBeltramiTransform(order=1)
+    assert_same(to_operator(plain(data_of(points))), LaplaceBeltrami.from_points(points, order=1))
+    data = data_of(points, norm=-points)
+    assert (to_operator(plain(data)).normals * points).sum(1).max() < 0
+    other = data_of(points, normal=points)
+    assert (to_operator(LaplaceBeltramiTransform(normals="normal")(other)).normals * points).sum(
+        1
+    ).min() > 0
+    ignored = LaplaceBeltramiTransform(order=1, normals=None)(data)
+    assert_same(to_operator(ignored), LaplaceBeltrami.from_points(points, order=1))
+    curves = [data_of(Circle().points(n)) for n in (20, 30)]
+    lb = to_operator(Batch.from_data_list([plain(curve) for curve in curves]))
+    assert (lb.dim, lb.sizes) == (1, (20, 30))
+
+
+def test_in_a_compose_and_from_a_cache(tmp_path):
+    transform = T.Compose([T.Center(), LaplaceBeltramiTransform(order=1, cache=tmp_path, k=4)])
+    first, again = transform(DATA[0]), transform(DATA[0])
+    assert len(list(tmp_path.iterdir())) == 1
+    assert torch.equal(first.lb_basis, again.lb_basis)
+    assert_same(to_operator(again), to_operator(first))
+    assert "order=1" in repr(transform)
+
+
+def test_the_keys_survive_a_file(tmp_path):
+    data = LaplaceBeltramiTransform(order=1, k=4)(DATA[0])
+    torch.save(data, tmp_path / "data.pt")
+    back = torch.load(tmp_path / "data.pt", weights_only=False)
+    assert_same(to_operator(back), to_operator(data))
+
+
+def test_errors():
+    transform = LaplaceBeltramiTransform(order=1)
+    with pytest.raises(ValueError, match="expected data with pos"):
+        transform(Data(x=torch.ones(3, 1)))
+    with pytest.raises(ValueError, match="went through LaplaceBeltramiTransform"):
+        to_operator(DATA[0])
+    data = transform(DATA[0])
+    data.pos = data.pos[:50]
+    with pytest.raises(ValueError, match="50 points, but an operator of 120"):
+        to_operator(data)
+    with pytest.raises(TypeError, match="no option degree"):
+        LaplaceBeltramiTransform(degree=2)(DATA[0])

@@ -1,0 +1,133 @@
+"""The command line as a user meets it: what it prints, its pictures, its exit codes, and no traceback."""
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+
+from torchlb import LaplaceBeltrami, __version__, save_operator
+from torchlb.surfaces import Ellipsoid
+
+ROOT = Path(__file__).parents[1]
+VERTICES, FACES = Ellipsoid().mesh(150)
+
+
+def run(*arguments, cwd):
+    environment = {**os.environ, "PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1"}
+    done = subprocess.run(
+        [sys.executable, "-m", "torchlb", *map(str, arguments)],
+        cwd=cwd,
+        env=environment,
+        capture_output=True,
+        text=True,
+        timeout=120,
+    )
+    assert "Traceback" not in done.stderr
+    return done
+
+
+@pytest.fixture
+def mesh(tmp_path):
+    trimesh.Trimesh(VERTICES.numpy(), FACES.numpy(), process=False).export(tmp_path / "shape.ply")
+    return tmp_path / "shape.ply"
+
+
+def test_compare_prints_report_certificate_and_spectra_and_draws(mesh, tmp_path):
+    done = run("compare", mesh, "-k", 6, "--order", 2, cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    for part in (
+        "shape.ply: 150 points in R^3, 296 faces",
+        "150 points, order 2 requested",
+        "certificate holds",
+        "   k     torchlb   cotangent",
+        "shape_compare.png",
+    ):
+        assert part in done.stdout, part
+    table = done.stdout.partition("cotangent\n")[2].splitlines()[:6]
+    first = [float(line.split()[1]) for line in table]
+    assert first == sorted(first)
+    assert first[0] == 0
+    assert (tmp_path / "shape_compare.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_compare_of_a_cloud_has_no_cotangent(tmp_path):
+    np.save(tmp_path / "cloud.npy", VERTICES.numpy())
+    done = run("compare", "cloud.npy", "--out", "a.png", "-k", 3, cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert "150 points in R^3, a cloud" in done.stdout
+    assert "cotangent" not in done.stdout
+    assert (tmp_path / "a.png").exists()
+
+
+def test_precompute_then_again_then_info(mesh, tmp_path):
+    arguments = ("precompute", ".", "--out", "cache", "--order", 1, "-k", 4, "--workers", 1)
+    first = run(*arguments, cwd=tmp_path)
+    assert (first.returncode, first.stdout) == (0, "1 shapes, 1 built, 0 cached, 0 failed\n")
+    again = run(*arguments, cwd=tmp_path)
+    assert (again.returncode, again.stdout) == (0, "1 shapes, 0 built, 1 cached, 0 failed\n")
+    [file] = (tmp_path / "cache").glob("*.npz")
+    done = run("info", file, cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    for part in ("order=1", "certificate holds", "eigenpairs stored", f"torchlb {__version__}"):
+        assert part in done.stdout, part
+
+
+def test_precompute_names_what_failed_and_ends_with_1(mesh, tmp_path):
+    (tmp_path / "broken.obj").write_text("nothing")
+    done = run(
+        "precompute", ".", "--out", "cache", "--order", 1, "--workers", 1, "--quiet", cwd=tmp_path
+    )
+    assert done.returncode == 1
+    assert "2 shapes, 1 built, 0 cached, 1 failed\nfailed\n  broken.obj" in done.stdout
+    assert done.stderr == ""
+
+
+def test_info_of_a_shape_and_of_a_damaged_operator(mesh, tmp_path):
+    done = run("info", mesh, cwd=tmp_path)
+    assert done.returncode == 0
+    assert "150 points in R^3, 296 faces, box" in done.stdout
+    save_operator(LaplaceBeltrami.from_cotangent(VERTICES, FACES), tmp_path / "lb.npz")
+    content = (tmp_path / "lb.npz").read_bytes()
+    (tmp_path / "lb.npz").write_bytes(content[: len(content) // 2])
+    done = run("info", "lb.npz", cwd=tmp_path)
+    assert done.returncode == 1
+    assert done.stderr.startswith("Error: ")
+    assert "lb.npz" in done.stderr
+
+
+@pytest.mark.parametrize(
+    ("arguments", "code", "message"),
+    [
+        (["compare", "missing.ply"], 2, "does not exist"),
+        (["compare", "prose.obj"], 1, "prose.obj: not a mesh or cloud that can be read"),
+        (["compare", "few.xyz"], 1, "3 points are fewer than the 15"),
+        (["compare", "few.xyz", "--order", "0"], 2, "0 is not in the range"),
+        (["compare", "few.xyz", "--weights", "heavy"], 2, "'heavy' is not one of"),
+        (["precompute", "."], 2, "Missing option '--out'"),
+        (["precompute", "empty", "--out", "cache"], 1, "no shapes in it"),
+        (["conquer"], 2, "No such command 'conquer'"),
+    ],
+)
+def test_a_wrong_call_ends_with_a_message(arguments, code, message, tmp_path):
+    (tmp_path / "prose.obj").write_text("no mesh")
+    (tmp_path / "few.xyz").write_text("0 0 0\n1 0 0\n0 1 0\n")
+    (tmp_path / "empty").mkdir()
+    done = run(*arguments, cwd=tmp_path)
+    assert done.returncode == code
+    assert message in done.stderr
+    assert not list(tmp_path.glob("*.png"))
+
+
+@pytest.mark.parametrize("command", [[], ["compare"], ["precompute"], ["info"]])
+def test_help_has_examples(command, tmp_path):
+    done = run(*command, "--help", cwd=tmp_path)
+    assert done.returncode == 0
+    assert f"  python -m torchlb {command[0] if command else 'compare'} " in done.stdout
+
+
+def test_version(tmp_path):
+    assert run("--version", cwd=tmp_path).stdout == f"torchlb, version {__version__}\n"

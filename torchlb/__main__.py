@@ -1,0 +1,216 @@
+"""`python -m torchlb`: look at the operator of one shape, precompute a folder of them, see what a file holds.
+
+Exit codes: 0 if all went well, 1 for an error or a shape that failed, 2 for a wrong call. Errors are one message on
+stderr, without a traceback.
+"""
+
+from __future__ import annotations
+
+import sys
+import time
+import warnings
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import click
+
+from torchlb.build import WEIGHTS
+from torchlb.cache import OperatorFileError, describe_file
+from torchlb.checks import clean_mesh
+from torchlb.comparison import draw_comparison, spectra, spectrum_table
+from torchlb.interop.trimesh import read_shape
+from torchlb.laplace_beltrami import LaplaceBeltrami
+from torchlb.operators import OPERATORS, build_operator
+from torchlb.precompute import precompute_operators
+from torchlb.tangent import PROJECTIONS
+from torchlb.version import __version__
+
+__all__ = ["main"]
+
+FILE = click.Path(exists=True, dir_okay=False, path_type=Path)
+COUNT = click.IntRange(min=1)
+
+
+class _Commands(click.Group):
+    """Commands whose errors are messages."""
+
+    def invoke(self, ctx: click.Context) -> Any:
+        """Run a command; what is wrong with the input ends it with a message and code 1."""
+        try:
+            with warnings.catch_warnings():
+                warnings.showwarning = _show
+                return super().invoke(ctx)
+        except (ValueError, TypeError, OSError) as error:
+            raise click.ClickException(str(error)) from error
+
+
+def _show(message: Warning | str, category: type[Warning], *_: Any) -> None:
+    if category.__module__.startswith("torchlb"):
+        click.echo(f"Warning: {message}", err=True)
+
+
+def _stencil_options(command: Callable[..., Any]) -> Callable[..., Any]:
+    """The options of the operator that the commands share."""
+    for option in (
+        click.option(
+            "--order", type=COUNT, default=3, show_default=True, help="Order p of accuracy."
+        ),
+        click.option(
+            "--projection",
+            type=click.Choice(list(PROJECTIONS)),
+            default="tangent",
+            show_default=True,
+            help="Onto the tangent plane, or along the normals.",
+        ),
+        click.option(
+            "--weights",
+            type=click.Choice(WEIGHTS),
+            default="least_squares",
+            show_default=True,
+            help="How the weights are found.",
+        ),
+        click.option("--clean", is_flag=True, help="Leave out vertices that belong to no face."),
+    ):
+        command = option(command)
+    return command
+
+
+@click.group(cls=_Commands, context_settings={"help_option_names": ["-h", "--help"]})
+@click.version_option(__version__, prog_name="torchlb")
+def main() -> None:
+    """High-order Laplace–Beltrami operators on meshes and point clouds.
+
+    \b
+    Examples:
+      python -m torchlb compare bunny.ply
+      python -m torchlb precompute shapes/ --out operators/ -k 128
+      python -m torchlb info operators/0a1b….npz
+    """
+
+
+@main.command()
+@click.argument("mesh", type=FILE)
+@click.option("-k", type=COUNT, default=20, show_default=True, help="Number of eigenvalues.")
+@click.option(
+    "--out", type=click.Path(path_type=Path), help="Picture; MESH_compare.png if left out."
+)
+@_stencil_options
+def compare(mesh: Path, k: int, out: Path | None, clean: bool, **options: Any) -> None:
+    """Report, certificate and spectrum of MESH beside the cotangent operator's, and a picture.
+
+    MESH is a mesh or point cloud (.ply .obj .off .stl .glb .xyz .npy .npz). A cloud has no cotangent operator.
+
+    \b
+    Examples:
+      python -m torchlb compare bunny.ply
+      python -m torchlb compare scan.xyz --order 2 -k 50 --out scan.png
+    """
+    vertices, faces = read_shape(mesh)
+    if clean and faces is not None:
+        vertices, faces, _ = clean_mesh(vertices, faces)
+    start = time.perf_counter()
+    lb = build_operator(vertices, faces, **options)
+    click.echo(f"{mesh.name}: {_size(vertices, faces)}\n{lb}")
+    click.echo(f"built in {time.perf_counter() - start:.1f} s\n\n{lb.report}\n{lb.certificate}\n")
+    operators = {"torchlb": lb}
+    if faces is not None:
+        try:
+            operators["cotangent"] = LaplaceBeltrami.from_cotangent(vertices, faces)
+        except ValueError as error:
+            click.echo(f"no cotangent operator to compare with: {error}", err=True)
+    values = spectra(operators, k)
+    click.echo(f"smallest eigenvalues of −Δ, 1/length²\n{spectrum_table(values)}")
+    out = out or Path(f"{mesh.stem}_compare.png")
+    try:
+        draw_comparison(lb, faces, values, out, f"{mesh.name}, order {options['order']} requested")
+    except ImportError as error:
+        click.echo(f"no picture: {error}; pip install 'torchlb[plot]'", err=True)
+    else:
+        click.echo(f"\n{out}")
+
+
+@main.command()
+@click.argument("folder", type=click.Path(exists=True, file_okay=False, path_type=Path))
+@click.option(
+    "--out", type=click.Path(file_okay=False, path_type=Path), required=True, help="Cache to fill."
+)
+@click.option("--operator", type=click.Choice(OPERATORS), default="stencil", show_default=True)
+@click.option("-k", type=click.IntRange(min=0), default=0, show_default=True, help="Eigenpairs.")
+@click.option(
+    "--workers", type=int, default=-1, show_default=True, help="Processes; -1: all cores."
+)
+@click.option("--quiet", is_flag=True, help="No progress bar.")
+@_stencil_options
+def precompute(
+    folder: Path,
+    out: Path,
+    operator: str,
+    k: int,
+    workers: int,
+    quiet: bool,
+    clean: bool,
+    **options: Any,
+) -> None:
+    """Compute the operators of all shapes in FOLDER and store them, each once.
+
+    What is in the cache is left as it is: after an interruption, give the same command again. A shape that fails stops
+    no other; a table at the end, and precompute.csv in the cache, say which and why, and the exit code is 1 then.
+
+    \b
+    Examples:
+      python -m torchlb precompute shapes/ --out operators/
+      python -m torchlb precompute shapes/ --out operators/ --order 5 -k 128 --workers 8 --clean
+    """
+    if operator == "cotangent":
+        options = {}
+    report = precompute_operators(
+        folder,
+        out,
+        operator=operator,
+        k=k,
+        workers=workers,
+        clean=clean,
+        progress=not quiet,
+        **options,
+    )
+    click.echo(str(report))
+    if report.failed:
+        sys.exit(1)
+
+
+@main.command()
+@click.argument("file", type=FILE)
+def info(file: Path) -> None:
+    """What FILE holds: an operator of a cache, or a shape. It is read in full, so damage is found.
+
+    \b
+    Examples:
+      python -m torchlb info operators/0a1b….npz
+      python -m torchlb info bunny.ply
+    """
+    try:
+        found = describe_file(file)
+    except OperatorFileError:
+        vertices, faces = read_shape(file)
+        low, high = vertices.amin(0), vertices.amax(0)
+        box = " × ".join(f"{side:.4g}" for side in (high - low).tolist())
+        click.echo(f"{file.name}: {_size(vertices, faces)}, box {box}")
+        if faces is not None:
+            loose = len(vertices) - len(clean_mesh(vertices, faces)[2])
+            click.echo(f"{loose} vertices belong to no face with distinct corners")
+        return
+    lb = found["operator"]
+    click.echo(f"{lb}\n\n{lb.report}\n{lb.certificate or 'no certificate'}")
+    pairs = lb.basis_eigenvectors.shape[-1] if len(lb.basis_left) else 0
+    click.echo(f"{pairs} eigenpairs stored")
+    click.echo(f"{file.stat().st_size / 1e6:.1f} MB, written by torchlb {found['version']}")
+
+
+def _size(vertices: Any, faces: Any) -> str:
+    cells = "a cloud" if faces is None else f"{len(faces)} faces"
+    return f"{len(vertices)} points in R^{vertices.shape[1]}, {cells}"
+
+
+if __name__ == "__main__":
+    main(prog_name="python -m torchlb")

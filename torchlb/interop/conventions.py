@@ -1,0 +1,78 @@
+"""The operator in the signs, factors and masses of other libraries; the table of them is in `docs/conventions.md`.
+
+Most libraries give a weak matrix C and a mass M, with M⁻¹C the operator; half of them give −C. torchlb's matrix is
+strong: Δ = M⁻¹C, M the diagonal of `lb.mass`.
+"""
+
+from __future__ import annotations
+
+import torch
+from jaxtyping import Float, Int
+from scipy import sparse
+from torch import Tensor
+
+from torchlb.laplace_beltrami import LaplaceBeltrami
+
+__all__ = ["SIGNS", "edge_weights", "weak_matrices"]
+
+SIGNS = {"igl": 1, "potpourri3d": -1, "robust_laplacian": -1, "lapy": -1, "diffusion_net": -1}
+"""Of the weak matrix: +1 if it is negative semidefinite like Δ, −1 if positive."""
+
+
+def weak_matrices(
+    lb: LaplaceBeltrami, convention: str
+) -> tuple[sparse.csr_array, sparse.csr_array]:
+    """Weak matrix C and diagonal mass M, both (N, N), with the sign of a library: M⁻¹C = ±Δ.
+
+    For the cotangent operator C is that library's, entry by entry, on a mesh without boundary trouble or degenerate
+    triangles; M is Voronoi, as igl has it by default, where potpourri3d and LaPy's `lump=True` give a third of the
+    triangles' areas. For the stencil C is not symmetric, its rows and its columns sum to zero, and its symmetric part
+    is semidefinite: for solvers that need symmetry (Cholesky, eigsh) take ½(C + Cᵀ), at the price of a lower order.
+
+    Parameters
+    ----------
+    lb : operator.
+    convention : "igl" (C ≤ 0), or "potpourri3d", "robust_laplacian", "lapy", "diffusion_net" (C ≥ 0).
+
+    Raises
+    ------
+    ValueError : for another library.
+
+    Examples
+    --------
+    >>> import igl
+    >>> from torchlb.surfaces import Sphere
+    >>> vertices, faces = Sphere().mesh(100)
+    >>> C, M = weak_matrices(LaplaceBeltrami.from_cotangent(vertices, faces), "igl")
+    >>> bool(abs(C - igl.cotmatrix(vertices.numpy(), faces.numpy())).max() < 1e-12)
+    True
+    """
+    if convention not in SIGNS:
+        raise ValueError(f"convention: expected one of {list(SIGNS)}, got {convention!r}")
+    mass = sparse.csr_array(sparse.diags_array(lb.mass.detach().cpu().numpy()))
+    return SIGNS[convention] * sparse.csr_array(mass @ lb.to_scipy()), mass
+
+
+def edge_weights(
+    lb: LaplaceBeltrami, normalization: str | None = None
+) -> tuple[Int[Tensor, "2 nnz"], Float[Tensor, " nnz"]]:
+    """`edge_index, edge_weight` as PyG's `get_mesh_laplacian(pos, face, normalization)` gives them, diagonal included.
+
+    Entry e of the operator is in row `edge_index[0, e]` and column `edge_index[1, e]`. Negative semidefinite.
+
+    Parameters
+    ----------
+    lb : operator.
+    normalization : None for the weak matrix, "rw" for the strong one, Δ itself. PyG's "sym" makes a symmetric matrix
+        symmetric again; the stencil is none.
+
+    Raises
+    ------
+    ValueError : for another normalization.
+    """
+    if normalization not in (None, "rw"):
+        raise ValueError(f"normalization: expected None or 'rw', got {normalization!r}")
+    count = torch.arange(lb.num_points, device=lb.crow.device)
+    row = count.repeat_interleave(lb.crow.diff())
+    values = lb.values if normalization == "rw" else lb.mass[row] * lb.values
+    return torch.stack([row, lb.col]), values

@@ -1,0 +1,193 @@
+"""PyTorch Geometric (`pip install torchlb[pyg]`): operators as keys of its `Data`, which its loaders batch.
+
+transform = LaplaceBeltramiTransform(order=3, k=64, cache="operators")
+for batch in torch_geometric.loader.DataLoader([transform(data) for data in shapes], batch_size=8):
+lb = to_operator(batch)  # block diagonal: every layer of torchlb takes it
+"""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import torch
+from jaxtyping import Int
+from torch import Tensor
+from torch_geometric.data import Batch, Data
+from torch_geometric.data.datapipes import functional_transform
+from torch_geometric.transforms import BaseTransform
+
+from torchlb.batching import join_certificates
+from torchlb.cache import load_or_build
+from torchlb.certificate import Certificate
+from torchlb.eigenbasis import Eigenbasis, stack_eigenbases
+from torchlb.laplace_beltrami import LaplaceBeltrami
+from torchlb.operators import build_operator
+
+__all__ = ["LaplaceBeltramiTransform", "to_operator"]
+
+BASIS = ("eigenvalues", "eigenvectors", "left", "rates", "mixing")
+
+
+@functional_transform("laplace_beltrami")
+class LaplaceBeltramiTransform(BaseTransform):
+    """Adds the Laplace–Beltrami operator of a shape to its `Data`, under keys that PyG batches rightly.
+
+    =================  ===========  ============================================================================
+    key                shape        what
+    =================  ===========  ============================================================================
+    lb_edge_index      (2, nnz)     [j; i] of every entry Δ_ij: messages flow j → i, as in `edge_index`
+    lb_values          (nnz,)       Δ_ij, 1/ℓ²: ``propagate(data.lb_edge_index, x=f, edge_weight=data.lb_values)`` is Δf
+    lb_gradient        (nnz, d)     tangential derivatives in the frame of i, 1/ℓ
+    lb_order_t         (nnz,)       the entries sorted by column, within the shape: the transpose, for the backward pass
+    lb_mass            (N,)         quadrature weights, ℓ^d
+    lb_frames          (N, n, d)    orthonormal tangent vectors
+    lb_normals         (N, n)       unit normals of a hypersurface
+    lb_basis           (…,)         with k > 0: all parts of the eigenbasis in one vector, for `to_operator`
+    lb_basis_size      (1, 2)       number of eigenpairs, and whether the basis is closed
+    lb_info            str          kind, options and certificate as JSON
+    =================  ===========  ============================================================================
+
+    Every key has a last or first axis that concatenates, and the one whose name contains "index" is shifted by the
+    number of nodes; nothing depends on a subclass of `Data`. The report is left out. A motion of the points leaves
+    values, gradients and mass valid, and turns frames and normals; any other change of `pos` needs the transform anew.
+
+    Parameters
+    ----------
+    operator : "stencil" or "cotangent".
+    k : number of eigenpairs for spectral layers; 0 for none, which `to_operator(batch).eigenbasis` would solve anew.
+    cache : folder, so that each shape is computed once (`load_or_build`); None to compute at every call.
+    normals : key of the normals of a cloud (PyG's transforms write "norm" or "normal"), which orient it; None to
+        ignore them. A shape without that key has them estimated.
+    **options : of `LaplaceBeltrami.from_mesh` (for data with `face`) or `from_points` (without).
+
+    Raises
+    ------
+    ValueError : when called, for data without `pos`, and for bad shapes.
+    """
+
+    def __init__(
+        self,
+        *,
+        operator: str = "stencil",
+        k: int = 0,
+        cache: str | Path | None = None,
+        normals: str | None = "norm",
+        **options: Any,
+    ) -> None:
+        self.operator, self.k, self.cache, self.normals = operator, k, cache, normals
+        self.options = options
+
+    def forward(self, data: Data) -> Data:
+        """The data with the keys added; `pos` (N, n) and, for a mesh, `face` (d + 1, F) are read."""
+        if data.pos is None:
+            raise ValueError(f"expected data with pos, got {data}")
+        pos: Tensor = data.pos
+        faces = None if data.get("face") is None else data["face"].T
+        options: dict[str, Any] = {"operator": self.operator, "progress": False, **self.options}
+        if faces is None and self.normals is not None and data.get(self.normals) is not None:
+            options.setdefault("normals", data[self.normals])
+        if self.cache is None:
+            lb = build_operator(pos, faces, **options)
+        else:
+            lb = load_or_build(pos, faces, cache=self.cache, k=self.k, **options)
+        for key, value in _keys(lb, self.k).items():
+            data[key] = value.to(pos.device) if isinstance(value, Tensor) else value
+        return data
+
+    def __repr__(self) -> str:
+        shown = {"operator": self.operator, "k": self.k, "cache": self.cache, **self.options}
+        return f"{type(self).__name__}({', '.join(f'{k}={v!r}' for k, v in shown.items())})"
+
+
+def _keys(lb: LaplaceBeltrami, k: int) -> dict[str, Any]:
+    """What is stored in the data of one shape."""
+    row = torch.arange(lb.num_points).repeat_interleave(lb.crow.diff())
+    keys: dict[str, Any] = {
+        "lb_edge_index": torch.stack([lb.col, row]),
+        "lb_values": lb.values,
+        "lb_gradient": lb.gradient_values.T.contiguous(),
+        "lb_order_t": lb.order_t,
+        "lb_mass": lb.mass,
+        "lb_frames": lb.frames,
+        "lb_info": json.dumps(lb.get_extra_state()),
+    }
+    if len(lb.normals):
+        keys["lb_normals"] = lb.normals
+    if k > 0:
+        lb.eigenbasis(k)
+        basis = lb.eigenbasis(1, closed=True)  # all that was solved
+        parts = [getattr(basis, name) for name in BASIS]
+        keys["lb_basis"] = torch.cat([part.flatten() for part in parts if part is not None])
+        size = [basis.eigenvectors.shape[1], int(basis.is_closed)]
+        keys["lb_basis_size"] = torch.tensor([size])
+    return keys
+
+
+def to_operator(data: Any) -> LaplaceBeltrami:
+    """The operator of a `Data` or `Batch` that went through `LaplaceBeltramiTransform`, on the device of the data.
+
+    Of a `Batch` it is block-diagonal, as `LaplaceBeltrami.batch` makes it, and `lb(x)` acts on the features of all
+    nodes. Eigenbases, if they were stored, come along. Nothing is solved or sorted: cheap enough for every step.
+
+    Raises
+    ------
+    ValueError : for data without the keys, or whose nodes were changed since.
+    """
+    if "lb_edge_index" not in data:
+        raise ValueError(f"expected data that went through LaplaceBeltramiTransform, got {data}")
+    batched = isinstance(data, Batch)
+    infos = [json.loads(text) for text in (data["lb_info"] if batched else [data["lb_info"]])]
+    sizes = data["ptr"].diff() if batched else data.lb_mass.new_tensor([len(data.lb_mass)]).long()
+    if int(sizes.sum()) != len(data.lb_mass) or len(data.pos) != len(data.lb_mass):
+        raise ValueError(
+            f"{len(data.pos)} points, but an operator of {len(data.lb_mass)}: nodes were added or taken away after "
+            "LaplaceBeltramiTransform; apply it last"
+        )
+    lb = LaplaceBeltrami()
+    _fill(lb, data, sizes)
+    if batched:
+        lb.kind, lb.options = "batch", dict(infos[0]["options"])
+        lb.sizes = tuple(sizes.tolist())
+        known = [i["certificate"] and Certificate(**i["certificate"]) for i in infos]
+        lb.certificate = join_certificates(known)
+    else:
+        lb.set_extra_state(infos[0])
+    if "lb_basis" in data:
+        bases = _bases(data, sizes.tolist())
+        lb._keep(stack_eigenbases(bases) if batched else bases[0])
+    return lb
+
+
+def _fill(lb: LaplaceBeltrami, data: Any, sizes: Int[Tensor, " S"]) -> None:
+    """Set the buffers of the block-diagonal matrix and of its transpose."""
+    col, row = data.lb_edge_index
+    lb.crow, lb.crow_t = _starts(row, len(data.pos)), _starts(col, len(data.pos))
+    ends = lb.crow[sizes.cumsum(0)]
+    entries = torch.diff(ends, prepend=ends.new_zeros(1))
+    lb.order_t = data.lb_order_t + (ends - entries).repeat_interleave(entries)
+    lb.col, lb.col_t = col.contiguous(), row[lb.order_t]
+    lb.values, lb.gradient_values = data.lb_values, data.lb_gradient.T.contiguous()
+    lb.mass, lb.points, lb.frames = data.lb_mass, data.pos.to(data.lb_mass), data.lb_frames
+    lb.normals = data.lb_normals if "lb_normals" in data else lb.points[:0]
+
+
+def _starts(index: Int[Tensor, " nnz"], size: int) -> Int[Tensor, " size_plus_1"]:
+    count = torch.bincount(index, minlength=size)
+    return torch.cat([count.new_zeros(1), count.cumsum(0)])
+
+
+def _bases(data: Any, sizes: list[int]) -> list[Eigenbasis]:
+    """The eigenbasis of each shape out of the common vector."""
+    shapes = []
+    for n, (k, closed) in zip(sizes, data.lb_basis_size.tolist(), strict=True):
+        parts = [(k,), (n, k), (n, k), *([(2, k), (3, k, k)] if closed else [])]
+        shapes.append([torch.Size(part) for part in parts])
+    pieces = iter(data.lb_basis.split([part.numel() for parts in shapes for part in parts]))
+    bases = []
+    for parts, mass in zip(shapes, data.lb_mass.split(sizes), strict=True):
+        values, vectors, left, *rest = (next(pieces).view(part) for part in parts)
+        rates, mixing = rest or (None, None)
+        bases.append(Eigenbasis(values, vectors, mass, left, rates=rates, mixing=mixing))
+    return bases
