@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 import trimesh
 
 from torchlb.surfaces import Ellipsoid
@@ -132,3 +133,47 @@ def test_demo_draws_a_torus_where_nilearn_is_missing(demo, monkeypatch, capsys):
     vertices, _, name, _ = demo.cortex()
     assert (len(vertices), name) == (6000, "torus")
     assert "nilearn is not installed" in capsys.readouterr().out
+
+
+SMALL = ["--decimate", "150", "--k", "12", "--width", "8"]
+
+
+@pytest.mark.parametrize(("operator", "test"), [("stencil", "clouds"), ("cotangent", "meshes")])
+def test_segmentation_trains_resumes_where_it_stopped_and_draws(tmp_path, operator, test, capsys):
+    example = load("train_segmentation")
+    method = "full" if operator == "stencil" else "spectral"
+    chosen = [*SMALL, "--operator", operator, "--test", test, "--method", method]
+    whole, parts = tmp_path / "whole", tmp_path / "parts"
+    accuracy = example.main([*chosen, "--out", str(whole), "--epochs", "2"])
+    example.main([*chosen, "--out", str(parts), "--epochs", "1"])
+    assert example.main([*chosen, "--out", str(parts), "--epochs", "2", "--resume"]) == accuracy
+    assert f"accuracy on 4 test {test}: {accuracy:.3f}" in capsys.readouterr().out
+    expected, resumed = (torch.load(folder / "checkpoint.pt") for folder in (whole, parts))
+    assert expected["epoch"] == resumed["epoch"] == 2
+    for name, value in expected["net"].items():
+        assert torch.equal(value, resumed["net"][name]), name
+    assert (parts / "labels.png").read_bytes().startswith(PNG)
+    assert not list(parts.glob("*.new"))
+
+
+def test_segmentation_reads_one_shape_a_file_or_a_stack_and_drops_loose_vertices(tmp_path):
+    example = load("train_segmentation")
+    vertices, faces = (t.numpy() for t in Ellipsoid().mesh(250))
+    loose = np.concatenate([vertices, [[9.0, 9, 9]]])
+    labels = np.append(np.arange(250) % 3, -1)
+    stack = np.stack([loose, 2 * loose])
+    np.savez(tmp_path / "a.npz", vertices=loose.astype("f4"), faces=faces, labels=labels)
+    np.savez(tmp_path / "b.npz", vertices=stack, faces=faces.astype("i4"), labels=labels)
+    shapes = example.read(tmp_path)
+    assert len(shapes) == 3
+    for points, corners, found in shapes:
+        assert (tuple(points.shape), tuple(corners.shape)) == ((250, 3), faces.shape)
+        assert found.tolist() == labels[:250].tolist()
+        assert points.norm(dim=1).max().item() == pytest.approx(1)
+        assert points.mean(0).abs().max() < 1e-6
+
+
+def test_spectral_gallery_writes_one_picture(tmp_path, capsys):
+    load("spectral_gallery").main(["--out", str(tmp_path), "--points", "400", "--k", "40"])
+    assert "Eigenbasis(40 pairs of 400 points" in capsys.readouterr().out
+    assert pictures_in(tmp_path) == ["spectral.png"]
