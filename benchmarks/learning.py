@@ -67,6 +67,15 @@ class Original:
         )
         self.gradients = tangent_gradients(points, None if faces is None else faces.numpy())
 
+    def to(self, device: str) -> Original:
+        """Itself, on another device."""
+        for name in ("points", "mass", "values"):
+            setattr(self, name, getattr(self, name).to(device))
+        parts = (self.basis.eigenvalues, self.basis.eigenvectors, self.mass, self.basis.left)
+        self.basis = Eigenbasis(*(part.to(device) for part in parts))
+        self.gradients = [matrix.to(device) for matrix in self.gradients]
+        return self
+
     def eigenbasis(self, k: int) -> Eigenbasis:
         return self.basis.truncate(k)
 

@@ -1,0 +1,128 @@
+"""Speed of the layers, as Markdown tables: python benchmarks/layers.py [--quick] [--device cuda].
+
+The sparse product forward and backward, beside torch's own on the same matrix; and a training step of DiffusionNet,
+beside the same network on DiffusionNet's own operators and sparse format (benchmarks/learning.py). The rows of a table
+are timed in turns, so that a busy machine slows all of them, and the median is printed.
+"""
+
+from __future__ import annotations
+
+import argparse
+import time
+from collections.abc import Callable
+
+import numpy as np
+import torch
+from _common import versions
+from learning import Original
+from torch.nn.functional import cross_entropy
+
+from torchlb import DiffusionNet, LaplaceBeltrami
+from torchlb.surfaces import StarShaped
+
+
+def medians(
+    steps: dict[str, Callable[[], object]], repeats: int, device: str
+) -> dict[str, list[float]]:
+    """Seconds of each step, all of them once a round; two rounds to warm up are left out."""
+    seconds: dict[str, list[float]] = {name: [] for name in steps}
+    for _ in range(repeats + 2):
+        for name, step in steps.items():
+            wait(device)
+            start = time.perf_counter()
+            step()
+            wait(device)
+            seconds[name].append(time.perf_counter() - start)
+    return {name: column[2:] for name, column in seconds.items()}
+
+
+def wait(device: str) -> None:
+    if device.startswith("cuda"):
+        torch.cuda.synchronize()
+
+
+def table(title: str, seconds: dict[str, list[float]], baseline: str) -> None:
+    """Medians, and their ratios to the baseline's."""
+    print(f"\n### {title}\n\n| | ms | of {baseline} |\n|:--|--:|--:|")
+    base = np.median(seconds[baseline])
+    for name, column in seconds.items():
+        print(f"| {name} | {1e3 * np.median(column):.1f} | {np.median(column) / base:.2f} |")
+
+
+def product(lb: LaplaceBeltrami, channels: int, repeats: int, device: str) -> None:
+    x = torch.randn(lb.num_points, channels, device=device, requires_grad=True)
+    weights = torch.randn(lb.num_points, channels, device=device)
+    csr, coo = lb.matrix, lb.matrix.to_sparse_coo().coalesce()
+
+    def both_ways(multiply: Callable[[torch.Tensor], torch.Tensor]) -> Callable[[], torch.Tensor]:
+        return lambda: torch.autograd.grad(multiply(x), x, weights)[0]
+
+    steps = {
+        "torchlb": both_ways(lb),
+        "torch CSR": both_ways(lambda x: csr @ x),
+        "torch COO": both_ways(lambda x: coo @ x),
+    }
+    reference = steps["torch COO"]()
+    for name, step in steps.items():
+        worst = ((step() - reference).abs().max() / reference.abs().max()).item()
+        if worst > 1e-5:
+            raise ArithmeticError(f"{name}: gradient off by {worst:.1e}")
+    title = f"Sparse product, forward and backward, N = {lb.num_points:,}, C = {channels}, "
+    title += f"{lb.col.numel() / lb.num_points:.0f} entries a row"
+    table(title, medians(steps, repeats, device), "torch CSR")
+
+
+def training_step(shape: dict[str, object], width: int, k: int, repeats: int, device: str) -> None:
+    """`shape`: operators by name, (of which "original" only has the spectral diffusion)."""
+    steps = {}
+    for kind, lb in shape.items():
+        for method in ("spectral", "full") if kind != "original" else ("spectral",):
+            steps[f"{kind}, {method}"] = step_of(lb, method, width, k, device)
+    title = f"Training step of 4 blocks, C_width = {width}, k = {k}"
+    table(title, medians(steps, repeats, device), "original, spectral")
+
+
+def step_of(lb: object, method: str, width: int, k: int, device: str) -> Callable[[], None]:
+    torch.manual_seed(0)
+    net = DiffusionNet(3, 8, width, 4, diffusion_method=method, k=k).to(device)
+    optimizer = torch.optim.Adam(net.parameters())
+    points = lb.points.to(device)  # type: ignore[attr-defined]
+    labels = (points[:, 0] > 0).long()
+
+    def step() -> None:
+        optimizer.zero_grad()
+        cross_entropy(net(points, lb), labels).backward()  # type: ignore[arg-type]
+        optimizer.step()
+
+    return step
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
+    parser.add_argument("--quick", action="store_true", help="small, few repeats: does it run?")
+    parser.add_argument("--points", type=int, default=10000)
+    parser.add_argument("--channels", type=int, default=64)
+    parser.add_argument("--k", type=int, default=128)
+    parser.add_argument("--repeats", type=int, default=15)
+    parser.add_argument("--device", default="cpu")
+    options = parser.parse_args()
+    if options.quick:
+        options.points, options.channels, options.k, options.repeats = 500, 8, 24, 3
+    torch.set_num_threads(1)
+    print("# Layers\n", *versions(), sep="\n")
+    print(f"\nOn {options.device}, one thread; float32.")
+    vertices, faces = StarShaped().mesh(options.points)
+    stencil = LaplaceBeltrami.from_mesh(vertices, faces)
+    cotangent = LaplaceBeltrami.from_cotangent(vertices, faces)
+    original = Original(vertices, faces, options.k)
+    for lb in (stencil, cotangent):
+        lb.eigenbasis(options.k)
+        lb.float().to(options.device)
+    original.to(options.device)
+    product(stencil, options.channels, options.repeats, options.device)
+    shape = {"torchlb": stencil, "cotangent": cotangent, "original": original}
+    training_step(shape, options.channels, options.k, options.repeats, options.device)
+
+
+if __name__ == "__main__":
+    main()
