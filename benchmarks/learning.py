@@ -130,8 +130,10 @@ def build(kind: str, shape: Shape, k: int) -> Any:
 
 def by_quadrics(vertices: Tensor, faces: Tensor, labels: Tensor, size: int) -> Shape:
     """A mesh of about `size` vertices, dense where it is curved and with slivers where it is not."""
+    if len(vertices) <= size:
+        return vertices, faces, labels
     coarse, triangles, _, origin = igl.qslim(vertices.numpy(), faces.numpy(), 2 * size)
-    if len(vertices) <= size or len(coarse) == 0:
+    if len(coarse) == 0:
         return vertices, faces, labels
     return torch.tensor(coarse), torch.tensor(triangles), labels[torch.tensor(origin)]
 

@@ -47,8 +47,10 @@ def read(path):
 
 def decimated(vertices, faces, labels, size):
     """A mesh of about `size` evenly spread vertices; the mesh itself if it is no manifold, which libigl refuses."""
+    if len(vertices) <= size:
+        return vertices, faces, labels
     coarse, triangles, _, origin = igl.decimate(vertices.numpy(), faces.numpy(), 2 * size)
-    if len(vertices) <= size or len(coarse) == 0:
+    if len(coarse) == 0:
         return vertices, faces, labels
     return torch.tensor(coarse), torch.tensor(triangles), labels[torch.tensor(origin)]
 
