@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any
 
 import click
+from click.core import ParameterSource
 
 from torchlb.build import WEIGHTS
 from torchlb.cache import OperatorFileError, describe_file
@@ -163,6 +164,12 @@ def precompute(
       python -m torchlb precompute shapes/ --out operators/ --order 5 -k 128 --workers 8 --clean
     """
     if operator == "cotangent":
+        context = click.get_current_context()
+        given = [
+            n for n in options if context.get_parameter_source(n) is not ParameterSource.DEFAULT
+        ]
+        if given:
+            raise click.UsageError(f"the cotangent operator has no --{' --'.join(given)}")
         options = {}
     report = precompute_operators(
         folder,
