@@ -10,22 +10,18 @@ from __future__ import annotations
 
 import argparse
 import functools
-import importlib.metadata
-import importlib.util
 import os
-import platform
 import sys
 import time
 from collections.abc import Callable, Iterable, Sequence
-from datetime import date
 from typing import Any, NamedTuple
 
 import numpy as np
 import torch
+from _common import installed, versions
 from scipy import sparse
 from tqdm import tqdm
 
-import torchlb
 from torchlb import LaplaceBeltrami, surfaces
 from torchlb.surfaces import smooth_function
 
@@ -40,12 +36,6 @@ OTHERS = {  # of other dimensions or codimensions, and how many fewer points the
     "ThreeSphere": (surfaces.ThreeSphere(), 4),
     "Circle": (surfaces.Circle(), 16),
     "SpaceCurve": (surfaces.SpaceCurve(), 16),
-}
-PACKAGES = {  # peers, and the names they are imported by
-    "libigl": "igl",
-    "robust_laplacian": "robust_laplacian",
-    "pcdiff": "pcdiff",
-    "pycompadre": "pycompadre",
 }
 PCDIFF_NEIGHBORS = 30
 COMPADRE_EPSILON = 1.9  # multiplier of the radius that holds the least number of neighbours
@@ -229,10 +219,6 @@ def peers() -> dict[str, Apply]:
         name = f"pycompadre, degree {degree} (p={degree - 1})"
         methods[name] = ("pycompadre", compadre(degree))
     return {name: apply for name, (package, apply) in methods.items() if installed(package)}
-
-
-def installed(package: str) -> bool:
-    return importlib.util.find_spec(PACKAGES[package]) is not None
 
 
 # Tables
@@ -503,20 +489,6 @@ TABLES = {
     "sphere4070": sphere4070,
     "theorem": theorem,
 }
-
-
-def versions() -> list[str]:
-    """Lines on what ran, and notes on peers that did not."""
-    found = [f"python {platform.python_version()}", f"torch {torch.__version__}"]
-    found += [f"{name} {importlib.metadata.version(name)}" for name in ("numpy", "scipy")]
-    found.append(f"torchlb {torchlb.__version__}")
-    lines = []
-    for package in PACKAGES:
-        if installed(package):
-            found.append(f"{package} {importlib.metadata.version(package)}")
-        else:
-            lines.append(f"{package} is not installed; its rows are left out.")
-    return [f"{date.today().isoformat()}; {', '.join(found)}.", *lines]
 
 
 def main() -> None:

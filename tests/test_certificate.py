@@ -1,5 +1,7 @@
 """The certificate: π > 0 and S = ½(ΠL + LᵀΠ) ≤ 0, and what follows from it."""
 
+import math
+
 import numpy as np
 import pytest
 import torch
@@ -7,7 +9,7 @@ from scipy import sparse
 
 from torchlb import LaplaceBeltrami, StabilityWarning
 from torchlb.certificate import check_certificate, left_null_vector
-from torchlb.surfaces import Sphere, Torus, smooth_function
+from torchlb.surfaces import Sphere, ThreeSphere, Torus, smooth_function
 
 
 def dense(lb):
@@ -82,6 +84,13 @@ def test_total_mass_is_the_area():
     torch.testing.assert_close(mesh, triangles.norm(dim=1).sum() / 2)
     cloud = LaplaceBeltrami.from_points(vertices).mass.sum()
     assert abs(cloud / surface.area - 1) < 0.01
+
+
+def test_three_dimensions():
+    """S³ ⊂ R⁴: the certificate holds, and the mass sums to the volume 2π² up to 5 %."""
+    lb = LaplaceBeltrami.from_points(ThreeSphere().points(400), order=2)
+    assert lb.certificate.holds
+    assert abs(lb.mass.sum() / (2 * math.pi**2) - 1) < 0.05
 
 
 def test_every_component_has_its_own_null_vector():

@@ -1,5 +1,6 @@
 """Every bad input is refused with what came, where, and what to do."""
 
+import jaxtyping
 import numpy as np
 import pytest
 import torch
@@ -11,6 +12,12 @@ from torchlb.surfaces import CliffordTorus, Sphere
 
 POINTS = Sphere().points(100)
 VERTICES, FACES = Sphere().mesh(100)
+
+
+@pytest.fixture
+def unchecked(monkeypatch):
+    """Without the tests' own checks of types: as a user calls it."""
+    monkeypatch.setattr(jaxtyping.config, "jaxtyping_disable", True)
 
 
 def spoiled(index, value):
@@ -28,6 +35,9 @@ def spoiled(index, value):
         ("a file name", "expected an \\(N, n\\) tensor or array"),
         (POINTS > 0, "expected real numbers"),
         (spoiled(3, POINTS[5]), "such as 3, 5 .*remove duplicates"),
+        (spoiled(3, POINTS[5] + 1e-14), "such as 3, 5 .*remove duplicates"),
+        (POINTS * 1e160, "extend over .*rescale"),
+        (POINTS * 1e-160, "extend over .*rescale"),
         (POINTS[:12], "12 points are fewer than the 15 .*lower `order` to 2"),
         (POINTS[:4], "4 points are fewer than the 15 .*add points"),
     ],
@@ -60,14 +70,19 @@ def test_bad_faces(faces, message):
         ({"projection": "orthogonal"}, "projection: expected one of"),
         ({"weights": "rbf"}, "weights: expected one of"),
         ({"order": 0}, "order: expected an integer ≥ 1"),
+        ({"order": 2.5}, "order: expected an integer, got 2.5"),
+        ({"order": "3"}, "order: expected an integer, got '3'"),
+        ({"dim": 1.5}, "dim: expected an integer"),
         ({"normal_order": -1}, "normal_order"),
+        ({"num_neighbors": 20.5}, "num_neighbors: expected an integer"),
+        ({"num_neighbors": 101}, "num_neighbors: 101 are more than the 100 points"),
         ({"num_neighbors": 14}, "num_neighbors: order 3 in 2 dimensions has 15 polynomials"),
         ({"dim": 4}, "dim: expected 1 … 3"),
         ({"normals": POINTS[:50]}, "normals: expected the shape of points"),
         ({"normals": 0 * POINTS}, "normals: 100 are zero"),
     ],
 )
-def test_bad_options(options, message):
+def test_bad_options(options, message, unchecked):
     with pytest.raises(ValueError, match=message):
         LaplaceBeltrami.from_points(POINTS, **options)
 
@@ -81,6 +96,39 @@ def test_normals_are_for_hypersurfaces():
 def test_cotangent_needs_triangles():
     with pytest.raises(ValueError, match="needs triangles"):
         LaplaceBeltrami.from_cotangent(VERTICES, FACES[:, :2])
+
+
+def test_cotangent_needs_area():
+    """A vertex in the middle of an edge, its only triangle flat: no area, or NaN."""
+    vertices = torch.tensor([[0.0, 0, 0], [2, 0, 0], [0, 2, 0], [1, 1, 0]])
+    with pytest.raises(ValueError, match=r"vertices \[3\] have no area"):
+        LaplaceBeltrami.from_cotangent(vertices, torch.tensor([[0, 1, 2], [2, 1, 3]]))
+
+
+def test_coincident_vertices_of_a_mesh_are_named():
+    """Two triangles that share an edge only in place, as in an STL file."""
+    cut = torch.cat([VERTICES, VERTICES[FACES[0]]])
+    faces = FACES.clone()
+    faces[0] = torch.arange(100, 103)
+    with pytest.warns(UserWarning, match="6 share a place with another .*merge_vertices"):
+        LaplaceBeltrami.from_mesh(cut, faces)
+
+
+def test_a_wrong_dimension_is_suspected():
+    with pytest.warns(UserWarning, match="manifold of dimension 3.*`dim`"):
+        LaplaceBeltrami.from_points(CliffordTorus().points(200))
+
+
+@pytest.mark.parametrize("dtype", [torch.bool, torch.int8, torch.int64, torch.float32])
+def test_features_of_any_type_are_not_rounded(dtype, unchecked):
+    lb = LaplaceBeltrami.from_points(POINTS)
+    f = (3 * POINTS[:, 0]).to(dtype)
+    torch.testing.assert_close(lb(f), lb(f.double()))
+
+
+def test_arrays_are_no_features(unchecked):
+    with pytest.raises(TypeError, match="as_tensor"):
+        LaplaceBeltrami.from_points(POINTS)(POINTS.numpy())
 
 
 @pytest.mark.parametrize("shape", [(99,), (99, 2), (2, 99, 2), (1, 1, 100, 2)])

@@ -15,6 +15,7 @@ ORDER = [
     "ladder",
     "weights",
     "tangent",
+    "orientation",
     "boundary",
     "sparse",
     "cotangent",

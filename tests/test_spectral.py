@@ -13,13 +13,14 @@ from torchlb import (
     StencilError,
     diffusion_distance,
     diffusion_map,
+    heat_flow,
     heat_kernel_signature,
     spectral_wavelets,
     wave_kernel_signature,
 )
 from torchlb.eigensolver import solve_eigenbasis
 from torchlb.sparse import to_scipy
-from torchlb.surfaces import Circle, CliffordTorus, Sphere, Torus, UnitDisk
+from torchlb.surfaces import Circle, CliffordTorus, Hemisphere, Sphere, Torus, UnitDisk
 
 BUILDERS = {
     "points": lambda n: LaplaceBeltrami.from_points(Torus().points(n)),
@@ -249,3 +250,36 @@ def test_spectral_convolution_is_its_formula():
     assert layer.weight.grad.isfinite().all()
     with pytest.raises(ValueError, match="expected 3 channels"):
         layer(x[:, :2], lb)
+
+
+@pytest.mark.parametrize("surface", [UnitDisk(), Hemisphere()], ids=["disk", "hemisphere"])
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_dirichlet_basis(surface, dtype):
+    """Without constants: squared Bessel zeros or l(l + 1), zero on the boundary, orthonormal; and heat that leaves."""
+    vertices, faces = surface.mesh(500)
+    lb = LaplaceBeltrami.from_mesh(vertices.to(dtype), faces, boundary="dirichlet")
+    basis = lb.eigenbasis(20)
+    exact = surface.eigenvalues(10, boundary="dirichlet")
+    assert ((basis.eigenvalues[:10].double() / exact - 1).abs() < 5e-3).all()
+    mask = surface.boundary_mask(vertices)
+    assert (basis.eigenvectors[mask] == 0).all()
+    product = basis.eigenvectors.T @ (lb.mass[:, None] * basis.eigenvectors)
+    tolerance = 1e-10 if dtype == torch.float64 else 1e-5
+    assert (product - torch.eye(20)).abs().max() < tolerance
+    f = basis.eigenvectors[:, 0]
+    cooled = torch.exp(-0.1 * basis.eigenvalues[0]) * f
+    for method in ("full", "spectral", "chebyshev", "rational"):
+        assert (heat_flow(lb, f, 0.1, method=method, k=20) - cooled).norm() < 2e-2 * cooled.norm()
+
+
+def test_dirichlet_beside_a_closed_component():
+    """One zero, of the sphere; the disk's own λ_1 = 5.783 among the sphere's 2, 2, 2, 6."""
+    vertices, faces = UnitDisk().mesh(300)
+    ball, shell = Sphere().mesh(300)
+    both = torch.cat([vertices, ball + 5])
+    lb = LaplaceBeltrami.from_mesh(both, torch.cat([faces, shell + 300]), boundary="dirichlet")
+    basis = lb.eigenbasis(5)
+    assert basis.eigenvalues[0] == 0
+    expected = torch.tensor([2.0, 2, 2, 5.783]).double()
+    assert ((basis.eigenvalues[1:] / expected - 1).abs() < 5e-3).all()
+    assert len(basis.eigenvectors[:, 0].unique()) == 2

@@ -8,7 +8,7 @@ import torch
 
 from tolerances import TOLERANCE
 from torchlb.ladder import ladder_rungs
-from torchlb.neighbors import GraphBalls, mesh_graph, nearest_graph, nearest_neighbors
+from torchlb.neighbors import GraphBalls, nearest_graph, nearest_neighbors
 from torchlb.surfaces import (
     CliffordTorus,
     Ellipsoid,
@@ -26,7 +26,6 @@ from torchlb.tangent import (
     local_offsets,
     mesh_frames,
     normals_of_frames,
-    orient_by_graph,
     refine_frames,
 )
 
@@ -188,30 +187,3 @@ def test_both_projections_agree_to_third_order(surface):
         spacing.append(float((points[neighbors] - points[centers, None]).norm(dim=-1).mean()))
     assert slope_of(sizes, apart, surface.dim) >= 2.7
     assert apart[-1] <= 5 * spacing[-1] ** 3
-
-
-@each([Sphere(), Torus(), Ellipsoid()])
-@pytest.mark.parametrize("sampling", ["points", "random_points"])
-def test_normals_of_a_cloud_are_turned_outward(surface, sampling):
-    """From random signs, over the graph of the cloud."""
-    points = getattr(surface, sampling)(1000)
-    frames, balls = poor_and_balls(surface, points)
-    normals = normals_of_frames(frames) * torch.randint(0, 2, (1000, 1)).mul(2).sub(1)
-    oriented = orient_by_graph(points, normals, balls.graph)
-    assert ((oriented * surface.normals(points)).sum(1) > 0).all()
-    close(oriented.abs(), normals.abs())
-
-
-def test_every_component_is_turned_outward_by_itself():
-    points = torch.cat([Sphere().points(300), 2 * Sphere().points(300, seed=1) + 5])
-    exact = torch.cat([points[:300], (points[300:] - 5) / 2])
-    graph = nearest_graph(points, complete_frames(exact), nearest_neighbors(points, 24))
-    signs = torch.randint(0, 2, (600, 1)).mul(2).sub(1)
-    close(orient_by_graph(points, exact * signs, graph), exact)
-
-
-def test_mesh_graph_orients_a_mesh_as_well():
-    vertices, faces = Torus().mesh(500)
-    exact = Torus().normals(vertices)
-    signs = torch.randint(0, 2, (500, 1)).mul(2).sub(1)
-    close(orient_by_graph(vertices, exact * signs, mesh_graph(faces, 500)), exact)

@@ -31,10 +31,12 @@ class Boundary:
     ----------
     mask : (N,), which points lie on the boundary.
     conormals : (N, n), unit and outward there, zero elsewhere.
+    condition : "neumann" for ∂_ν f = 0 there, "dirichlet" for f = 0.
     """
 
     mask: Bool[Tensor, " N"]
     conormals: Float[Tensor, "N n"]
+    condition: str = "neumann"
 
 
 def boundary_faces(faces: Int[Tensor, "F v"]) -> Int[Tensor, "G w"]:

@@ -17,6 +17,8 @@ from torchlb.checks import (
     check_normals,
     check_options,
     check_points,
+    check_scale,
+    warn_of_coincident,
 )
 from torchlb.cotangent import cotangent_laplacian
 from torchlb.geometry import Geometry, cloud_geometry, mesh_geometry
@@ -26,6 +28,7 @@ from torchlb.tangent import PROJECTIONS
 
 __all__ = ["Built", "Options", "build_cloud", "build_cotangent", "build_mesh"]
 
+CONDITIONS = ["neumann", "dirichlet"]
 WEIGHTS = ["least_squares", "polyharmonic"]
 
 
@@ -52,7 +55,7 @@ class Options:
             ambient_dim,
             dim,
             self.order,
-            self.q,
+            self.normal_order or 0,
             self.num_neighbors,
             projection=(self.projection, list(PROJECTIONS)),
             weights=(self.weights, WEIGHTS),
@@ -71,14 +74,24 @@ class Built:
 
 
 def build_cloud(
-    points: Any, dim: int | None, options: Options, *, normals: Any, boundary: Any, progress: bool
+    points: Any,
+    dim: int | None,
+    options: Options,
+    *,
+    normals: Any,
+    boundary: Any,
+    condition: str,
+    progress: bool,
 ) -> Built:
     """Operator on a point cloud; arguments as for `LaplaceBeltrami.from_points`."""
     points = check_points(points)
+    check_scale(points)
     ambient = points.shape[1]
     d = max(ambient - 1, 1) if dim is None else dim
     options.check(len(points), ambient, d)
     check_distinct(points)
+    if condition not in CONDITIONS:
+        raise ValueError(f"condition: expected one of {CONDITIONS}, got {condition!r}")
     if normals is not None:
         if d != ambient - 1:
             raise ValueError(f"normals: only hypersurfaces have them, not dim={d} in R^{ambient}")
@@ -90,9 +103,17 @@ def build_cloud(
         num_neighbors=options.num_neighbors,
         normals=normals,
         boundary=check_boundary(boundary, len(points)),
+        condition=condition,
         progress=progress,
     )
-    return _finished(geometry, "points", options, progress)
+    built = _finished(geometry, "points", options, progress)
+    if not (built.rows.order > 0).any():
+        warnings.warn(
+            f"no point has a stencil, only rows of last resort: do the points lie on a manifold of dimension {d}? "
+            "If not, pass its dimension as `dim`; else `report` says what is wrong",
+            stacklevel=3,
+        )
+    return built
 
 
 def build_mesh(
@@ -100,16 +121,18 @@ def build_mesh(
 ) -> Built:
     """Operator on a mesh; arguments as for `LaplaceBeltrami.from_mesh`."""
     vertices = check_points(vertices, "vertices")
+    check_scale(vertices)
     faces = check_faces(faces, len(vertices))
     options.check(len(vertices), vertices.shape[1], faces.shape[1] - 1)
-    if boundary not in ("neumann", None):
-        raise ValueError(f"boundary: expected 'neumann' or None, got {boundary!r}")
+    warn_of_coincident(vertices)
+    if boundary not in (*CONDITIONS, None):
+        raise ValueError(f"boundary: expected one of {CONDITIONS} or None, got {boundary!r}")
     geometry = mesh_geometry(
         vertices,
         faces,
         options.q,
         num_neighbors=options.num_neighbors,
-        boundary=boundary is not None,
+        boundary=boundary,
         progress=progress,
     )
     return _finished(geometry, "mesh", options, progress)
@@ -118,11 +141,12 @@ def build_mesh(
 def build_cotangent(vertices: Any, faces: Any) -> Built:
     """The cotangent operator with its mass; arguments as for `LaplaceBeltrami.from_cotangent`."""
     vertices = check_points(vertices, "vertices")
+    check_scale(vertices)
     faces = check_faces(faces, len(vertices))
     if faces.shape[1] != 3:
         raise ValueError(f"faces: the cotangent operator needs triangles, got {tuple(faces.shape)}")
     matrix, mass = cotangent_laplacian(vertices, faces)
-    geometry = mesh_geometry(vertices, faces, 0, boundary=False)
+    geometry = mesh_geometry(vertices, faces, 0, boundary=None)
     everything: Tensor = torch.arange(len(vertices))
     rows = matrix_rows(matrix, geometry.points, geometry.frames, everything)
     return Built(rows, replace(geometry, areas=mass), "cotangent", {}, None)

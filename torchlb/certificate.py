@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from scipy import sparse
 from scipy.sparse import csgraph
 from scipy.sparse.linalg import (
@@ -31,6 +31,7 @@ from torchlb.sparse import to_scipy
 from torchlb.stencil import Ladder, StencilError
 
 __all__ = [
+    "LOSS",
     "Certificate",
     "StabilityWarning",
     "certify",
@@ -39,11 +40,17 @@ __all__ = [
     "left_null_vector",
 ]
 
+LOSS = 1e-9
+"""A row whose sum is above this share of its diagonal loses heat; all others sum to zero up to rounding."""
 MARGIN = 0.02
 """A point whose π is below this share of its area asks the rows around it to step down while they can."""
 STRICTNESS = 1e-12
 """S passes if it is negative up to this share of its spectral radius; a hundred times the rounding of its sums."""
-MAX_ROUNDS = 40
+POSITIVE = 1e-10
+"""Share of its area that π must reach at every point; what is below has no inflow but rounding."""
+MAX_ROUNDS = 80
+PATIENCE = 20
+"""Rounds after which rows step down to the bottom at once."""
 LARGEST = 150_000
 """Beyond this many points the sparse factors outgrow an ordinary machine."""
 MAX_VECTORS = 32
@@ -115,7 +122,9 @@ def left_null_vector(
 ) -> tuple[Float[Tensor, " N"], np.ndarray]:
     """π with πᵀL = 0, scaled on each component to the sum of the areas there, and the component of each point.
 
-    Inverse iteration with the LU of (AL)ᵀ, A the areas, shifted by 1e-9 of its diagonal; four solves.
+    Inverse iteration with the LU of (AL)ᵀ, A the areas, shifted by 1e-9 of its diagonal; four solves. On a component
+    with rows that lose heat (L1 < 0, next to a Dirichlet boundary) π solves πᵀL = −q instead, where q ≥ 0 is what the
+    areas lose there, the positive part of −aᵀL in the columns of those rows.
     """
     area = areas.numpy()
     weighted = sparse.diags_array(area) @ matrix
@@ -129,11 +138,15 @@ def left_null_vector(
         ) from error
     count, component = csgraph.connected_components(matrix, directed=True, connection="weak")
     total = np.bincount(component, area, minlength=count)
+    losing = np.abs(matrix.sum(axis=1)) > LOSS * np.abs(matrix.diagonal())
+    lost = losing * np.maximum(-(matrix.T @ area), 0)
+    lossless = np.bincount(component, losing, minlength=count) == 0
     density = np.ones(len(area))
     for _ in range(4):
-        density = lu.solve(area * density)
-        # Each component has its own null vector, with its own scale and sign.
-        density *= (total / np.bincount(component, area * density, minlength=count))[component]
+        density = -lu.solve(lost + shift * area * density)
+        # Each component without a loss has its own null vector, with its own scale and sign.
+        share = total / np.bincount(component, area * density, minlength=count)
+        density *= np.where(lossless, share, 1.0)[component]
     return torch.from_numpy(area * density), component
 
 
@@ -182,7 +195,7 @@ def check_certificate(
     max_s, feed = np.nan, torch.zeros(len(areas), 0)
     if smallest > 0:
         max_s, feed = dissipation(matrix, mass)
-    holds = smallest > 0 and feed.shape[1] == 0
+    holds = smallest > POSITIVE and feed.shape[1] == 0
     result = Certificate(holds, smallest, max_s, rounds, stepped, int(component.max()) + 1)
     return mass, result, feed
 
@@ -209,25 +222,34 @@ def certify(
             mass, result, feed = check_certificate(matrix, areas, rounds, stepped)
             bar.set_postfix_str(f"min π {result.min_pi:.2g}, {stepped} rows down", refresh=False)
             bar.update()
-            blamed = _responsible(matrix, mass / areas, feed)
-            movable = blamed[rows.rung[blamed] < len(ladder.rungs)]
+            free = rows.rung < len(ladder.rungs)
+            blamed = _responsible(matrix, mass / areas, feed, free)
+            movable = blamed[free[blamed]]
+            if len(movable) == 0 and not result.holds:
+                blamed = _around(matrix, blamed)
+                movable = blamed[free[blamed]]
             if len(movable) == 0 or rounds == MAX_ROUNDS:
                 break
             rounds += 1
             steps[movable] += 1
-            rows = _step_down(ladder, rows, movable, steps[movable], first)
+            steps[movable] += 64 * (rounds > PATIENCE)
+            rows = _step_down(ladder, rows, movable, steps[movable].clamp_max(16), first)
     if not result.holds:
         _warn(result, mass / areas, feed)
     return rows, mass, result
 
 
 def _responsible(
-    matrix: sparse.csr_array, density: Float[Tensor, " N"], feed: Float[Tensor, "N k"]
+    matrix: sparse.csr_array,
+    density: Float[Tensor, " N"],
+    feed: Float[Tensor, "N k"],
+    free: Bool[Tensor, " N"],
 ) -> Int[Tensor, " J"]:
     """Rows to step down.
 
-    Where π is small: the point's own row and those with a negative weight into it, unless slight. Where S fails: the
-    rows that feed its positive eigenvalues.
+    Where π is small: the point's own row and those with a negative weight into it, unless slight. Also the
+    points of its row if that is at the bottom already, since they may leave it out of theirs, as on both sides of a
+    crease. Where S fails: the rows that feed its positive eigenvalues.
     """
     blamed = (feed > FEED_SHARE * feed.amax(0)).any(1) if feed.shape[1] else density.isnan()
     small = (density <= MARGIN).numpy()
@@ -239,7 +261,16 @@ def _responsible(
         heavy = (columns.data < WEIGHT_SHARE * worst[col]) & (columns.data < 0)
         blamed[torch.from_numpy(row[heavy].astype(np.int64))] = True
         blamed |= torch.from_numpy(small)
+        starved = np.flatnonzero(small & ~free.numpy())
+        blamed[torch.from_numpy(np.unique(matrix[starved].indices).astype(np.int64))] = True
     return blamed.nonzero()[:, 0]
+
+
+def _around(matrix: sparse.csr_array, rows: Int[Tensor, " J"]) -> Int[Tensor, " K"]:
+    """Rows that share an entry with the given ones, where those are at the bottom: they are symmetric only together."""
+    inward = sparse.csc_array(matrix)[:, rows.numpy()].indices
+    joined = np.concatenate([matrix[rows.numpy()].indices, inward])
+    return torch.from_numpy(np.unique(joined).astype(np.int64))
 
 
 def _step_down(ladder: Ladder, rows: Rows, movable: Tensor, steps: Tensor, first: Tensor) -> Rows:

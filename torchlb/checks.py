@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import operator
+import warnings
 from typing import Any
 
 import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
+from scipy.spatial import KDTree
 from torch import Tensor
 
 from torchlb.polynomials import num_monomials
@@ -18,8 +21,16 @@ __all__ = [
     "check_normals",
     "check_options",
     "check_points",
+    "check_scale",
     "clean_mesh",
+    "warn_of_coincident",
 ]
+
+
+MAX_EXTENT = 1e70
+"""Largest extent of the points, and the inverse of the smallest: fourth powers of it must stay finite."""
+COINCIDENT = 1e-12
+"""Points closer than this share of the largest coordinate are one point: their difference is rounding."""
 
 
 def _some(index: Tensor, limit: int = 8) -> str:
@@ -51,16 +62,46 @@ def check_points(points: Any, what: str = "points") -> Float[Tensor, "N n"]:
     return points
 
 
+def check_scale(points: Float[Tensor, "N n"]) -> None:
+    """ValueError if the points extend so far, or so little, that 1/ℓ² leaves the range of numbers."""
+    extent = float((points - points[0]).abs().max())
+    if len(points) > 1 and not 1 / MAX_EXTENT < extent < MAX_EXTENT:
+        raise ValueError(
+            f"points: they extend over {extent:.3g}, and 1/ℓ² of that leaves the range of numbers; "
+            "rescale them to an extent near 1"
+        )
+
+
+def _twins(points: Float[Tensor, "N n"]) -> tuple[Int[Tensor, " N"], Int[Tensor, " T"]]:
+    """(nearest other point of each, indices of those whose nearest is in the same place to rounding)."""
+    distance, nearest = KDTree(points.numpy()).query(points.numpy(), k=min(2, len(points)))
+    distance = torch.from_numpy(distance).view(len(points), -1)[:, -1]
+    index = torch.arange(len(points))
+    nearest = torch.from_numpy(nearest).view(len(points), -1)
+    other = torch.where(nearest[:, 0] == index, nearest[:, -1], nearest[:, 0])
+    close = (distance <= COINCIDENT * points.abs().max()) & (other != index)
+    return other, close.nonzero()[:, 0]
+
+
 def check_distinct(points: Float[Tensor, "N n"]) -> None:
     """ValueError that names points which coincide."""
-    _, place, count = torch.unique(points, dim=0, return_inverse=True, return_counts=True)
-    bad = (count[place] > 1).nonzero()[:, 0]
+    other, bad = _twins(points)
     if len(bad):
-        first = int(bad[0])
-        twins = (place == place[first]).nonzero()[:, 0]
+        pair = sorted((int(bad[0]), int(other[bad[0]])))
         raise ValueError(
-            f"points: {len(bad)} points share a place with another, such as {_some(twins)} "
-            f"(all: {_some(bad)}); remove duplicates, for example with torch.unique(points, dim=0)"
+            f"points: {len(bad)} points share a place with another, such as {pair[0]}, {pair[1]} (all: {_some(bad)}); "
+            "remove duplicates, for example with torch.unique(points.round(decimals=9), dim=0)"
+        )
+
+
+def warn_of_coincident(vertices: Float[Tensor, "N n"]) -> None:
+    """UserWarning if vertices of a mesh coincide, as in STL files: the surface is cut open there."""
+    _, bad = _twins(vertices)
+    if len(bad):
+        warnings.warn(
+            f"vertices: {len(bad)} share a place with another ({_some(bad)}), so the mesh is cut open along them; if "
+            "it should not be, merge them first, for example with trimesh.Trimesh(vertices, faces).merge_vertices()",
+            stacklevel=4,
         )
 
 
@@ -160,6 +201,13 @@ def check_boundary(boundary: Any, num_points: int) -> Bool[Tensor, " N"] | str |
     return mask
 
 
+def _check_integer(name: str, number: Any) -> None:
+    try:
+        operator.index(number)
+    except TypeError as error:
+        raise ValueError(f"{name}: expected an integer, got {number!r}") from error
+
+
 def check_options(
     num_points: int,
     ambient_dim: int,
@@ -173,6 +221,9 @@ def check_options(
     for name, (value, allowed) in choices.items():
         if value not in allowed:
             raise ValueError(f"{name}: expected one of {allowed}, got {value!r}")
+    numbers = {"dim": dim, "order": order, "normal_order": normal_order}
+    for name, number in {**numbers, "num_neighbors": num_neighbors or 0}.items():
+        _check_integer(name, number)
     if not 1 <= dim <= ambient_dim:
         raise ValueError(
             f"dim: expected 1 … {ambient_dim} for points in R^{ambient_dim}, got {dim}"
@@ -188,6 +239,10 @@ def check_options(
         raise ValueError(
             f"num_neighbors: order {order} in {dim} dimensions has {needed} polynomials and needs at least as many "
             f"neighbours (1.6 times as many, {-(-16 * needed // 10)}, is the default); got {num_neighbors}"
+        )
+    if num_neighbors is not None and num_neighbors > num_points:
+        raise ValueError(
+            f"num_neighbors: {num_neighbors} are more than the {num_points} points; lower it, or leave it out"
         )
     if num_points < needed:
         fits = [p for p in range(1, order) if num_monomials(dim, p + 1) <= num_points]

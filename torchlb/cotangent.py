@@ -33,8 +33,9 @@ def cotangent_laplacian(
     corners = np.ascontiguousarray(faces.numpy().astype(np.int64))
     weak = sparse.csr_array(igl.cotmatrix(points, corners))
     area = igl.massmatrix(points, corners, igl.MASSMATRIX_TYPE_VORONOI).diagonal()
-    if (area <= 0).any():
-        bad = np.flatnonzero(area <= 0)[:5].tolist()
+    usable = area > 0  # False for NaN as well
+    if not usable.all():
+        bad = np.flatnonzero(~usable)[:5].tolist()
         raise ValueError(
             f"cotangent operator: vertices {bad} have no area (all their triangles are degenerate); "
             "remove or merge them, or use LaplaceBeltrami.from_mesh, which accepts degenerate triangles"

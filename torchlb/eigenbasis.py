@@ -14,8 +14,8 @@ class Eigenbasis:
 
     Attributes
     ----------
-    eigenvalues : (k,), 1/ℓ², ≥ 0 and ascending, exactly 0 once for every connected component; (S, k) for a batch of S
-        shapes, each with its own.
+    eigenvalues : (k,), 1/ℓ², ≥ 0 and ascending, exactly 0 once for every connected component (but one with a Dirichlet
+        boundary); (S, k) for a batch of S shapes, each with its own.
     eigenvectors : Φ, (N, k), ΦᵀΠΦ = I; the first is constant. For a batch, those of each shape on its own rows; a
         shape of fewer than k points has zero columns at the end.
     mass : π, (N,), ℓ^d.

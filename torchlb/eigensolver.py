@@ -20,7 +20,7 @@ from scipy.sparse import csgraph
 from scipy.sparse.linalg import ArpackError, LinearOperator, eigs, eigsh
 from torch import Tensor
 
-from torchlb.certificate import factorized, left_null_vector
+from torchlb.certificate import LOSS, factorized, left_null_vector
 from torchlb.eigenbasis import Eigenbasis, stack_eigenbases
 from torchlb.stencil import StencilError
 
@@ -62,14 +62,14 @@ class _Part:
     index: np.ndarray
     matrix: sparse.csr_array
     root: np.ndarray
-    null_left: np.ndarray
+    null_left: np.ndarray | None  # None where heat is lost, and there are no constants
     right: tuple[np.ndarray, np.ndarray]
     left: tuple[np.ndarray, np.ndarray]
     symmetric: bool
 
     @property
     def complete(self) -> bool:
-        return len(self.right[0]) == len(self.index) - 1
+        return len(self.right[0]) == len(self.index) - (self.null_left is not None)
 
 
 def solve_eigenbasis(
@@ -79,7 +79,8 @@ def solve_eigenbasis(
 
     Parameters
     ----------
-    matrix : Δ, (N, N), of either kind; its rows sum to zero up to `rounding`, relative, which is removed.
+    matrix : Δ, (N, N), of either kind. Its rows sum to zero up to `rounding`, relative, which is removed, or lose heat
+        (next to a Dirichlet boundary).
     mass : inner product; π of the certificate, or the mass of a symmetric operator.
     k : number of pairs; all N if there are fewer.
 
@@ -89,27 +90,35 @@ def solve_eigenbasis(
     """
     a = -sparse.csr_array(matrix, dtype=np.float64, copy=True)
     a.eliminate_zeros()
-    a = sparse.csr_array(a - sparse.diags_array(a.sum(axis=1)))
+    total = a.sum(axis=1)
+    losing = np.abs(total) > max(LOSS, 64 * rounding) * np.abs(a.diagonal())
+    a = sparse.csr_array(a - sparse.diags_array(np.where(losing, 0.0, total)))
     pi = mass.detach().cpu().double().numpy()
     count, component = csgraph.connected_components(a, directed=True, connection="weak")
+    lossy = np.bincount(component, losing, minlength=count) > 0
     null_left = pi.copy()
-    if np.abs(pi @ a).max() > 1e-11 * (pi @ abs(a)).max():
+    flow = np.where(lossy[component], 0.0, pi @ a)
+    if np.abs(flow).max() > 1e-11 * (pi @ abs(a)).max():
         null_left = left_null_vector(sparse.csr_array(-a), torch.from_numpy(pi.copy()))[0].numpy()
-    wanted = max(min(k, len(pi)) - count, 0)
+    wanted = max(min(k, len(pi)) - int((~lossy).sum()), 0)
     tolerance = max(SYMMETRY, 8 * rounding)
     parts = []
     for c in range(count):
         index = np.flatnonzero(component == c)
-        parts.append(
-            _part(a[index][:, index], index, pi[index], null_left[index], wanted, tolerance)
-        )
+        null = None if lossy[c] else null_left[index]
+        parts.append(_part(a[index][:, index], index, pi[index], null, wanted, tolerance))
     cut = _cut(parts, wanted)
     solved = [_ritz(part, cut) for part in parts]
     return _merged(parts, solved, pi, min(k, len(pi)))
 
 
 def _part(
-    a: Any, index: np.ndarray, mass: np.ndarray, null: np.ndarray, wanted: int, tolerance: float
+    a: Any,
+    index: np.ndarray,
+    mass: np.ndarray,
+    null: np.ndarray | None,
+    wanted: int,
+    tolerance: float,
 ) -> _Part:
     """Scale one component and find its slow eigenvectors, right and left."""
     root = np.sqrt(mass)
@@ -117,14 +126,16 @@ def _part(
     skew = scaled - scaled.T
     symmetric = bool(skew.nnz == 0 or abs(skew).max() <= tolerance * abs(scaled).max())
     if symmetric:
-        scaled, null = sparse.csr_array((scaled + scaled.T) / 2), mass
-    left_null = null / root
-    left_null /= left_null @ root
+        scaled = sparse.csr_array((scaled + scaled.T) / 2)
+    left_null = None
+    if null is not None:
+        left_null = root.copy() if symmetric else null / root
+        left_null /= left_null @ root
     size = len(index)
-    if wanted == 0 or size == 1:
+    if wanted == 0 or size <= (left_null is not None):
         right = left = (np.zeros(0), np.zeros((size, 0)))
     elif size <= DENSE or 2 * wanted >= size:
-        right, left = _dense(scaled.toarray(), symmetric)
+        right, left = _dense(scaled.toarray(), symmetric, left_null is not None)
     else:
         right, left = _inverted(scaled, root, left_null, wanted, symmetric)
     return _Part(index, scaled, root, left_null, right, left, symmetric)
@@ -133,11 +144,11 @@ def _part(
 Pairs = tuple[np.ndarray, np.ndarray]
 
 
-def _dense(a: np.ndarray, symmetric: bool) -> tuple[Pairs, Pairs]:
-    """All eigenpairs but the null vector, slowest first, of A and of its transpose."""
+def _dense(a: np.ndarray, symmetric: bool, singular: bool) -> tuple[Pairs, Pairs]:
+    """All eigenpairs but a null vector, slowest first, of A and of its transpose."""
 
     def ordered(values: np.ndarray, vectors: np.ndarray) -> Pairs:
-        order = np.argsort(np.abs(values), kind="stable")[1:]
+        order = np.argsort(np.abs(values), kind="stable")[int(singular) :]
         return values[order], vectors[:, order]
 
     if symmetric:
@@ -147,10 +158,12 @@ def _dense(a: np.ndarray, symmetric: bool) -> tuple[Pairs, Pairs]:
 
 
 def _inverted(
-    a: sparse.csr_array, right: np.ndarray, left: np.ndarray, wanted: int, symmetric: bool
+    a: sparse.csr_array, right: np.ndarray, left: np.ndarray | None, wanted: int, symmetric: bool
 ) -> tuple[Pairs, Pairs]:
-    """Slow eigenpairs by Arnoldi on the inverse; the null vectors are projected out on both sides."""
+    """Slow eigenpairs by Arnoldi on the inverse; null vectors, if `left` is one, are projected out on both sides."""
     size = len(right)
+    if left is None:
+        right = left = np.zeros(size)
     shift = SHIFT * float(np.median(a.diagonal()))
     try:
         lu = factorized(sparse.csc_array(a + shift * sparse.eye_array(size)), 1e-2)
@@ -218,7 +231,8 @@ def _ritz(part: _Part, cut: float) -> Solved:
     """Rayleigh–Ritz on one component: (eigenvalues, Φ, W, rates, mixing) in its scaled coordinates, zero first."""
     zero = part.root / linalg.norm(part.root)
     u = _real_span(part.right, cut)
-    u = np.linalg.qr(u - zero[:, None] * (zero @ u))[0]
+    closed = part.null_left is not None
+    u = np.linalg.qr(u - zero[:, None] * (zero @ u))[0] if closed else u
     h = u.T @ (part.matrix @ u)
     values, q = linalg.eigh((h + h.T) / 2) if u.shape[1] else (np.zeros(0), np.zeros((0, 0)))
     if (values <= 0).any():
@@ -229,11 +243,12 @@ def _ritz(part: _Part, cut: float) -> Solved:
     u = u @ q
     if u.size:
         u *= np.sign(u[np.abs(u).argmax(0), np.arange(u.shape[1])])
-    phi = np.column_stack([zero, u])
-    values = np.append(0.0, values)
-    if part.symmetric:
+    phi, z = u, _real_span(part.left, cut)
+    if part.null_left is not None:
+        phi, z = np.column_stack([zero, u]), np.column_stack([part.null_left, z])
+        values = np.append(0.0, values)
+    if part.symmetric or phi.shape[1] == 0:
         return values, phi, phi, np.stack([values, 0 * values]), _plain_mixing(len(values))
-    z = np.column_stack([part.null_left, _real_span(part.left, cut)])
     overlap = phi.T @ z if z.shape == phi.shape else np.zeros((1, 1))
     if linalg.svdvals(overlap)[-1] < 1e-8 * linalg.svdvals(overlap)[0]:
         raise StencilError(
@@ -241,7 +256,10 @@ def _ritz(part: _Part, cut: float) -> Solved:
             "points: the cut falls into a cluster; ask for a few more or fewer"
         )
     w = z @ linalg.inv(overlap)
-    rates, mixing = _exact_modes(w.T @ (part.matrix @ phi))
+    b = w.T @ (part.matrix @ phi)
+    if closed:
+        b[:, 0] = 0.0  # constants, exactly
+    rates, mixing = _exact_modes(b)
     return values, phi, w, rates, mixing
 
 
@@ -254,7 +272,6 @@ def _exact_modes(b: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
     For a pair α ± iβ with p ± iq: B[p q] = [p q](α + βJ'), so e^{−tB} turns [p q] by βt while it shrinks by e^{−αt}.
     """
-    b[:, 0] = 0.0  # constants, exactly
     values, vectors = np.linalg.eig(b)
     real, imag = np.real(values), np.imag(values)
     first, second = np.flatnonzero(imag > 0), np.flatnonzero(imag < 0)
@@ -272,7 +289,8 @@ def _exact_modes(b: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 def _merged(parts: list[_Part], solved: list[Solved], pi: np.ndarray, k: int) -> Eigenbasis:
     """The components side by side: their constants recombined so that the first is global, the rest ascending."""
-    count = len(parts)
+    closed_parts = np.array([part.null_left is not None for part in parts])
+    count = int(closed_parts.sum())
     sizes = [len(s[0]) for s in solved]
     start = np.cumsum([0, *sizes])
     total = int(start[-1])
@@ -284,16 +302,19 @@ def _merged(parts: list[_Part], solved: list[Solved], pi: np.ndarray, k: int) ->
         phi[part.index, place] = f / part.root[:, None]
         left[part.index, place] = w * part.root[:, None]
         mixing[:, place, place] = m
-    order = np.concatenate([start[:-1], np.setdiff1d(np.arange(total), start[:-1])])
+    zeros = start[:-1][closed_parts]
+    order = np.concatenate([zeros, np.setdiff1d(np.arange(total), zeros)])
     order[count:] = order[count:][np.argsort(values[order[count:]], kind="stable")]
     values, phi, left = values[order], phi[:, order], left[:, order]
     v, others = mixing[0][order], mixing[1:, :, order]
-    root = np.sqrt(np.array([(part.root**2).sum() for part in parts]))
-    t = np.linalg.qr(np.column_stack([root, np.eye(count)[:, : count - 1]]))[0]
-    t *= np.sign(t[0, 0])
-    phi[:, :count], left[:, :count] = phi[:, :count] @ t, left[:, :count] @ t
-    v[:count], others[:, :, :count] = t.T @ v[:count], others[:, :, :count] @ t
-    phi[:, 0] = 1 / np.sqrt(pi.sum())
+    if count:
+        closed_index = [part.index for part in parts if part.null_left is not None]
+        root = np.sqrt(np.array([pi[index].sum() for index in closed_index]))
+        t = np.linalg.qr(np.column_stack([root, np.eye(count)[:, : count - 1]]))[0]
+        t *= np.sign(t[0, 0])
+        phi[:, :count], left[:, :count] = phi[:, :count] @ t, left[:, :count] @ t
+        v[:count], others[:, :, :count] = t.T @ v[:count], others[:, :, :count] @ t
+        phi[np.concatenate(closed_index), 0] = 1 / linalg.norm(root)
     closed: dict[str, Any] = {}
     if count <= k and np.isfinite(mixing).all():
         closed = {

@@ -59,6 +59,10 @@ class CloudFallback:
 
     def areas(self) -> Float[Tensor, " N"]:
         """Volumes of the Voronoi cells, ℓ^d: second order in the spacing."""
+        return self._volumes
+
+    @cached_property
+    def _volumes(self) -> Float[Tensor, " N"]:
         volumes = []
         for centers in torch.arange(len(self.balls.points)).split(4096):
             _, coords, valid = self._cells(centers)
@@ -71,6 +75,27 @@ class CloudFallback:
 
     def rows(self, centers: Int[Tensor, " B"]) -> sparse.csr_array:
         """Rows (B, N) of Δ, 1/ℓ²."""
+        return sparse.csr_array(self._matrix[centers.numpy()])
+
+    @cached_property
+    def _matrix(self) -> sparse.csr_array:
+        """All rows, W/m less its sums, with m the volumes and W the mean of what both ends make of the flux.
+
+        So the rows of last resort alone are an M-matrix, symmetric in m. A flux that one end alone knows is its own.
+        """
+        parts = [self._one_sided(part) for part in torch.arange(len(self._volumes)).split(4096)]
+        volumes = np.concatenate([volume for volume, _ in parts])
+        rows = sparse.vstack([row for _, row in parts], format="csr")
+        flux = sparse.csr_array(sparse.diags_array(volumes) @ rows)
+        flux = sparse.csr_array(flux - sparse.diags_array(flux.diagonal()))
+        flux.eliminate_zeros()
+        ends = flux.astype(bool).astype(float)
+        flux = (flux + flux.T).multiply((ends + ends.T).power(-1))
+        flux = flux - sparse.diags_array(flux.sum(axis=1))
+        return sparse.csr_array(sparse.diags_array(1 / volumes) @ flux)
+
+    def _one_sided(self, centers: Int[Tensor, " B"]) -> tuple[np.ndarray, sparse.csr_array]:
+        """Volumes and rows as each point by itself would have them."""
         index, coords, valid = self._cells(centers)
         flux = cell_laplacian(coords, valid)
         weights = torch.cat([-flux.sum(1, keepdim=True), flux], dim=1)
@@ -78,15 +103,17 @@ class CloudFallback:
         shape = (len(centers), len(self.balls.points))
         cells = sparse.csr_array((weights.flatten(), (row, index.flatten())), shape=shape)
         cells.sum_duplicates()
+        volumes = self._volumes[centers].numpy()
         if not self.surface or len(self.balls.points) < 4:
-            return cells
-        matrix, reachable = self._robust
+            return volumes, cells
+        matrix, areas, reachable = self._robust
         robust = sparse.csr_array(matrix[centers.numpy()])
         joined = robust.astype(bool)
         near = joined.multiply(reachable[centers.numpy()])
         clean = (near.sum(axis=1) == joined.sum(axis=1)) & (joined.sum(axis=1) > 1)
         ours, theirs = (sparse.diags_array(rows.astype(float)) for rows in (~clean, clean))
-        return sparse.csr_array(ours @ cells + theirs @ robust)
+        volumes = np.where(clean, areas[centers].numpy(), volumes)
+        return volumes, sparse.csr_array(ours @ cells + theirs @ robust)
 
     def _cells(
         self, centers: Int[Tensor, " B"]
@@ -113,8 +140,8 @@ class CloudFallback:
         return nearest_neighbors(self.balls.points, self.few)
 
     @cached_property
-    def _robust(self) -> tuple[sparse.csr_array, sparse.csr_array]:
-        """Rows of robust_laplacian, and who can be reached in a few hops between close or admissible neighbours."""
+    def _robust(self) -> tuple[sparse.csr_array, Tensor, sparse.csr_array]:
+        """Rows and areas of robust_laplacian, and who is a few hops between close or admissible neighbours away."""
         points = self.balls.points
         close = self._nearest[:, : self.balls.frames.shape[-1] + 1]
         row = np.arange(len(points)).repeat(close.shape[1])
@@ -124,4 +151,4 @@ class CloudFallback:
         reach = step
         for _ in range(MAX_HOPS - 1):
             reach = reach @ step
-        return robust_rows(points, None)[0], reach
+        return *robust_rows(points, None), reach

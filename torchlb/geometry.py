@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -19,13 +19,13 @@ from torchlb.neighbors import (
     nearest_graph,
     nearest_neighbors,
 )
+from torchlb.orientation import consistently_wound, nearest_pairs, orient_normals, thin_sides
 from torchlb.tangent import (
     cloud_frames,
     complete_frames,
     face_normals,
     mesh_frames,
     normals_of_frames,
-    orient_by_graph,
     refine_frames,
 )
 
@@ -45,6 +45,7 @@ class Geometry:
     frames : (N, n, d), orthonormal; [frames, normal] is right-handed where there is a normal.
     normals : (N, n) unit normals of a hypersurface, else None. Oriented by the faces, or consistently on a cloud.
     normal_order : (N,), the degree q of the fit behind each frame; 0 for a frame that stayed poor.
+    sides : (N, n), those normals where the shape is thin, zero elsewhere, see `thin_sides`; None without normals.
     graph : (N, N) adjacency whose balls are the neighbourhoods.
     areas : (N,), ℓ^d, positive: a first-order share of the area.
     fallback : M-matrix rows for points without a stencil.
@@ -54,6 +55,7 @@ class Geometry:
     points: Float[Tensor, "N n"]
     frames: Float[Tensor, "N n d"]
     normals: Float[Tensor, "N n"] | None
+    sides: Float[Tensor, "N n"] | None
     normal_order: Int[Tensor, " N"]
     graph: sparse.csr_array
     areas: Float[Tensor, " N"]
@@ -69,24 +71,30 @@ def cloud_geometry(
     num_neighbors: int | None = None,
     normals: Float[Tensor, "N n"] | None = None,
     boundary: Bool[Tensor, " N"] | str | None = None,
+    condition: str = "neumann",
     progress: bool = True,
 ) -> Geometry:
     """Geometry of a point cloud: graph and frames from the nearest neighbours.
 
-    `boundary` is the mask of its boundary points, or "detect".
+    `boundary` is the mask of its boundary points, or "detect"; `condition` what holds there.
     """
     candidates = nearest_neighbors(points, min(CANDIDATES.get(dim, 128), len(points)))
     poor = cloud_frames(points, candidates, dim) if normals is None else complete_frames(normals)
     graph = nearest_graph(points, poor, candidates)
-    frames, order = _refined(points, poor, graph, normal_order, num_neighbors, progress)
-    reference = normals
-    if reference is None and dim == points.shape[1] - 1:
-        reference = orient_by_graph(points, normals_of_frames(frames), graph)
-    balls = GraphBalls(points, graph, frames)
+    sides = None
+    if dim == points.shape[1] - 1:
+        pairs = nearest_pairs(candidates)
+        oriented = orient_normals(points, normals_of_frames(poor), pairs)
+        normals = oriented if normals is None else normals
+        sides = thin_sides(points, oriented, pairs)
+    balls = GraphBalls(points, graph, poor, sides)
+    frames, order = _refined(balls, normal_order, num_neighbors, progress)
+    balls = GraphBalls(points, graph, frames, _follow(sides, frames))
     mask = detect_boundary(points, frames, balls) if isinstance(boundary, str) else boundary
     rim = None if mask is None else boundary_of_cloud(points, mask, frames, normal_order)
     fallback = CloudFallback(balls, rim, surface=dim == 2 and points.shape[1] <= 3)
-    return _oriented(points, frames, reference, order, graph, fallback, rim)
+    rim = None if rim is None else replace(rim, condition=condition)
+    return _oriented(balls, normals, order, fallback, rim)
 
 
 def mesh_geometry(
@@ -95,39 +103,55 @@ def mesh_geometry(
     normal_order: int,
     *,
     num_neighbors: int | None = None,
-    boundary: bool = True,
+    boundary: str | None = "neumann",
     progress: bool = True,
 ) -> Geometry:
     """Geometry of a mesh of triangles (or of segments, or tetrahedra in Rⁿ): graph and frames from the faces.
 
-    Its boundary is found unless `boundary` is False.
+    `boundary` is the condition on its boundary; None leaves it alone.
     """
     poor = mesh_frames(vertices, faces)
     graph = mesh_graph(faces, len(vertices))
-    frames, order = _refined(vertices, poor, graph, normal_order, num_neighbors, progress)
-    hypersurface = faces.shape[1] == vertices.shape[1]
-    reference = face_normals(vertices, faces) if hypersurface else None
+    reference = sides = None
+    if faces.shape[1] == vertices.shape[1] and faces.shape[1] < 4:
+        reference = face_normals(vertices, faces)
+        if consistently_wound(faces):
+            candidates = nearest_neighbors(vertices, min(CANDIDATES[2], len(vertices)))
+            sides = thin_sides(
+                vertices, torch.nn.functional.normalize(reference), nearest_pairs(candidates)
+            )
+    balls = GraphBalls(vertices, graph, poor, sides)
+    frames, order = _refined(balls, normal_order, num_neighbors, progress)
+    balls = GraphBalls(vertices, graph, frames, _follow(sides, frames))
     rim = boundary_of_mesh(vertices, faces, frames, normal_order) if boundary else None
     if faces.shape[1] == 3 and vertices.shape[1] <= 3:
         fallback = MeshFallback(vertices, faces)
     else:
-        fallback = CloudFallback(GraphBalls(vertices, graph, frames), rim, surface=False)
-    return _oriented(vertices, frames, reference, order, graph, fallback, rim)
+        fallback = CloudFallback(balls, rim, surface=False)
+    rim = None if rim is None or boundary is None else replace(rim, condition=boundary)
+    return _oriented(balls, reference, order, fallback, rim)
+
+
+def _follow(sides: Tensor | None, frames: Tensor) -> Tensor | None:
+    """The sides by the normals of the refined frames, where they were set."""
+    if sides is None:
+        return None
+    return _turned(normals_of_frames(frames), sides) * (sides != 0).any(1, keepdim=True)
+
+
+def _turned(normals: Tensor, reference: Tensor) -> Tensor:
+    """The normals, on the side of `reference`."""
+    return torch.where(((normals * reference).sum(1) < 0)[:, None], -normals, normals)
 
 
 def _refined(
-    points: Tensor,
-    poor: Tensor,
-    graph: sparse.csr_array,
-    degree: int,
-    num_neighbors: int | None,
-    progress: bool,
+    balls: GraphBalls, degree: int, num_neighbors: int | None, progress: bool
 ) -> tuple[Tensor, Tensor]:
-    """Frames of order q, in chunks; the poor ones if q = 0 or in a flat space."""
+    """Frames of order q, in chunks; the poor ones of `balls` if q = 0 or in a flat space."""
+    points, poor = balls.points, balls.frames
     if degree == 0 or poor.shape[1] == poor.shape[2]:
         return poor, torch.full((len(points),), degree)
     rungs = ladder_rungs(poor.shape[-1], range(degree, 0, -1), num_neighbors=num_neighbors)
-    balls = GraphBalls(points, graph, poor)
     parts = chunks(len(points), rungs, poor.shape[-1])
     bar = tqdm(parts, "tangent frames", delay=2, disable=not progress, leave=False)
     frames, order = zip(
@@ -137,23 +161,21 @@ def _refined(
 
 
 def _oriented(
-    points: Tensor,
-    frames: Tensor,
+    balls: GraphBalls,
     reference: Tensor | None,
     order: Tensor,
-    graph: sparse.csr_array,
     fallback: CloudFallback | MeshFallback,
     boundary: Boundary | None,
 ) -> Geometry:
     """Turn normals to the side of `reference`, and frames so that [frames, normal] is right-handed."""
+    points, frames = balls.points, balls.frames
     normals = None
     if frames.shape[-1] == points.shape[1] - 1:
-        normals = normals_of_frames(frames)
-        if reference is not None:
-            flip = (normals * reference).sum(-1) < 0
-            normals = torch.where(flip[:, None], -normals, normals)
-            frames = torch.where(
-                flip[:, None, None], torch.cat([-frames[..., :1], frames[..., 1:]], -1), frames
-            )
+        righthanded = normals_of_frames(frames)
+        normals = righthanded if reference is None else _turned(righthanded, reference)
+        hand = (normals * righthanded).sum(1)[:, None, None].sign()
+        frames = torch.cat([hand * frames[..., :1], frames[..., 1:]], -1)
     areas = fallback.areas()
-    return Geometry(points, frames, normals, order, graph, areas, fallback, boundary)
+    return Geometry(
+        points, frames, normals, balls.sides, order, balls.graph, areas, fallback, boundary
+    )

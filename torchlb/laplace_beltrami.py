@@ -60,6 +60,7 @@ class LaplaceBeltrami(OperatorStorage):
         num_neighbors: int | None = None,
         normals: Any = None,
         boundary: Any = None,
+        condition: str = "neumann",
         certify: bool = True,
         progress: bool = True,
     ) -> LaplaceBeltrami:
@@ -76,8 +77,10 @@ class LaplaceBeltrami(OperatorStorage):
         weights : "least_squares" (robust) or "polyharmonic" (more accurate at high order on evenly spread points).
         num_neighbors : size K of every stencil, itself included, instead of the sizes of the ladder.
         normals : (N, n), if known (d = n − 1): the first guess of the tangent frames, and their orientation.
-        boundary : (N,) mask of the points on the boundary, or "detect" (surfaces), for the Neumann condition ∂_ν f = 0
-            there; None for a closed shape, or to do without a condition.
+        boundary : (N,) mask of the points on the boundary, or "detect" (surfaces); None for a closed shape, or to do
+            without a condition.
+        condition : there: "neumann", ∂_ν f = 0, or "dirichlet", f = 0. With the latter the values of f at boundary
+            points are not used elsewhere, and have rows of their own, −4d f/h² with h the distance to the nearest.
         certify : whether rows step down until the certificate of stability holds, whose π is then the mass. Without
             it the operator is the raw one, which may blow up under diffusion, and the mass is that of Voronoi cells.
         progress : whether to show a bar on what takes longer than two seconds.
@@ -89,7 +92,13 @@ class LaplaceBeltrami(OperatorStorage):
         """
         options = Options(order, normal_order, projection, weights, num_neighbors, certify)
         built = build_cloud(
-            points, dim, options, normals=normals, boundary=boundary, progress=progress
+            points,
+            dim,
+            options,
+            normals=normals,
+            boundary=boundary,
+            condition=condition,
+            progress=progress,
         )
         return cls._of(built, points)
 
@@ -115,7 +124,8 @@ class LaplaceBeltrami(OperatorStorage):
         vertices : (N, n) tensor or array, length ℓ.
         faces : (F, 3) indices. Any triangle mesh: several components, non-manifold edges, zero-area triangles.
             Also (F, 2) polylines and (F, 4) tetrahedra, for manifolds of dimension 1 and 3.
-        boundary : "neumann" for ∂_ν f = 0 on the boundary that the faces have, if any; None to do without a condition.
+        boundary : "neumann" for ∂_ν f = 0 on the boundary that the faces have, if any, or "dirichlet" for f = 0, see
+            `condition` of `from_points`; None to do without a condition.
         order, normal_order, projection, weights, num_neighbors, certify, progress : as for `from_points`.
 
         Raises
@@ -212,6 +222,8 @@ class LaplaceBeltrami(OperatorStorage):
 
     def _apply_rows(self, values: Tensor, f: Tensor) -> Tensor:
         """The product with one set of values on the pattern, for any layout of f."""
+        if not isinstance(f, Tensor):
+            raise TypeError(f"expected f as a tensor, got {type(f)}; torch.as_tensor(f) makes one")
         if f.ndim == 1:
             return self._apply_rows(values, f[:, None])[:, 0]
         if not (f.ndim in (2, 3) and f.shape[-2] == self.num_points):

@@ -141,6 +141,7 @@ class GraphBalls:
     points : (N, n), length ℓ.
     graph : (N, N) symmetric adjacency, from `mesh_graph` or `nearest_graph`.
     frames : (N, n, d) tangent frames that decide admission.
+    sides : (N, n) from `thin_sides`: also refused is a point on the other side of a thin shape. None if not known.
     """
 
     def __init__(
@@ -148,10 +149,12 @@ class GraphBalls:
         points: Float[Tensor, "N n"],
         graph: sparse.csr_array,
         frames: Float[Tensor, "N n d"],
+        sides: Float[Tensor, "N n"] | None = None,
     ) -> None:
         self.points = points
         self.graph = graph
         self.frames = frames
+        self.sides = sides
 
     def __call__(
         self, centers: Int[Tensor, " B"], size: int
@@ -175,6 +178,14 @@ class GraphBalls:
         index[local[kept], rank[kept]] = others[kept]
         return index, total.clamp_max(size)
 
+    def _admissible(
+        self, centers: Int[Tensor, " P"], others: Int[Tensor, " P"]
+    ) -> Bool[Tensor, " P"]:
+        good = admissible(self.points, self.frames, centers, others)
+        if self.sides is not None:
+            good &= (self.sides[centers] * self.sides[others]).sum(1) >= 0
+        return good
+
     def _reach(
         self, centers: Int[Tensor, " B"], size: int
     ) -> tuple[Int[Tensor, " P"], Int[Tensor, " P"]]:
@@ -190,7 +201,7 @@ class GraphBalls:
             new = ring.data < 2**20
             local = torch.from_numpy(ring.coords[0][new].astype(np.int64))
             others = torch.from_numpy(ring.coords[1][new].astype(np.int64))
-            good = admissible(self.points, self.frames, centers[local], others).numpy()
+            good = self._admissible(centers[local], others).numpy()
             row, col = ring.coords[0][new][good], ring.coords[1][new][good]
             ones = np.ones(len(row), np.float32)
             frontier = sparse.csr_array((ones, (row, col)), shape=shape)

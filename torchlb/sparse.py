@@ -7,6 +7,7 @@ derivatives are each other, give derivatives of any order in values and features
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Sequence
 from typing import Any
 
@@ -16,6 +17,10 @@ from jaxtyping import Float, Int
 from scipy import sparse
 from torch import Tensor
 from torch.nn.functional import embedding_bag
+
+with warnings.catch_warnings():  # torch says once, at the first CSR tensor, that they are in beta
+    warnings.simplefilter("ignore")
+    torch.sparse_csr_tensor([0, 1], [0], [1.0], (1, 1))
 
 __all__ = ["csr_product", "from_scipy", "matmul", "to_scipy", "transpose_pattern"]
 
@@ -75,7 +80,8 @@ def _compute_dtype(left: Tensor, right: Tensor) -> torch.dtype:
 
 
 def _result_dtype(values: Tensor, x: Tensor) -> torch.dtype:
-    return x.dtype if x.dtype.itemsize < 4 else _compute_dtype(values, x)
+    half = x.dtype in (torch.float16, torch.bfloat16)
+    return x.dtype if half else _compute_dtype(values, x)
 
 
 def _csr(crow: Tensor, col: Tensor, values: Tensor, num_cols: int) -> Tensor:

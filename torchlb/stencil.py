@@ -8,6 +8,7 @@ order 1; then the fallback row. How far down each point had to step is part of t
 from __future__ import annotations
 
 from dataclasses import replace
+from math import ceil
 
 import torch
 from jaxtyping import Float, Int
@@ -18,6 +19,7 @@ from tqdm import tqdm
 from torchlb.geometry import Geometry
 from torchlb.ladder import Rung, chunks, ladder_rungs, walk_ladder
 from torchlb.neighbors import GraphBalls
+from torchlb.polynomials import num_monomials
 from torchlb.rows import Rows
 from torchlb.sparse import from_scipy
 from torchlb.tangent import local_offsets
@@ -36,7 +38,10 @@ MAX_GROWTH = 3.0
 MAX_GROWTH_OF_SPLINES = 12.0
 """Good splines have 3 to 5 times the growth of good least squares."""
 MAX_GROWTH_AT_BOUNDARY = 12.0
-"""One-sided stencils have larger weights; there dominance decides."""
+MAX_DOMINANCE_AT_BOUNDARY = 6.0
+"""One-sided stencils have larger weights, and wide ones would be balanced but poor: a lower order is better there."""
+MAX_SIZE_AT_BOUNDARY = 2.5
+"""Points of a stencil per polynomial that holds points of the boundary."""
 MAX_RESIDUAL = 1e-10
 
 
@@ -66,8 +71,8 @@ class Ladder:
     ) -> None:
         self.points, self.frames = geometry.points, geometry.frames
         self.fallback, self.boundary = geometry.fallback, geometry.boundary
-        self.balls = GraphBalls(geometry.points, geometry.graph, geometry.frames)
-        self.projection = projection
+        self.balls = GraphBalls(geometry.points, geometry.graph, geometry.frames, geometry.sides)
+        self.projection, self.fixed_size = projection, num_neighbors is not None
         dim = self.frames.shape[-1]
         rules = [weights] if weights == "least_squares" else [weights, "least_squares"]
         self.rungs = ladder_rungs(dim, range(order + 1, 1, -1), rules, num_neighbors)
@@ -83,7 +88,7 @@ class Ladder:
 
         def attempt(rows: Tensor, index: Tensor, rung: Rung) -> tuple[Tensor, Rows]:
             weights = self._weights(rows, index, rung)
-            failure = _failure(weights, self._growth_limit(index, rung))
+            failure = _failure(weights, *self._limits(index, rung))
             if rung.degree == top and rung.rule != "positive":
                 reason[place[rows]] = failure
             return failure == 0, _stencil_rows(index, weights, rung.degree)
@@ -98,12 +103,31 @@ class Ladder:
             blocks.append(self._fallback_rows(centers[left]))
             taken.append(left.nonzero()[:, 0])
         rows = Rows.stack(blocks)[torch.cat(taken).argsort()]
+        if self.boundary is not None and self.boundary.condition == "dirichlet":
+            rows = replace(rows, laplacian=self._without_boundary(centers, rows))
         return replace(rows, reason=torch.where(rows.order < top - 1, reason, rows.reason))
 
+    def _without_boundary(self, centers: Tensor, rows: Rows) -> Float[Tensor, " nnz"]:
+        """Entries of Δ for f = 0 on the boundary: none joins a boundary point to another point.
+
+        A boundary point has −4d/h² for itself, as a grid's fastest wave, h its distance to the nearest point.
+        """
+        assert self.boundary is not None
+        mask, dim = self.boundary.mask, self.frames.shape[-1]
+        local = torch.arange(len(centers)).repeat_interleave(rows.length)
+        row, col = centers[local], rows.col
+        square = (self.points[col] - self.points[row]).square().sum(1)
+        square = torch.where(row == col, torch.inf, square)
+        nearest = square.new_full((len(centers),), torch.inf).scatter_reduce(
+            0, local, square, "amin"
+        )
+        kept = torch.where(mask[row] | mask[col], 0.0, rows.laplacian)
+        return torch.where(mask[row] & (row == col), -4 * dim / nearest[local], kept)
+
     def _weights(self, centers: Tensor, index: Tensor, rung: Rung) -> Weights:
-        """Weights of a batch; stencils that hold boundary points use the Neumann data there."""
+        """Weights of a batch; stencils that hold boundary points use the Neumann data there, if they have some."""
         touching = torch.zeros(len(centers), dtype=torch.bool)
-        if self.boundary is not None:
+        if self.boundary is not None and self.boundary.condition == "neumann":
             touching = self.boundary.mask[index].any(1)
         parts = []
         if not touching.all():
@@ -115,12 +139,19 @@ class Ladder:
         order = torch.cat([(~touching).nonzero()[:, 0], touching.nonzero()[:, 0]]).argsort()
         return Weights.stack(parts)[order]
 
-    def _growth_limit(self, index: Tensor, rung: Rung) -> Float[Tensor, " B"]:
+    def _limits(self, index: Tensor, rung: Rung) -> tuple[Float[Tensor, " B"], Float[Tensor, " B"]]:
+        """Bounds on growth and dominance; none passes where points of the boundary make a wide stencil lopsided."""
+        dim = self.frames.shape[-1]
         largest = MAX_GROWTH_OF_SPLINES if rung.rule == "polyharmonic" else MAX_GROWTH
-        factor = torch.full((len(index),), largest, dtype=self.points.dtype)
+        growth = torch.full((len(index),), largest, dtype=self.points.dtype)
+        dominance = torch.full_like(growth, MAX_DOMINANCE)
         if self.boundary is not None:
-            factor[self.boundary.mask[index].any(1)] = MAX_GROWTH_AT_BOUNDARY
-        return factor * typical_growth(self.frames.shape[-1], rung.degree)
+            touching = self.boundary.mask[index].any(1)
+            wide = rung.size > ceil(MAX_SIZE_AT_BOUNDARY * num_monomials(dim, rung.degree))
+            refused = wide and rung.degree > 2 and not self.fixed_size
+            growth[touching] = 0.0 if refused else MAX_GROWTH_AT_BOUNDARY
+            dominance[touching] = MAX_DOMINANCE_AT_BOUNDARY
+        return growth * typical_growth(dim, rung.degree), dominance
 
     def _neumann_weights(self, centers: Tensor, index: Tensor, rung: Rung) -> Weights:
         """Second derivatives that use ∂_ν f = 0; first derivatives that do not, since they serve any f.
@@ -151,7 +182,9 @@ class Ladder:
         return rows
 
 
-def _failure(weights: Weights, max_growth: Float[Tensor, " B"]) -> Int[Tensor, " B"]:
+def _failure(
+    weights: Weights, max_growth: Float[Tensor, " B"], max_dominance: Float[Tensor, " B"]
+) -> Int[Tensor, " B"]:
     """Which of the local tests a stencil fails first, as an index into `REASONS`; 0 if none."""
     laplacian = weights.laplacian
     center, others = laplacian[:, 0], laplacian[:, 1:].abs().sum(1)
@@ -160,7 +193,7 @@ def _failure(weights: Weights, max_growth: Float[Tensor, " B"]) -> Int[Tensor, "
         (2, weights.deficit == 0),
         (3, weights.residual <= MAX_RESIDUAL),  # false for NaN
         (4, center < 0),
-        (5, others <= MAX_DOMINANCE * center.abs()),
+        (5, others <= max_dominance * center.abs()),
         (6, weights.radius.square() * (others + center.abs()) <= max_growth),
     ):
         failure = torch.where((failure == 0) & ~passed, code, failure)

@@ -9,8 +9,6 @@ from __future__ import annotations
 
 import torch
 from jaxtyping import Bool, Float, Int
-from scipy import sparse
-from scipy.sparse import csgraph
 from torch import Tensor
 
 from torchlb.ladder import Rung, walk_ladder
@@ -25,7 +23,6 @@ __all__ = [
     "local_offsets",
     "mesh_frames",
     "normals_of_frames",
-    "orient_by_graph",
     "refine_frames",
 ]
 
@@ -185,33 +182,3 @@ def face_normals(vertices: Float[Tensor, "N n"], faces: Int[Tensor, "F n"]) -> F
     for corner in faces.T:
         total.index_add_(0, corner, normal)
     return total
-
-
-def orient_by_graph(
-    points: Float[Tensor, "N n"], normals: Float[Tensor, "N n"], graph: sparse.csr_array
-) -> Float[Tensor, "N n"]:
-    """Signs of the normals made consistent along a spanning tree that prefers parallel neighbours.
-
-    Every component is then turned so that the normal at its extreme point (largest last coordinate) points outward.
-    """
-    edges = sparse.triu(graph).tocoo()
-    i, j = (torch.from_numpy(end.astype("int64")) for end in edges.coords)
-    bend = 1.0001 - (normals[i] * normals[j]).sum(-1).abs()
-    weighted = sparse.csr_array((bend.numpy(), edges.coords), shape=graph.shape)
-    tree = csgraph.minimum_spanning_tree(weighted)
-    count, component = csgraph.connected_components(tree, directed=False)
-    oriented = normals.clone()
-    height = points[:, -1]
-    for label in range(count):
-        members = torch.from_numpy((component == label).nonzero()[0])
-        root = members[height[members].argmax()]
-        order, parent = csgraph.breadth_first_order(tree, int(root), directed=False)
-        up = torch.from_numpy(parent[order[1:]].astype("int64"))
-        nodes = torch.from_numpy(order.astype("int64"))
-        agree = (normals[nodes[1:]] * normals[up]).sum(-1).sign().tolist()
-        sign = {int(root): 1.0 if normals[root, -1] >= 0 else -1.0}
-        for node, above, same in zip(nodes[1:].tolist(), up.tolist(), agree, strict=True):
-            sign[node] = sign[above] * (same or 1.0)
-        factor = torch.tensor([sign[node] for node in nodes.tolist()], dtype=normals.dtype)
-        oriented[nodes] = normals[nodes] * factor[:, None]
-    return oriented

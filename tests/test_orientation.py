@@ -1,0 +1,107 @@
+"""Consistent normals, and which points of a thin shape lie on different sides."""
+
+import math
+
+import pytest
+import torch
+
+from tolerances import TOLERANCE
+from torchlb.neighbors import nearest_neighbors
+from torchlb.orientation import (
+    consistently_wound,
+    nearest_pairs,
+    orient_normals,
+    thin_sides,
+)
+from torchlb.surfaces import Ellipsoid, Sphere, StarShaped, Torus
+from torchlb.tangent import cloud_frames, complete_frames, face_normals, normals_of_frames
+
+
+def close(actual, expected):
+    torch.testing.assert_close(actual, expected, **TOLERANCE[torch.float64])
+
+
+def pairs_of(points):
+    return nearest_pairs(nearest_neighbors(points, 24))
+
+
+def scrambled(normals):
+    return normals * torch.randint(0, 2, (len(normals), 1)).mul(2).sub(1)
+
+
+@pytest.mark.parametrize("surface", [Sphere(), Torus(), Ellipsoid(), StarShaped()])
+@pytest.mark.parametrize("sampling", ["points", "random_points"])
+def test_normals_of_a_cloud_are_turned_outward(surface, sampling):
+    """Estimated normals with random signs: all end on the outer side, none changes but in sign."""
+    points = getattr(surface, sampling)(1000)
+    frames = cloud_frames(points, nearest_neighbors(points, 24), 2)
+    normals = scrambled(normals_of_frames(frames))
+    oriented = orient_normals(points, normals, pairs_of(points))
+    assert ((oriented * surface.normals(points)).sum(1) > 0).all()
+    close(oriented.abs(), normals.abs())
+
+
+def test_every_component_is_turned_outward_by_itself():
+    points = torch.cat([Sphere().points(300), 2 * Sphere().points(300, seed=1) + 5])
+    exact = torch.cat([points[:300], (points[300:] - 5) / 2])
+    close(orient_normals(points, scrambled(exact), pairs_of(points)), exact)
+
+
+@pytest.mark.parametrize("gap", [1.5, 2.0])
+def test_the_two_sides_of_a_slab_face_away_from_each_other(gap):
+    """Two parallel sheets, `gap` spacings apart."""
+    axis = torch.arange(20, dtype=torch.float64)
+    lower = torch.cartesian_prod(axis, axis, torch.zeros(1, dtype=torch.float64))
+    upper = lower + torch.tensor([0.4, 0.3, gap], dtype=torch.float64)
+    exact = torch.zeros(800, 3, dtype=torch.float64)
+    exact[:400, 2], exact[400:, 2] = -1.0, 1.0
+    points = torch.cat([lower, upper])
+    pairs = pairs_of(points)
+    oriented = orient_normals(points, scrambled(exact), pairs)
+    close(oriented, exact)
+    sides = thin_sides(points, oriented, pairs)
+    close(sides, exact)
+
+
+def test_nothing_is_thin_on_a_resolved_surface():
+    points = Torus().points(1000)
+    assert not thin_sides(points, Torus().normals(points), pairs_of(points)).any()
+
+
+def test_a_strip_with_one_side_is_not_thin():
+    """A Möbius strip: no consistent normals, and none needed."""
+    turn, across = torch.meshgrid(
+        torch.arange(120, dtype=torch.float64) * math.tau / 120,
+        torch.linspace(-0.3, 0.3, 13, dtype=torch.float64),
+        indexing="ij",
+    )
+    reach = 1 + across * (turn / 2).cos()
+    points = torch.stack(
+        [reach * turn.cos(), reach * turn.sin(), across * (turn / 2).sin()], -1
+    ).view(-1, 3)
+    frames = cloud_frames(points, nearest_neighbors(points, 24), 2)
+    oriented = orient_normals(points, normals_of_frames(frames), pairs_of(points))
+    assert not thin_sides(points, oriented, pairs_of(points)).any()
+
+
+def test_pairs_come_once_each():
+    points = Sphere().random_points(200)
+    i, j = pairs_of(points)
+    assert (i < j).all()
+    assert len(torch.unique(torch.stack([i, j], 1), dim=0)) == len(i)
+
+
+def test_one_flipped_face_spoils_the_winding():
+    vertices, faces = Sphere().mesh(200)
+    assert consistently_wound(faces)
+    assert ((face_normals(vertices, faces) * vertices).sum(1) > 0).all()
+    faces[7] = faces[7].flip(0)
+    assert not consistently_wound(faces)
+
+
+def test_given_normals_of_any_sign_are_oriented():
+    """complete_frames of a normal and of its opposite span the same plane, so the signs come out the same."""
+    points = Ellipsoid().points(500)
+    exact = Ellipsoid().normals(points)
+    normals = normals_of_frames(complete_frames(scrambled(exact)))
+    close(orient_normals(points, normals, pairs_of(points)), exact)
