@@ -7,7 +7,9 @@ import torch
 
 os.environ.setdefault("MPLBACKEND", "Agg")
 os.environ.setdefault("OMP_NUM_THREADS", "1")  # of the programs that tests start
-torch.set_num_threads(1)  # small products: on a busy machine two threads wait for each other, 5 to 15 times longer
+torch.set_num_threads(
+    1
+)  # small products: on a busy machine two threads wait for each other, 5 to 15 times longer
 
 
 @pytest.fixture(autouse=True)
