@@ -23,7 +23,7 @@ from torchlb.comparison import draw_comparison, spectra, spectrum_table
 from torchlb.interop.trimesh import read_shape
 from torchlb.laplace_beltrami import LaplaceBeltrami
 from torchlb.operators import OPERATORS, build_operator
-from torchlb.precompute import precompute_operators
+from torchlb.precompute import concerns_the_shape, precompute_operators
 from torchlb.tangent import PROJECTIONS
 from torchlb.version import __version__
 
@@ -47,7 +47,7 @@ class _Commands(click.Group):
 
 
 def _show(message: Warning | str, category: type[Warning], *_: Any) -> None:
-    if category.__module__.startswith("torchlb"):
+    if concerns_the_shape(message):
         click.echo(f"Warning: {message}", err=True)
 
 
