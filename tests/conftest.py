@@ -1,4 +1,4 @@
-"""What every test gets: fixed random numbers, float32 as the default type, pictures without a screen."""
+"""What every test gets: fixed random numbers, float32 as the default type, one thread, pictures without a screen."""
 
 import os
 
@@ -6,6 +6,10 @@ import pytest
 import torch
 
 os.environ.setdefault("MPLBACKEND", "Agg")
+os.environ.setdefault("OMP_NUM_THREADS", "1")  # of the programs that tests start
+torch.set_num_threads(
+    1
+)  # small products: on a busy machine two threads wait for each other, 5 to 15 times longer
 
 
 @pytest.fixture(autouse=True)

@@ -1,20 +1,35 @@
 """Every public name says what it is and what it takes."""
 
+import importlib
 import inspect
+import pkgutil
 from types import FunctionType
 
 import pytest
 
 import torchlb
+from torchlb import interop
 
 MIN_SUMMARY = 10  # characters
 METHODS = (FunctionType, classmethod, staticmethod, property)
 
 
+ADAPTERS = [
+    importlib.import_module(f"torchlb.interop.{found.name}")
+    for found in pkgutil.iter_modules(interop.__path__)
+]
+
+
+def public():
+    """Public names, also of the adapters to other libraries, and what they stand for."""
+    for module in [torchlb, *ADAPTERS]:
+        for name in module.__all__:
+            yield name, getattr(module, name)
+
+
 def described():
     """Public classes and functions, and the methods the classes define: name and own docstring."""
-    for name in torchlb.__all__:
-        value = getattr(torchlb, name)
+    for name, value in public():
         if not (callable(value) or inspect.ismodule(value)):
             continue  # a constant
         yield pytest.param(name, value.__doc__, id=name)
@@ -25,8 +40,7 @@ def described():
 
 def signatures():
     """Public functions and methods, and the __init__ of public classes."""
-    for name in torchlb.__all__:
-        value = getattr(torchlb, name)
+    for name, value in public():
         if inspect.isclass(value):
             for key, member in vars(value).items():
                 member = getattr(member, "__func__", member)  # of a classmethod or staticmethod

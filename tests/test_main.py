@@ -8,8 +8,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 import trimesh
+from click.testing import CliRunner
 
 from torchlb import LaplaceBeltrami, __version__, save_operator
+from torchlb.__main__ import main
 from torchlb.surfaces import Ellipsoid
 
 ROOT = Path(__file__).parents[1]
@@ -76,6 +78,12 @@ def test_precompute_then_again_then_info(mesh, tmp_path):
         assert part in done.stdout, part
 
 
+def test_an_error_is_one_message_on_stderr(tmp_path):
+    done = run("compare", "missing.ply", cwd=tmp_path)
+    assert (done.returncode, done.stdout) == (2, "")
+    assert "does not exist" in done.stderr
+
+
 def test_precompute_names_what_failed_and_ends_with_1(mesh, tmp_path):
     (tmp_path / "broken.obj").write_text("nothing")
     done = run(
@@ -108,25 +116,31 @@ def test_info_of_a_shape_and_of_a_damaged_operator(mesh, tmp_path):
         (["compare", "few.xyz", "--order", "0"], 2, "0 is not in the range"),
         (["compare", "few.xyz", "--weights", "heavy"], 2, "'heavy' is not one of"),
         (["precompute", "."], 2, "Missing option '--out'"),
+        (
+            ["precompute", ".", "--out", "cache", "--operator", "cotangent", "--order", "3"],
+            2,
+            "cotangent operator has no --order",
+        ),
         (["precompute", "empty", "--out", "cache"], 1, "no shapes in it"),
         (["conquer"], 2, "No such command 'conquer'"),
     ],
 )
-def test_a_wrong_call_ends_with_a_message(arguments, code, message, tmp_path):
+def test_a_wrong_call_ends_with_a_message(arguments, code, message, tmp_path, monkeypatch):
     (tmp_path / "prose.obj").write_text("no mesh")
     (tmp_path / "few.xyz").write_text("0 0 0\n1 0 0\n0 1 0\n")
     (tmp_path / "empty").mkdir()
-    done = run(*arguments, cwd=tmp_path)
-    assert done.returncode == code
-    assert message in done.stderr
+    monkeypatch.chdir(tmp_path)
+    done = CliRunner().invoke(main, arguments)  # in this process, which is quicker
+    assert (done.exit_code, type(done.exception)) == (code, SystemExit)
+    assert message in done.output
     assert not list(tmp_path.glob("*.png"))
 
 
 @pytest.mark.parametrize("command", [[], ["compare"], ["precompute"], ["info"]])
-def test_help_has_examples(command, tmp_path):
-    done = run(*command, "--help", cwd=tmp_path)
-    assert done.returncode == 0
-    assert f"  python -m torchlb {command[0] if command else 'compare'} " in done.stdout
+def test_help_has_examples(command):
+    done = CliRunner().invoke(main, [*command, "--help"])
+    assert done.exit_code == 0
+    assert f"  python -m torchlb {command[0] if command else 'compare'} " in done.output
 
 
 def test_version(tmp_path):

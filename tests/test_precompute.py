@@ -6,6 +6,7 @@ import signal
 import subprocess
 import sys
 import time
+import warnings
 from pathlib import Path
 
 import joblib
@@ -196,6 +197,18 @@ def test_the_same_call_runs_on_a_dask_cluster(tmp_path, monkeypatch):
     lb = load_operator(report.files["03.ply"])
     direct = LaplaceBeltrami.from_mesh(*read_shape(folder / "03.ply"), order=1)
     assert torch.equal(lb.values, direct.values)
+
+
+def test_a_warning_of_a_shape_is_in_the_report(tmp_path, monkeypatch):
+    def warned(*arguments, **options):
+        warnings.warn("few points", UserWarning, stacklevel=1)
+        warnings.warn("Sparse CSR tensor support is in beta", UserWarning, stacklevel=1)
+        return load_or_build(*arguments, **options)
+
+    monkeypatch.setattr(torchlb.precompute, "load_or_build", warned)
+    report = precompute_operators([(VERTICES, FACES)], tmp_path, workers=1, **OPTIONS)
+    assert report.results[0].message == "few points"
+    assert str(report).endswith("warned\n  shape 0  few points")
 
 
 def test_what_killed_writers_left_is_removed_after_a_day(tmp_path):

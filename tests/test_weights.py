@@ -72,7 +72,8 @@ def test_derivatives_of_polynomials_are_exact(dim, degree, rule):
     close(applied(weights.gradient, f, coords), slope.expand(3, dim), scale)
     close(applied(weights.hessian, f, coords), second[a, b].expand(3, -1), scale)
     assert (weights.deficit == 0).all()
-    assert weights.residual.max() < 1e-11
+    # On clustered random nodes splines have weights of 1e4 and more, and their rounding; the ladder refuses those.
+    assert weights.residual.max() < (1e-9 if rule == "polyharmonic" else 1e-11)
 
 
 @pytest.mark.parametrize("dim", [1, 2, 3, 4])
@@ -152,7 +153,9 @@ def test_rotations_of_the_plane_do_not_move_the_laplacian(rule):
     c, s = np.cos(0.7), np.sin(0.7)
     turned = coords @ torch.tensor([[c, -s], [s, c]])
     one, other = (RULES[rule](x, 4).laplacian for x in (coords, turned))
-    close(other, one, one.abs().max())
+    # The saddle system of the spline has a condition of about 1e10 on random nodes.
+    tolerance = 1e-6 if rule == "polyharmonic" else 1e-10
+    assert (other - one).abs().max() <= tolerance * one.abs().max()
 
 
 @pytest.mark.parametrize(("dim", "degree"), [(1, 4), (2, 2), (2, 4), (3, 2)])
@@ -177,12 +180,12 @@ def test_weights_minimise_the_centre_constrained_problem(dim, degree):
 
 @pytest.mark.parametrize(("dim", "degree"), [(2, 3), (2, 4), (3, 3)])
 def test_polyharmonic_weights_are_derivatives_of_the_interpolant(dim, degree):
-    """s(y) = Σ c_j |y − y_j|⁵ + polynomial with s(y_j) = f_j, Σ c_j y_j^α = 0: w·f = Δs(0), by autograd."""
+    """s(y) = Σ c_j |y − y_j|^(2m+3) + polynomial with s(y_j) = f_j, Σ c_j y_j^α = 0: w·f = Δs(0), by autograd."""
     coords = cloud(dim, degree, batch=1)
     nodes = torch.cat([torch.zeros(1, dim).double(), coords[0]])
     nodes = nodes / nodes.norm(dim=1).max()
     f = torch.randn(len(nodes), dtype=torch.float64)
-    kernel = torch.cdist(nodes, nodes) ** 5
+    kernel = torch.cdist(nodes, nodes) ** (2 * degree + 3)
     v = torch.cat([torch.ones(len(nodes), 1).double(), monomials(nodes, degree)], 1)
     size, columns = v.shape
     system = torch.zeros(size + columns, size + columns, dtype=torch.float64)
@@ -192,9 +195,9 @@ def test_polyharmonic_weights_are_derivatives_of_the_interpolant(dim, degree):
 
     def spline(y):
         square = (y - nodes).square().sum(1)
-        return (c * square.pow(2.5)).sum() + b[0] + monomials(y, degree) @ b[1:]
+        return (c * square.pow(degree + 1.5)).sum() + b[0] + monomials(y, degree) @ b[1:]
 
-    # Not at 0 itself, where the root of autograd is singular: the derivative of r⁵ there is 0.
+    # Not at 0 itself, where the root of autograd is singular: the derivative of an odd power there is 0.
     here = torch.full((dim,), 1e-7, dtype=torch.float64)
     expected = hessian(spline)(here).trace()
     weights = polyharmonic_weights(coords, degree)

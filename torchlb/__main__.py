@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any
 
 import click
+from click.core import ParameterSource
 
 from torchlb.build import WEIGHTS
 from torchlb.cache import OperatorFileError, describe_file
@@ -22,7 +23,7 @@ from torchlb.comparison import draw_comparison, spectra, spectrum_table
 from torchlb.interop.trimesh import read_shape
 from torchlb.laplace_beltrami import LaplaceBeltrami
 from torchlb.operators import OPERATORS, build_operator
-from torchlb.precompute import precompute_operators
+from torchlb.precompute import concerns_the_shape, precompute_operators
 from torchlb.tangent import PROJECTIONS
 from torchlb.version import __version__
 
@@ -46,7 +47,7 @@ class _Commands(click.Group):
 
 
 def _show(message: Warning | str, category: type[Warning], *_: Any) -> None:
-    if category.__module__.startswith("torchlb"):
+    if concerns_the_shape(message):
         click.echo(f"Warning: {message}", err=True)
 
 
@@ -163,6 +164,12 @@ def precompute(
       python -m torchlb precompute shapes/ --out operators/ --order 5 -k 128 --workers 8 --clean
     """
     if operator == "cotangent":
+        context = click.get_current_context()
+        given = [
+            n for n in options if context.get_parameter_source(n) is not ParameterSource.DEFAULT
+        ]
+        if given:
+            raise click.UsageError(f"the cotangent operator has no --{' --'.join(given)}")
         options = {}
     report = precompute_operators(
         folder,

@@ -112,6 +112,8 @@ def operator_key(
     Parameters are those of `load_or_build`; defaults and the same values spelt out give the same key, as do integers
     and floats of any width. Faces that repeat a corner, which no operator uses, do not count.
 
+    Examples
+    --------
     >>> operator_key(torch.eye(3), order=3) == operator_key(np.eye(3), weights="least_squares")
     True
     """

@@ -157,6 +157,8 @@ def clean_mesh(vertices: Tensor, faces: Tensor) -> tuple[Tensor, Tensor, Tensor]
     faces : (F', 3), renumbered.
     kept : (N',), their indices in the input: `values[kept]` carries data over.
 
+    Examples
+    --------
     >>> vertices, faces, kept = clean_mesh(torch.eye(4), torch.tensor([[0, 1, 3], [0, 0, 1]]))
     >>> faces.tolist(), kept.tolist()
     ([[0, 1, 2]], [0, 1, 3])

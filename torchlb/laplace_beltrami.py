@@ -74,7 +74,7 @@ class LaplaceBeltrami(OperatorStorage):
         order : p ≥ 1 of the Laplacian: the error falls like h^p.
         normal_order : q of the tangent frames, p + 1 by default; 0 keeps the poor ones (or those of `normals`).
         projection : "tangent" (more accurate) or "normal" (the note's), see `method.md`, section 3.
-        weights : "least_squares" (robust) or "polyharmonic" (more accurate at high order on evenly spread points).
+        weights : "least_squares" (robust) or "polyharmonic" (far more accurate on evenly spread points).
         num_neighbors : size K of every stencil, itself included, instead of the sizes of the ladder.
         normals : (N, n), if known (d = n − 1): the first guess of the tangent frames, and their orientation.
         boundary : (N,) mask of the points on the boundary, or "detect" (surfaces); None for a closed shape, or to do

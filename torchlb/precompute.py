@@ -235,7 +235,7 @@ def _solve(index: int, task: _Task) -> tuple[int, ShapeResult]:
                 read_shape(task.source) if isinstance(task.source, Path) else task.source
             )
             status, points, file = _stored(task, vertices, faces)
-        notes = {str(w.message) for w in caught if type(w.message).__module__.startswith("torchlb")}
+        notes = {str(w.message) for w in caught if concerns_the_shape(w.message)}
         seconds = time.perf_counter() - start
         result = ShapeResult(task.name, status, points, seconds, file, "; ".join(sorted(notes)))
     except Exception as error:
@@ -245,6 +245,11 @@ def _solve(index: int, task: _Task) -> tuple[int, ShapeResult]:
     finally:
         torch.set_num_threads(threads)
     return index, result
+
+
+def concerns_the_shape(warning: Warning | str) -> bool:
+    """Whether a warning tells the user of a shape something; torch's about its own sparse tensors does not."""
+    return isinstance(warning, UserWarning) and not str(warning).startswith("Sparse ")
 
 
 def _stored(task: _Task, vertices: Any, faces: Any) -> tuple[str, int, str]:

@@ -36,7 +36,7 @@ __all__ = ["Ladder", "StencilError", "build_stencil", "matrix_rows"]
 MAX_DOMINANCE = 3.0
 MAX_GROWTH = 3.0
 MAX_GROWTH_OF_SPLINES = 12.0
-"""Good splines have 3 to 5 times the growth of good least squares."""
+"""Good splines have 2 to 3 times the growth of good least squares, and one-sided ones more."""
 MAX_GROWTH_AT_BOUNDARY = 12.0
 MAX_DOMINANCE_AT_BOUNDARY = 6.0
 """One-sided stencils have larger weights, and wide ones would be balanced but poor: a lower order is better there."""

@@ -76,6 +76,8 @@ class _Round(_Radial):
 class Sphere(_Round):
     """The sphere of a radius ℓ in R³: eigenvalues l (l + 1) / radius², 2l + 1 times.
 
+    Examples
+    --------
     >>> Sphere().eigenvalues(5).tolist()
     [0.0, 2.0, 2.0, 2.0, 6.0]
     """
@@ -284,6 +286,8 @@ def deserno_points(n: int) -> Float[Tensor, "N 3"]:
 
     The number of circles is rounded, that of points on each rounded up, as in Compadre's examples.
 
+    Examples
+    --------
     >>> [len(deserno_points(n)) for n in (2000, 8000, 32000)]
     [2022, 8038, 32093]
     """

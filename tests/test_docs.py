@@ -1,0 +1,141 @@
+"""Every page's code runs, every quoted message is one that torchlb gives, and the site builds without a network."""
+
+import re
+import subprocess
+import sys
+import warnings
+from pathlib import Path
+
+import pytest
+import torch
+
+import torchlb
+from torchlb import DiffusionNet, LaplaceBeltrami
+from torchlb.surfaces import Circle, Sphere
+
+ROOT = Path(__file__).parents[1]
+PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
+CODE = re.compile(r"^```python\n(.*?)^```$", re.DOTALL | re.MULTILINE)
+WITH_CODE = [page for page in PAGES if CODE.search(page.read_text("utf-8"))]
+
+
+@pytest.mark.parametrize("page", WITH_CODE, ids=lambda page: str(page.relative_to(ROOT)))
+def test_the_code_of_a_page_runs_from_top_to_bottom(page, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    names = {"__name__": "__main__"}
+    text = page.read_text("utf-8")
+    for found in CODE.finditer(text):
+        line = text.count("\n", 0, found.start()) + 1
+        code = compile("\n" * line + found.group(1), str(page), "exec")
+        exec(code, names)
+
+
+def test_pages_with_code_are_found():
+    names = {page.name for page in WITH_CODE}
+    assert names >= {"README.md", "index.md", "from_diffusion_net.md", "choosing.md"}
+    assert names >= {"troubleshooting.md", "precompute.md", "other_libraries.md", "conventions.md"}
+
+
+VERTICES, FACES = Sphere().mesh(60)
+NAN = VERTICES.clone()
+NAN[3, 1] = float("nan")
+
+
+def uncertified(monkeypatch):
+    monkeypatch.setattr("torchlb.build.LARGEST", 10)
+    LaplaceBeltrami.from_mesh(VERTICES, FACES, order=1)
+
+
+def unstable(_):
+    lb = LaplaceBeltrami.from_mesh(VERTICES, FACES, order=1)
+    fields = {**vars(lb.certificate), "holds": False}
+    lb.certificate = torchlb.Certificate(**fields)
+    raise ValueError(repr(lb))
+
+
+def damaged(_):
+    Path("shape.obj").write_text("nothing")
+    torchlb.load_operator("shape.obj")
+
+
+def circle_network(_):
+    lb = LaplaceBeltrami.from_points(Circle().points(30).float(), order=1)
+    DiffusionNet(2, 1, C_width=4, N_block=1, k=4)(torch.zeros(30, 2), lb)
+
+
+# By the beginning of the heading: what gives the message.
+TRIGGERS = {
+    "… vertices (…) belong": lambda _: LaplaceBeltrami.from_mesh(
+        torch.cat([VERTICES, VERTICES[:1] + 5]), FACES
+    ),
+    "… points share": lambda _: LaplaceBeltrami.from_points(torch.cat([VERTICES, VERTICES[:2]])),
+    "… are NaN": lambda _: LaplaceBeltrami.from_points(NAN),
+    "… have indices": lambda _: LaplaceBeltrami.from_mesh(VERTICES, FACES + 1),
+    "… points are fewer": lambda _: LaplaceBeltrami.from_points(VERTICES[:9]),
+    "num_neighbors:": lambda _: LaplaceBeltrami.from_points(VERTICES, num_neighbors=4),
+    "… points are more": uncertified,
+    "NOT STABLE": unstable,
+    "…: not a mesh": lambda _: (
+        Path("shape.obj").write_text("nothing"),
+        torchlb.interop.trimesh.read_shape("shape.obj"),
+    ),
+    "…: not an operator": damaged,
+    "… has no option": lambda _: torchlb.load_or_build(VERTICES, FACES, cache=".", dim=2),
+    "expected f of shape": lambda _: LaplaceBeltrami.from_mesh(VERTICES, FACES, order=1)(
+        torch.zeros(5, 2)
+    ),
+    "rotations need": circle_network,
+}
+# Hard to provoke on purpose; that the source has the words is checked instead.
+IN_THE_SOURCE = ("cotangent operator:", "… points have neither")
+
+
+def quoted_messages():
+    text = (ROOT / "docs" / "troubleshooting.md").read_text("utf-8")
+    return re.findall(r"^### `(.*)`$", text, re.MULTILINE)
+
+
+@pytest.mark.parametrize("message", quoted_messages())
+def test_a_quoted_message_is_one_that_comes(message, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    if message.startswith(IN_THE_SOURCE):
+        source = "".join(path.read_text("utf-8") for path in (ROOT / "torchlb").rglob("*.py"))
+        source = re.sub(r"\{[^{}]*\}", "…", source)
+        words = [part for part in re.split(r"\s*…\s*", message) if part]
+        assert all(word in source for word in words), words
+        return
+    [trigger] = [call for start, call in TRIGGERS.items() if message.startswith(start)]
+    pattern = ".*".join(re.escape(part) for part in message.split("…"))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", torchlb.StabilityWarning)
+        with pytest.raises((ValueError, TypeError, RuntimeError, UserWarning)) as caught:
+            trigger(monkeypatch)
+    assert re.search(pattern, str(caught.value), re.DOTALL), str(caught.value)
+
+
+def test_every_public_name_is_in_the_reference():
+    text = "".join(path.read_text("utf-8") for path in (ROOT / "docs" / "api").glob("*.md"))
+    listed = set(re.findall(r"^::: torchlb\.([\w.]+)$", text, re.MULTILINE))
+    assert set(torchlb.__all__) - {"__version__"} <= listed
+    modules = {f"interop.{p.stem}" for p in (ROOT / "torchlb" / "interop").glob("[a-z]*.py")}
+    assert modules <= listed
+
+
+def test_the_site_builds_without_a_network(tmp_path):
+    """Strictly: every link and every name leads somewhere. No page asks another host for anything."""
+    blocked = "import socket; socket.socket.connect = None; socket.getaddrinfo = None\n"
+    run = f"{blocked}from mkdocs.__main__ import cli; cli(['build', '--strict', '-d', {str(tmp_path)!r}])"
+    done = subprocess.run(
+        [sys.executable, "-c", run], cwd=ROOT, capture_output=True, text=True, timeout=120
+    )
+    assert done.returncode == 0, done.stderr
+    pages = list(tmp_path.rglob("*.html"))
+    assert len(pages) > 10
+    for page in pages:
+        html = page.read_text("utf-8")
+        fetched = re.findall(r'<(?:script|img|iframe)[^>]+src="(https?:[^"]+)"', html)
+        fetched += re.findall(r'<link[^>]+rel="stylesheet"[^>]+href="(https?:[^"]+)"', html)
+        assert not fetched, (page.name, fetched)
+    reference = (tmp_path / "api" / "operators.html").read_text("utf-8")
+    assert "from_points" in reference
+    assert "Raises" in reference
