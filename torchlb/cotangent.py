@@ -57,6 +57,8 @@ def robust_rows(
     space = np.zeros((len(points), 3))
     space[:, : points.shape[1]] = points.numpy()
     if faces is None:
+        # Its triangles of a cloud depend on the axes, up to 100 % of a row: these turn with the points.
+        space = _principal_axes(space)
         weak, mass = robust_laplacian.point_cloud_laplacian(space, MOLLIFY, min(30, len(space) - 1))
     else:
         weak, mass = robust_laplacian.mesh_laplacian(space, faces.numpy(), MOLLIFY)
@@ -71,6 +73,14 @@ def robust_rows(
     return _with_diagonal(
         sparse.csr_array(sparse.diags_array(1 / area) @ strong)
     ), torch.from_numpy(area)
+
+
+def _principal_axes(points: np.ndarray) -> np.ndarray:
+    """Coordinates about the mean in the principal axes, whose signs make the third moments positive."""
+    centered = points - points.mean(axis=0)
+    axes = np.linalg.svd(centered, full_matrices=False)[2]
+    turned = centered @ axes.T
+    return np.ascontiguousarray(turned * np.where((turned**3).sum(axis=0) < 0, -1.0, 1.0))
 
 
 def _with_diagonal(matrix: sparse.csr_array) -> sparse.csr_array:

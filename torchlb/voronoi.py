@@ -29,12 +29,29 @@ def unit_directions(dim: int) -> Float[Tensor, "u d"]:
     return normal / normal.norm(dim=1, keepdim=True)
 
 
-def _inverse_radius(
+def _directions(
     coords: Float[Tensor, "B K d"], valid: Bool[Tensor, "B K"]
+) -> Float[Tensor, "B u d"]:
+    """The table for each point: in the plane it starts at the nearest neighbour, and so turns with the points."""
+    table = unit_directions(coords.shape[-1]).to(coords)
+    if coords.shape[-1] != 2:
+        return table.expand(len(coords), -1, -1)
+    square = coords.square().sum(-1).masked_fill(~valid, torch.inf)
+    nearest = coords[torch.arange(len(coords)), square.argmin(1)]
+    x, y = torch.nn.functional.normalize(nearest, dim=-1).unbind(-1)
+    x = torch.where((x == 0) & (y == 0), 1.0, x)
+    turn = torch.stack([torch.stack([x, y], -1), torch.stack([-y, x], -1)], dim=-2)
+    return table @ turn
+
+
+def _inverse_radius(
+    coords: Float[Tensor, "B K d"],
+    valid: Bool[Tensor, "B K"],
+    directions: Float[Tensor, "B u d"],
 ) -> Float[Tensor, "B K u"]:
     """2 y_j·u / |y_j|²: the largest over j is 1 / r(u). Negative for neighbours behind the point."""
     square = coords.square().sum(-1, keepdim=True).clamp_min(torch.finfo(coords.dtype).tiny)
-    inverse = 2 * (coords / square) @ unit_directions(coords.shape[-1]).to(coords).T
+    inverse = 2 * (coords / square) @ directions.mT
     return inverse.masked_fill(~valid[..., None], -torch.inf)
 
 
@@ -47,7 +64,7 @@ def natural_neighbors(
     >>> natural_neighbors(corners, torch.ones(1, 5, dtype=torch.bool)).tolist()
     [[True, True, True, True, False]]
     """
-    nearest, first = _inverse_radius(coords, valid).max(dim=1)
+    nearest, first = _inverse_radius(coords, valid, _directions(coords, valid)).max(dim=1)
     natural = torch.zeros_like(valid)
     natural.scatter_reduce_(1, first, nearest > 0, "amax")
     return natural & valid
@@ -70,10 +87,11 @@ def cell_volume(
     dim = coords.shape[-1]
     distance = coords.norm(dim=-1).masked_fill(~valid, 0).amax(1)
     farthest = distance.clamp_min(torch.finfo(coords.dtype).tiny)
-    inverse = _inverse_radius(coords, valid).amax(1).maximum(2 / farthest[:, None])
+    directions = _directions(coords, valid)
+    inverse = _inverse_radius(coords, valid, directions).amax(1).maximum(2 / farthest[:, None])
     volume = inverse.pow(-dim)
     if outward is not None:
-        volume = volume * (outward @ unit_directions(dim).to(coords).T <= 0)
+        volume = volume * ((directions @ outward[..., None])[..., 0] <= 0)
     unit_ball = pi ** (dim / 2) / gamma(dim / 2 + 1)
     return unit_ball * volume.mean(1)
 
@@ -94,7 +112,8 @@ def cell_laplacian(
     if dim == 2:
         weights = _star_cotangents(coords, valid) / cell_volume(coords, valid)[:, None]
     else:
-        inverse, first = _inverse_radius(coords, valid).max(dim=1)
+        directions = _directions(coords, valid)
+        inverse, first = _inverse_radius(coords, valid, directions).max(dim=1)
         closed = inverse >= 2 / square.sqrt().amax(1, keepdim=True)
         part = torch.where(closed, inverse, torch.inf).pow(-dim)
         share = torch.zeros_like(square).scatter_add_(1, first, part)
