@@ -65,7 +65,7 @@ def heat_flow(
 
     Examples
     --------
-    >>> theta = torch.arange(12, dtype=torch.float64) * torch.pi / 6
+    >>> theta = torch.arange(36, dtype=torch.float64) * torch.pi / 18
     >>> lb = LaplaceBeltrami.from_points(torch.stack([theta.cos(), theta.sin()], dim=1))
     >>> bool(torch.allclose(heat_flow(lb, theta.cos(), 0.5), math.exp(-0.5) * theta.cos(), atol=1e-2))
     True
@@ -219,10 +219,10 @@ class Diffusion(nn.Module):
 
     Examples
     --------
-    >>> theta = torch.arange(12) * torch.pi / 6
+    >>> theta = torch.arange(36) * torch.pi / 18
     >>> lb = LaplaceBeltrami.from_points(torch.stack([theta.cos(), theta.sin()], dim=1))
     >>> layer = Diffusion(3)
-    >>> layer(torch.ones(12, 3), lb).mean().item()
+    >>> layer(torch.ones(36, 3), lb).mean().item()
     1.0
     """
 

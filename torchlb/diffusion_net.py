@@ -35,9 +35,9 @@ class GradientFeatures(nn.Module):
 
     Examples
     --------
-    >>> theta = torch.arange(12) * torch.pi / 6
+    >>> theta = torch.arange(36) * torch.pi / 18
     >>> lb = LaplaceBeltrami.from_points(torch.stack([theta.cos(), theta.sin()], dim=1))
-    >>> GradientFeatures(3, rotations=False)(torch.ones(12, 3), lb).abs().max() < 1e-5
+    >>> GradientFeatures(3, rotations=False)(torch.ones(36, 3), lb).abs().max() < 1e-5
     tensor(True)
     """
 
@@ -136,11 +136,11 @@ class DiffusionNet(nn.Module):
 
     Examples
     --------
-    >>> theta = torch.arange(12) * torch.pi / 6
+    >>> theta = torch.arange(36) * torch.pi / 18
     >>> circle = torch.stack([theta.cos(), theta.sin()], dim=1)
     >>> lb = LaplaceBeltrami.from_points(circle)
     >>> DiffusionNet(2, 5, C_width=8, with_gradient_rotations=False)(circle, lb).shape
-    torch.Size([12, 5])
+    torch.Size([36, 5])
     """
 
     def __init__(

@@ -40,7 +40,7 @@ class LaplaceBeltrami(OperatorStorage):
 
     Examples
     --------
-    >>> theta = torch.arange(12, dtype=torch.float64) * torch.pi / 6
+    >>> theta = torch.arange(36, dtype=torch.float64) * torch.pi / 18
     >>> circle = torch.stack([theta.cos(), theta.sin()], dim=1)
     >>> lb = LaplaceBeltrami.from_points(circle, order=3)
     >>> bool(torch.allclose(lb(circle[:, 0]), -circle[:, 0], atol=0.02))

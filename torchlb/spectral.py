@@ -63,7 +63,7 @@ def heat_kernel_signature(
 
     Examples
     --------
-    >>> theta = torch.arange(12, dtype=torch.float64) * torch.pi / 6
+    >>> theta = torch.arange(36, dtype=torch.float64) * torch.pi / 18
     >>> lb = LaplaceBeltrami.from_points(torch.stack([theta.cos(), theta.sin()], dim=1))
     >>> bool((heat_kernel_signature(lb, torch.tensor([50.0])) * lb.mass.sum()).allclose(torch.tensor(1.0).double()))
     True
@@ -193,10 +193,10 @@ class SpectralConv(nn.Module):
 
     Examples
     --------
-    >>> theta = torch.arange(12) * torch.pi / 6
+    >>> theta = torch.arange(36) * torch.pi / 18
     >>> lb = LaplaceBeltrami.from_points(torch.stack([theta.cos(), theta.sin()], dim=1))
-    >>> SpectralConv(3, 5, k=8)(torch.randn(12, 3), lb).shape
-    torch.Size([12, 5])
+    >>> SpectralConv(3, 5, k=8)(torch.randn(36, 3), lb).shape
+    torch.Size([36, 5])
     """
 
     def __init__(
