@@ -13,6 +13,7 @@ from collections.abc import Callable, Mapping, Sequence
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor, nn
+from torch.nn.functional import linear
 
 from torchlb.diffusion import Diffusion, raw_of_time
 from torchlb.laplace_beltrami import LaplaceBeltrami
@@ -52,15 +53,16 @@ class GradientFeatures(nn.Module):
 
     def forward(self, x: Float[Tensor, "*B N C"], lb: LaplaceBeltrami) -> Float[Tensor, "*B N C"]:
         """The features of x, (N, C) or (B, N, C), in its shape."""
-        gradient = lb.local_gradient(x)  # (…, N, d, C)
-        if not self.rotations:
-            return torch.tanh((gradient * self.A(gradient)).sum(-2))
-        if not (lb.dim == 2):
+        if self.rotations and lb.dim != 2:
             raise ValueError(f"rotations need a surface, got dim={lb.dim}; use rotations=False")
-        real, imaginary = self.A_re(gradient), self.A_im(gradient)
-        first = real[..., 0, :] - imaginary[..., 1, :]
-        second = real[..., 1, :] + imaginary[..., 0, :]
-        return torch.tanh(gradient[..., 0, :] * first + gradient[..., 1, :] * second)
+        gradient = lb.local_gradient(x)  # (…, N, d, C)
+        if self.rotations:  # z ↦ Az of complex numbers is a real map of both parts side by side
+            upper = torch.cat([self.A_re.weight, -self.A_im.weight], dim=1)
+            lower = torch.cat([self.A_im.weight, self.A_re.weight], dim=1)
+            mapped = linear(gradient.flatten(-2), torch.cat([upper, lower])).view_as(gradient)
+        else:
+            mapped = self.A(gradient)
+        return torch.tanh((gradient * mapped).sum(-2))
 
 
 def _mlp(sizes: Sequence[int], dropout: bool) -> nn.Sequential:
@@ -68,7 +70,7 @@ def _mlp(sizes: Sequence[int], dropout: bool) -> nn.Sequential:
     layers: OrderedDict[str, nn.Module] = OrderedDict()
     for i in range(len(sizes) - 1):
         if i > 0:
-            layers[f"relu_{i}"] = nn.ReLU()
+            layers[f"relu_{i}"] = nn.ReLU(inplace=True)
         if i > 0 and dropout:
             layers[f"dropout_{i}"] = nn.Dropout(0.5)
         layers[f"linear_{i}"] = nn.Linear(sizes[i], sizes[i + 1])
