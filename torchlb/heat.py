@@ -26,7 +26,7 @@ from scipy.special import ive
 from torch import Tensor
 
 from torchlb.certificate import factorized
-from torchlb.sparse import csr_product
+from torchlb.sparse import csr_product, multiply
 
 __all__ = ["EXPANSIONS", "chebyshev_coefficients", "heat", "hyperbola"]
 
@@ -84,7 +84,7 @@ def _heat(
     y = torch.zeros_like(x, memory_format=torch.contiguous_format)
     terms = _terms(pattern, values, x, time, extent, expansion, tolerance, transposed)
     for columns, vector, coefficient, _ in terms:
-        y[:, columns] += _real(vector * _like(coefficient, vector))
+        _add_scaled(y, columns, vector, coefficient)
     return y
 
 
@@ -109,7 +109,7 @@ def _heat_backward(
     grad_t = torch.zeros_like(time)
     terms = _terms(pattern, values, grad, time, extent, expansion, tolerance, not transposed)
     for columns, vector, coefficient, derivative in terms:
-        grad_x[:, columns] += _real(vector * _like(coefficient, vector))
+        _add_scaled(grad_x, columns, vector, coefficient)
         along = (vector * x[:, columns]).sum(0)
         grad_t[columns] += _real(along * _like(derivative, vector)).to(time)
     return grad_x, grad_t
@@ -137,6 +137,14 @@ def _backward(ctx: Any, grad: Tensor) -> tuple[Any, ...]:
 
 
 _heat.register_autograd(_backward, setup_context=_save)
+
+
+def _add_scaled(y: Tensor, columns: Any, vector: Tensor, coefficient: np.ndarray) -> None:
+    """Add the real part of c_k v_k to some columns of y."""
+    if isinstance(columns, slice) and not vector.is_complex():
+        y[:, columns].addcmul_(vector, _like(coefficient, vector))
+    else:
+        y[:, columns] += _real(vector * _like(coefficient, vector))
 
 
 def _real(t: Tensor) -> Tensor:
@@ -218,12 +226,15 @@ def _chebyshev(
     c, slope, d, r = chebyshev_coefficients(times, extent[0], extent[1], tolerance)
     every = slice(None)
     yield every, x, c[0], slope[0]
+    crow, col, crow_t, col_t, order_t = pattern
+    if transposed:
+        crow, col, values = crow_t, col_t, values[order_t]
     scaled = values * (2 / (r * d))
     shift = extent[0] / (r * d)
-    before, v = x, (csr_product(pattern, scaled, x, transposed) + shift * x) / 2
+    before, v = x, (multiply(crow, col, scaled, x) + shift * x) / 2
     yield every, v, c[1], slope[1]
     for k in range(2, len(c)):
-        after = csr_product(pattern, scaled, v, transposed).add_(v, alpha=shift)
+        after = multiply(crow, col, scaled, v).add_(v, alpha=shift)
         before, v = v, after.sub_(before, alpha=r**-2)
         yield every, v, c[k], slope[k]
 
