@@ -1,4 +1,4 @@
-"""Pictures with matplotlib (`pip install torchlb[plot]`): a scalar on a surface or cloud, orders, convergence.
+"""Pictures with matplotlib (`pip install torchlb[plot]`): scalars, vectors, orders on a surface or cloud; convergence.
 
 Surfaces are drawn by the painter's algorithm: triangles projected, shaded and filled from back to front. That takes a
 second for 20,000 of them, and no graphics card.
@@ -14,28 +14,35 @@ from jaxtyping import Float, Int, Num
 from torch import Tensor
 
 from torchlb.drawing import (
+    INK,
     VIEW,
     Eye,
     axes_of,
     cloud_of,
     color_map,
+    draw_arrows,
     draw_dots,
     finish,
+    isolines_of,
     mesh_of,
     paint,
+    plain,
     values_of,
 )
 
-__all__ = ["plot_convergence", "plot_orders", "plot_points", "plot_surface"]
+__all__ = ["plot_convergence", "plot_orders", "plot_points", "plot_surface", "plot_vectors"]
 
 Vertices = Float[Tensor, "N 3"] | Float[np.ndarray, "N 3"]
 Faces = Int[Tensor, "F 3"] | Int[np.ndarray, "F 3"]
 Cloud = Float[Tensor, "N n"] | Float[np.ndarray, "N n"]
 Scalar = Num[Tensor, " N"] | Num[np.ndarray, " N"]
+Vectors = Float[Tensor, "N n"] | Float[np.ndarray, "N n"]
 ORDER_COLORS = ("#d55e00", "#e69f00", "#f0e442", "#56b4e9", "#009e73", "#0072b2", "#cc79a7")
 """By order reached, fallback first, the last for all beyond. Okabe and Ito's, distinct for the colour-blind too."""
 LINE_COLORS = ("#d55e00", "#56b4e9", "#0072b2", "#000000", "#e69f00", "#009e73", "#cc79a7")
 MARKERS = "osD^vP*"
+PALE = "0.88"
+"""Colour of a shape on which only arrows have one."""
 
 
 def plot_surface(
@@ -47,6 +54,8 @@ def plot_surface(
     title: str | None = None,
     cmap: str | None = None,
     symmetric: bool | None = None,
+    limits: tuple[float, float] | None = None,
+    levels: Sequence[float] = (),
     view: Eye | Sequence[Eye] = VIEW,
     label: str | None = None,
 ) -> Any:
@@ -62,7 +71,10 @@ def plot_surface(
     cmap : matplotlib's name; by default "RdBu_r" around zero, "viridis" otherwise, which the colour-blind can read.
     symmetric : whether zero is in the middle of the colours; by default if the values have both signs. The colours
         span the values but for the outer 1 % at either end, which a pointed end of the bar stands for.
-    view : elevation and azimuth of the eye, degrees; several are drawn below one another.
+    limits : least and greatest value that the colours tell apart, instead of those.
+    levels : values at which isolines are drawn.
+    view : elevation and azimuth of the eye, degrees; several are drawn below one another. A shape in the plane z = 0
+        is seen from above.
     label : of the colour bar, such as the unit.
 
     Returns
@@ -77,8 +89,9 @@ def plot_surface(
     ax = axes_of(ax)
     points, corners = mesh_of(vertices, faces)
     numbers = values_of(values, points)
-    shades, extend = color_map(numbers, cmap, symmetric)
-    paint(ax, points, corners, shades.to_rgba(numbers[corners].mean(axis=1)), view)
+    shades, extend = color_map(numbers, cmap, symmetric, limits)
+    isolines = isolines_of(numbers, corners, levels) if len(levels) else None
+    paint(ax, points, corners, shades.to_rgba(numbers[corners].mean(axis=1)), view, isolines)
     finish(ax, title, shades, extend, label)
     return ax
 
@@ -91,6 +104,7 @@ def plot_points(
     title: str | None = None,
     cmap: str | None = None,
     symmetric: bool | None = None,
+    limits: tuple[float, float] | None = None,
     view: Eye | Sequence[Eye] = VIEW,
     label: str | None = None,
     size: float | None = None,
@@ -102,7 +116,7 @@ def plot_points(
     points : (N, 2) or (N, 3) tensor or array.
     values : (N,).
     size : area of a disk, in square points (1/72 inch); by default smaller the more there are.
-    ax, title, cmap, symmetric, view, label : as for `plot_surface`.
+    ax, title, cmap, symmetric, limits, view, label : as for `plot_surface`.
 
     Returns
     -------
@@ -116,8 +130,67 @@ def plot_points(
     ax = axes_of(ax)
     places = cloud_of(points)
     numbers = values_of(values, places)
-    shades, extend = color_map(numbers, cmap, symmetric, "coolwarm")  # whose middle is no white
+    shades, extend = color_map(
+        numbers, cmap, symmetric, limits, "coolwarm"
+    )  # whose middle is no white
     draw_dots(ax, places, shades.to_rgba(numbers), view, size)
+    finish(ax, title, shades, extend, label)
+    return ax
+
+
+def plot_vectors(
+    vertices: Cloud,
+    faces: Faces | None,
+    vectors: Vectors,
+    values: Scalar | None = None,
+    *,
+    ax: Any = None,
+    title: str | None = None,
+    cmap: str | None = None,
+    symmetric: bool | None = None,
+    limits: tuple[float, float] | None = None,
+    view: Eye | Sequence[Eye] = VIEW,
+    label: str | None = None,
+    count: int = 400,
+) -> Any:
+    """A field of vectors as arrows at evenly spread points of a surface or cloud, such as ``lb.gradient(f)``.
+
+    Those that the surface hides are left out. The longest is twice as long as the distance between two of them.
+
+    Parameters
+    ----------
+    vertices : (N, 3); also (N, 2) for a cloud.
+    faces : (F, 3), or None for a cloud.
+    vectors : (N, 3), or (N, 2) in the plane. None is drawn where one is zero or not finite.
+    values : (N,), a scalar beneath black arrows. Without it the arrows are coloured, by their lengths.
+    count : number of arrows, on all sides of the shape.
+    ax, title, cmap, symmetric, limits, view, label : as for `plot_surface`.
+
+    Returns
+    -------
+    The axes.
+
+    Raises
+    ------
+    ImportError : without matplotlib.
+    ValueError : for vectors, values or faces that do not fit the vertices.
+    """
+    ax = axes_of(ax)
+    places, field = cloud_of(vertices), cloud_of(vectors, "vectors")
+    if field.shape != places.shape:
+        raise ValueError(f"vectors: expected {places.shape}, one a point, got {field.shape}")
+    corners = None if faces is None else mesh_of(places, faces)[1]
+    lengths = np.linalg.norm(field, axis=1)
+    numbers = lengths if values is None else values_of(values, places)
+    shades, extend = color_map(numbers, cmap, symmetric, limits)
+    painted = numbers if corners is None else numbers[corners].mean(axis=1)  # by dot or triangle
+    ground = plain(PALE, len(painted)) if values is None else shades.to_rgba(painted)
+    if corners is None:
+        draw_dots(ax, places, ground, view, None)
+    else:
+        paint(ax, places, corners, ground, view)
+    inks = shades.to_rgba(lengths) if values is None else plain(INK, len(places))
+    draw_arrows(ax, places, corners, field, inks, view, count)
     finish(ax, title, shades, extend, label)
     return ax
 
