@@ -179,6 +179,12 @@ def test_points_of_the_plane_keep_their_coordinates_apart_from_a_shift():
     assert np.allclose(np.ptp(drawn, axis=0), np.ptp(points.numpy(), axis=0), atol=1e-6)
 
 
+def test_points_of_the_plane_are_all_equally_near():
+    points = torch.rand(50, 2, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
+    colors = plot_points(points, torch.ones(50)).collections[0].get_facecolors()
+    assert np.ptp(colors, axis=0).max() < 1e-6
+
+
 def test_order_map_counts_points_and_shows_the_lowest_order_of_a_triangle():
     vertices = torch.tensor([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [1, 1, 0]])
     faces = torch.tensor([[0, 1, 2], [1, 3, 2]])

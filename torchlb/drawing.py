@@ -192,7 +192,7 @@ def paint(
 
 
 def isolines_of(
-    values: np.ndarray, faces: np.ndarray, levels: Sequence[float]
+    values: np.ndarray, faces: np.ndarray, levels: Sequence[float] | np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """Segments on which the linear interpolant has one of the levels.
 
@@ -211,9 +211,10 @@ def isolines_of(
     return np.concatenate(found), np.concatenate(shares)
 
 
-def _faded(colors: np.ndarray, height: np.ndarray) -> np.ndarray:
-    """Colours paler with the distance from the eye."""
-    depth = (height.max() - height) / max(np.ptp(height), 1e-300)
+def _faded(colors: np.ndarray, flat: np.ndarray) -> np.ndarray:
+    """Colours paler with the distance from the eye; as they are where all are equally far, but for rounding."""
+    height = flat[:, 2]
+    depth = (height.max() - height) / max(np.ptp(height), 1e-9 * np.ptp(flat), 1e-300)
     pale = colors.copy()
     pale[:, :3] += (1 - pale[:, :3]) * 0.5 * depth[:, None]
     return pale
@@ -227,7 +228,7 @@ def draw_dots(
     for flat, _ in _stacked(points, view):
         order = flat[:, 2].argsort()
         x, y = flat[order, :2].T
-        pale = _faded(colors, flat[:, 2])[order]
+        pale = _faded(colors, flat)[order]
         ax.scatter(x, y, s=area, c=pale, linewidths=0, rasterized=True)
 
 
@@ -263,7 +264,7 @@ def draw_arrows(
     for flat, eye in _stacked(points, view):
         seen = tails if faces is None else tails[_visible(flat, faces, tails)]
         seen = seen[flat[seen, 2].argsort()]
-        inks = (_faded(colors, flat[:, 2]) if faces is None else colors)[seen]
+        inks = (_faded(colors, flat) if faces is None else colors)[seen]
         x, y = flat[seen, :2].T
         u, v = scale * _project(field[seen], eye)[:, :2].T
         ax.quiver(x, y, u, v, color=inks, minlength=0.5, zorder=2, **options)

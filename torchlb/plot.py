@@ -55,7 +55,7 @@ def plot_surface(
     cmap: str | None = None,
     symmetric: bool | None = None,
     limits: tuple[float, float] | None = None,
-    levels: Sequence[float] = (),
+    levels: Sequence[float] | Float[np.ndarray, " L"] = (),
     view: Eye | Sequence[Eye] = VIEW,
     label: str | None = None,
 ) -> Any:
