@@ -169,7 +169,7 @@ def paint(
         shaded = colors.copy()
         shaded[:, :3] *= (0.45 + 0.55 * np.clip(normal @ light, 0, 1))[:, None]
         polygons, depth = list(corners[..., :2]), corners[..., 2].mean(axis=1)
-        width = np.full(len(faces), 0.2)  # closes the seams between triangles
+        width = np.full(len(faces), 0.5)  # closes the seams between triangles
         if isolines is not None:
             edges, share = isolines
             ends = flat[edges[..., 0]] * (1 - share) + flat[edges[..., 1]] * share  # (S, 2, 3)
