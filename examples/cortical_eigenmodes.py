@@ -52,7 +52,9 @@ def main(arguments=None):
     ):
         for ax, i in zip(row, MODES, strict=True):
             mode = modes[:, i] * (modes[:, i] @ basis.eigenvectors[:, i]).sign()
-            title = f"{library}: λ_{i} = {eigenvalues[i]:.4g}" + (unit and f" / {unit}²")
+            title = f"{library}: $\\lambda_{{{i}}}$ = {eigenvalues[i]:.4g}" + (
+                unit and f" / {unit}²"
+            )
             plot_surface(vertices, faces, mode, ax=ax, levels=[0.0], title=title, view=LEFT)
     save(figure, options.output, "cortical_eigenmodes.png")
 

@@ -47,7 +47,7 @@ def main(arguments=None):
         scale = {"limits": (-7.0, -1.0), "cmap": "magma", "label": "log₁₀"}
         plot_surface(vertices, faces, error, ax=axes[name], title=name, **scale)
     plot_convergence(sizes, table, ax=axes["table"], title="Δf of a smooth f")
-    figure.suptitle(f"error of Δf on {len(f):,} vertices, in root mean squares of Δf")
+    figure.suptitle(f"|error of Δf| / root mean square of Δf, {len(f):,} vertices")
     save(figure, options.output, "cotangent_vs_orders.png")
 
 

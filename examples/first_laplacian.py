@@ -38,11 +38,12 @@ def main(arguments=None):
     plot_vectors(vertices, faces, on_mesh.gradient(f), f, ax=axes[0, 0], title="f and its gradient")
     plot_surface(vertices, faces, on_mesh(f), ax=axes[0, 1], title="Δf on the mesh")
     scale = {"limits": (-5.5, -2.5), "cmap": "viridis", "label": "log₁₀"}
-    title = "error of Δf, in root mean squares of Δf: "
-    plot_surface(
-        vertices, faces, errors["mesh"].log10(), ax=axes[1, 0], title=title + "mesh", **scale
-    )
-    plot_points(vertices, errors["cloud"].log10(), ax=axes[1, 1], title=title + "cloud", **scale)
+    for ax, name in zip(axes[1], errors, strict=True):
+        shown = {"title": f"|error of Δf| / root mean square of Δf, {name}", **scale}
+        if name == "mesh":
+            plot_surface(vertices, faces, errors[name].log10(), ax=ax, **shown)
+        else:
+            plot_points(vertices, errors[name].log10(), ax=ax, **shown)
     save(figure, options.output, "first_laplacian.png")
 
 
