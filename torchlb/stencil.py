@@ -44,7 +44,7 @@ MAX_DOMINANCE_AT_BOUNDARY = 6.0
 MAX_SIZE_AT_BOUNDARY = 2.5
 """Points of a stencil per polynomial that holds points of the boundary."""
 MAX_RESIDUAL = 1e-10
-MAX_MISFIT = 0.05
+MAX_MISFIT = 0.07
 MAX_MISFIT_ON_MESH = 0.03
 """Heights that no polynomial of the stencil's degree follows: a crease, an unresolved fold, noise. Triangles know more
 of the surface there than a fit, points alone do not."""
