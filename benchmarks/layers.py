@@ -1,8 +1,9 @@
 """Speed of the layers, as Markdown tables: python benchmarks/layers.py [--quick] [--device cuda].
 
 The sparse product forward and backward, beside torch's own on the same matrix; and a training step of DiffusionNet,
-beside the same network on DiffusionNet's own operators and sparse format (benchmarks/learning.py). The rows of a table
-are timed in turns, so that a busy machine slows all of them, and the median is printed.
+beside the same network on DiffusionNet's own operators and sparse format (benchmarks/learning.py); an epoch on eight
+shapes, one by one and in a batch. The rows of a table are timed in turns, so that a busy machine slows all of them,
+and the median is printed.
 """
 
 from __future__ import annotations
@@ -97,6 +98,20 @@ def step_of(lb: object, method: str, width: int, k: int, device: str) -> Callabl
     return step
 
 
+def epoch(shapes: list[LaplaceBeltrami], width: int, k: int, repeats: int, device: str) -> None:
+    """A training step for each shape, against a single step for all of them."""
+    batch = LaplaceBeltrami.batch(shapes)
+    for method in ("spectral", "full"):
+        alone = [step_of(lb, method, width, k, device) for lb in shapes]
+        steps = {
+            "one by one, 8 steps": lambda alone=alone: [step() for step in alone],
+            "batch, 1 step": step_of(batch, method, width, k, device),
+        }
+        sizes = [lb.num_points for lb in shapes]
+        title = f"Epoch of 8 shapes of {min(sizes):,} to {max(sizes):,} points, {method}"
+        table(title, medians(steps, repeats, device), "one by one, 8 steps")
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     parser.add_argument("--quick", action="store_true", help="small, few repeats: does it run?")
@@ -122,6 +137,16 @@ def main() -> None:
     product(stencil, options.channels, options.repeats, options.device)
     shape = {"torchlb": stencil, "cotangent": cotangent, "original": original}
     training_step(shape, options.channels, options.k, options.repeats, options.device)
+    for smallest, largest in ((700, 2000), (3000, 6000)):
+        scale = options.points / 10000
+        shapes = [
+            LaplaceBeltrami.from_mesh(*StarShaped().mesh(int(scale * n)))
+            for n in np.linspace(smallest, largest, 8)
+        ]
+        for lb in shapes:
+            lb.eigenbasis(options.k)
+            lb.float().to(options.device)
+        epoch(shapes, options.channels, options.k, options.repeats, options.device)
 
 
 if __name__ == "__main__":

@@ -12,6 +12,7 @@ from torchlb import (
     LaplaceBeltrami,
     heat_flow,
 )
+from torchlb.diffusion_net import _Dropout
 from torchlb.surfaces import Circle, Sphere, Torus
 
 WIDTH, HIDDEN, BLOCKS = 8, [12, 10], 2
@@ -174,6 +175,27 @@ def test_dropout_is_there_while_training_only(mesh):
     assert not torch.equal(net(lb.points, lb), net(lb.points, lb))
     net.eval()
     assert torch.equal(net(lb.points, lb), net(lb.points, lb))
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64, torch.bfloat16])
+def test_dropout_keeps_half_and_doubles_it(dtype):
+    """Each value by a coin of its own, those of a seed again, the same ones in the gradient; any other share too."""
+    dropout, x = _Dropout(0.5), torch.ones(150, 77, dtype=dtype, requires_grad=True)
+    torch.manual_seed(0)
+    y = dropout(x)
+    assert y.dtype == dtype
+    assert set(y.unique().tolist()) == {0.0, 2.0}
+    for axis in (0, 1):  # five standard deviations
+        share = (y > 0).double().mean(axis)
+        assert (share - 0.5).abs().max() < 2.5 / y.shape[axis] ** 0.5
+    assert torch.equal(torch.autograd.grad(y.sum(), x)[0], y)
+    assert not torch.equal(dropout(x), y)
+    torch.manual_seed(0)
+    assert torch.equal(dropout(x), y)
+    dropout.p = 0.9
+    assert (dropout(x) > 0).double().mean() < 0.15
+    assert dropout.eval()(x) is x
+    assert _Dropout(0.5)(x[:0]).shape == (0, 77)
 
 
 def test_a_curve_has_gradient_features_without_rotations():

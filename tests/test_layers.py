@@ -92,6 +92,23 @@ def test_a_batch_of_eight_shapes_gives_what_they_give_one_by_one(eight, name):
         torch.testing.assert_close(a, b, rtol=1e-3, atol=1e-4 * float(b.abs().max()))
 
 
+@pytest.mark.parametrize("cached", [1, 4 * 250, 4 * 10000])
+def test_a_batch_diffuses_in_blocks_of_shapes(eight, monkeypatch, cached):
+    """One shape, a few or all at a time: the same, derivatives in x and t too."""
+    batch = LaplaceBeltrami.batch(eight)
+    x, time = features(batch).requires_grad_(), torch.tensor([0.0, 0.01, 0.05, 0.2])
+    time.requires_grad_()
+
+    def results():
+        y = heat_flow(batch, x, time, method="chebyshev")
+        return y, *torch.autograd.grad(y.pow(3).sum(), (x, time))
+
+    expected = results()
+    monkeypatch.setattr("torchlb.heat.CACHED", cached)
+    for a, b in zip(results(), expected, strict=True):
+        torch.testing.assert_close(a, b, rtol=1e-5, atol=1e-6 * float(b.abs().max()))
+
+
 def test_a_batch_is_block_diagonal(eight):
     """Δ, gradient, Δx, mass, certificate and report of the shapes below each other; offsets, signatures."""
     batch = LaplaceBeltrami.batch(eight)

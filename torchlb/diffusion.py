@@ -147,10 +147,11 @@ def _expanded(
     extent = lb.spectral_extent or find_spectral_extent(lb)
     pattern = [lb.crow, lb.col, lb.crow_t, lb.col_t, lb.order_t]
     values = lb.values.to(x.dtype)
+    options = extent, expansion, tolerance, lb.sizes or (lb.num_points,)
     if x.ndim == 2:
-        return heat(pattern, values, x, time, extent, expansion, tolerance)
+        return heat(pattern, values, x, time, *options)
     columns = x.transpose(0, 1).flatten(1)
-    y = heat(pattern, values, columns, time.repeat(len(x)), extent, expansion, tolerance)
+    y = heat(pattern, values, columns, time.repeat(len(x)), *options)
     return y.view(x.shape[1], x.shape[0], x.shape[2]).transpose(0, 1)
 
 

@@ -60,7 +60,7 @@ class Eigenbasis:
 
     def to_basis(self, f: Float[Tensor, "*B N C"]) -> Float[Tensor, "*S k C"]:
         """Coefficients Φᵀ(πf), (…, k, C), or (…, S, k, C) for a batch of shapes."""
-        return self._analyse(self.eigenvectors * self.mass[:, None], f)
+        return self._analyse(self.eigenvectors, self.mass.to(f.dtype)[:, None] * f)
 
     def to_basis_obliquely(self, f: Float[Tensor, "*B N C"]) -> Float[Tensor, "*S k C"]:
         """Coefficients Wᵀf: zero on every left-over eigenvector of Δ, which Φᵀ(πf) is not."""

@@ -14,7 +14,9 @@ expansion w_k of the gradient g: Σ c_k w_k in x, and Σ c_k'(t) ⟨w_k, x⟩ in
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Sequence
+from itertools import accumulate
 from typing import Any
 
 import numpy as np
@@ -26,7 +28,7 @@ from scipy.special import ive
 from torch import Tensor
 
 from torchlb.certificate import factorized
-from torchlb.sparse import csr_product
+from torchlb.sparse import csr_product, multiply
 
 __all__ = ["EXPANSIONS", "chebyshev_coefficients", "heat", "hyperbola"]
 
@@ -36,7 +38,9 @@ SECTOR = 0.4
 """Half angle (radians) around the negative axis that the hyperbola stays clear of; the largest seen is 0.35."""
 WINDOW = 10.0
 """Ratio of the times that share one hyperbola."""
-Term = tuple[Any, Tensor, np.ndarray, np.ndarray]
+CACHED = 2**18
+"""Values of a vector that stays in a processor's cache from product to product."""
+Term = tuple[tuple[slice, Any], Tensor, np.ndarray, np.ndarray]
 
 
 def heat(
@@ -47,6 +51,7 @@ def heat(
     extent: tuple[float, float],
     expansion: str,
     tolerance: float,
+    sizes: Sequence[int],
 ) -> Float[Tensor, "N C"]:
     """e^{t_c L}x_c for every channel c, differentiable once in x and t.
 
@@ -58,10 +63,12 @@ def heat(
     extent : (R, b): the spectrum lies in the ellipse of half axes R/2, b around −R/2.
     expansion : one of `EXPANSIONS`.
     tolerance : of the result, relative to x.
+    sizes : numbers of rows of the diagonal blocks of L; (N,) for one shape.
     """
     # The rational sum cancels: its terms are some hundred times larger than it.
     wide = x.double() if expansion == "rational" else x
-    y = _heat(list(pattern), values, wide, time, list(extent), expansion, tolerance, False)
+    options = list(extent), expansion, tolerance, list(sizes)
+    y = _heat(list(pattern), values, wide, time, *options, False)
     return y.to(x.dtype)
 
 
@@ -69,7 +76,7 @@ def heat(
     "torchlb::heat",
     mutates_args=(),
     schema="(Tensor[] pattern, Tensor values, Tensor x, Tensor time, float[] extent, str expansion, "
-    "float tolerance, bool transposed) -> Tensor",
+    "float tolerance, SymInt[] sizes, bool transposed) -> Tensor",
 )
 def _heat(
     pattern: Sequence[Tensor],
@@ -79,12 +86,13 @@ def _heat(
     extent: Sequence[float],
     expansion: str,
     tolerance: float,
+    sizes: Sequence[int],
     transposed: bool,
 ) -> Tensor:
     y = torch.zeros_like(x, memory_format=torch.contiguous_format)
-    terms = _terms(pattern, values, x, time, extent, expansion, tolerance, transposed)
-    for columns, vector, coefficient, _ in terms:
-        y[:, columns] += _real(vector * _like(coefficient, vector))
+    terms = _terms(pattern, values, x, time, extent, expansion, tolerance, sizes, transposed)
+    for where, vector, coefficient, _ in terms:
+        _add_scaled(y, where, vector, coefficient)
     return y
 
 
@@ -92,7 +100,7 @@ def _heat(
     "torchlb::heat_backward",
     mutates_args=(),
     schema="(Tensor[] pattern, Tensor values, Tensor x, Tensor time, float[] extent, str expansion, "
-    "float tolerance, bool transposed, Tensor grad) -> (Tensor, Tensor)",
+    "float tolerance, SymInt[] sizes, bool transposed, Tensor grad) -> (Tensor, Tensor)",
 )
 def _heat_backward(
     pattern: Sequence[Tensor],
@@ -102,16 +110,18 @@ def _heat_backward(
     extent: Sequence[float],
     expansion: str,
     tolerance: float,
+    sizes: Sequence[int],
     transposed: bool,
     grad: Tensor,
 ) -> tuple[Tensor, Tensor]:
     grad_x = torch.zeros_like(x, memory_format=torch.contiguous_format)
     grad_t = torch.zeros_like(time)
-    terms = _terms(pattern, values, grad, time, extent, expansion, tolerance, not transposed)
-    for columns, vector, coefficient, derivative in terms:
-        grad_x[:, columns] += _real(vector * _like(coefficient, vector))
-        along = (vector * x[:, columns]).sum(0)
-        grad_t[columns] += _real(along * _like(derivative, vector)).to(time)
+    options = extent, expansion, tolerance, sizes, not transposed
+    terms = _terms(pattern, values, grad, time, *options)
+    for where, vector, coefficient, derivative in terms:
+        _add_scaled(grad_x, where, vector, coefficient)
+        along = (vector * x[where]).sum(0)
+        grad_t[where[1]] += _real(along * _like(derivative, vector)).to(time)
     return grad_x, grad_t
 
 
@@ -133,10 +143,20 @@ def _save(ctx: Any, inputs: tuple[Any, ...], output: Tensor) -> None:
 def _backward(ctx: Any, grad: Tensor) -> tuple[Any, ...]:
     *pattern, values, x, time = ctx.saved_tensors
     gradients = _heat_backward(pattern, values, x, time, *ctx.options, grad)
-    return [None] * len(pattern), None, *gradients, None, None, None, None
+    return [None] * len(pattern), None, *gradients, None, None, None, None, None
 
 
 _heat.register_autograd(_backward, setup_context=_save)
+
+
+def _add_scaled(
+    y: Tensor, where: tuple[slice, Any], vector: Tensor, coefficient: np.ndarray
+) -> None:
+    """Add the real part of c_k v_k to some rows and columns of y."""
+    if isinstance(where[1], slice) and not vector.is_complex():
+        y[where].addcmul_(vector, _like(coefficient, vector))
+    else:
+        y[where] += _real(vector * _like(coefficient, vector))
 
 
 def _real(t: Tensor) -> Tensor:
@@ -155,14 +175,15 @@ def _terms(
     extent: Sequence[float],
     expansion: str,
     tolerance: float,
+    sizes: Sequence[int],
     transposed: bool,
 ) -> Iterator[Term]:
-    """The terms (columns, v_k, c_k, c_k') of the expansion, with L or its transpose."""
+    """The terms ((rows, columns), v_k, c_k, c_k') of the expansion, with L or its transpose."""
     times = time.detach().double().cpu().numpy()
     if len(times) == 0 or len(x) == 0:
         return iter(())
     if expansion == "chebyshev":
-        return _chebyshev(pattern, values, x, times, extent, tolerance, transposed)
+        return _chebyshev(pattern, values, x, times, extent, tolerance, sizes, transposed)
     return _rational(pattern, values, x, times, extent[0], tolerance, transposed)
 
 
@@ -213,19 +234,39 @@ def _chebyshev(
     times: np.ndarray,
     extent: Sequence[float],
     tolerance: float,
+    sizes: Sequence[int],
     transposed: bool,
 ) -> Iterator[Term]:
     c, slope, d, r = chebyshev_coefficients(times, extent[0], extent[1], tolerance)
-    every = slice(None)
-    yield every, x, c[0], slope[0]
-    scaled = values * (2 / (r * d))
+    crow, col, crow_t, col_t, order_t = pattern
+    if transposed:
+        crow, col, values = crow_t, col_t, values[order_t]
     shift = extent[0] / (r * d)
-    before, v = x, (csr_product(pattern, scaled, x, transposed) + shift * x) / 2
-    yield every, v, c[1], slope[1]
-    for k in range(2, len(c)):
-        after = csr_product(pattern, scaled, v, transposed).add_(v, alpha=shift)
-        before, v = v, after.sub_(before, alpha=r**-2)
-        yield every, v, c[k], slope[k]
+    for rows, matrix in _blocks(crow, col, values * (2 / (r * d)), x, sizes):
+        where = rows, slice(None)
+        before = x[rows]
+        yield where, before, c[0], slope[0]
+        v = (multiply(*matrix, before) + shift * before) / 2
+        yield where, v, c[1], slope[1]
+        for k in range(2, len(c)):
+            after = multiply(*matrix, v).add_(v, alpha=shift)
+            before, v = v, after.sub_(before, alpha=r**-2)
+            yield where, v, c[k], slope[k]
+
+
+def _blocks(
+    crow: Tensor, col: Tensor, values: Tensor, x: Tensor, sizes: Sequence[int]
+) -> Iterator[tuple[slice, tuple[Tensor, Tensor, Tensor]]]:
+    """Diagonal blocks (rows, (crow, col, values)): on the CPU as many together as stay in its cache, else all."""
+    limit = CACHED // x.shape[1] if x.device.type == "cpu" else len(x)
+    ends = list(accumulate(sizes))
+    start = 0
+    for end, following in zip(ends, [*ends[1:], math.inf], strict=True):
+        if following - start > limit:
+            first, last = int(crow[start]), int(crow[end])
+            pattern = crow[start : end + 1] - first, col[first:last] - start
+            yield slice(start, end), (*pattern, values[first:last])
+            start = end
 
 
 def hyperbola(spread: float, tolerance: float) -> tuple[np.ndarray, np.ndarray]:
@@ -274,12 +315,13 @@ def _rational(
     tolerance: float,
     transposed: bool,
 ) -> Iterator[Term]:
+    every = slice(None)
     short = np.flatnonzero(times * radius <= 1e-5)
     if len(short):  # 1 + tL, exact to 1e-10; a hyperbola would lose digits
         columns = torch.from_numpy(short).to(x.device)
         part, t = x[:, columns].contiguous(), times[short]
-        yield columns, part, np.ones_like(t), np.zeros_like(t)
-        yield columns, csr_product(pattern, values, part, transposed), t, np.ones_like(t)
+        yield (every, columns), part, np.ones_like(t), np.zeros_like(t)
+        yield (every, columns), csr_product(pattern, values, part, transposed), t, np.ones_like(t)
     rest = np.flatnonzero(times * radius > 1e-5)
     crow, col = (p.cpu().numpy() for p in pattern[:2])
     entries = values.detach().double().cpu().numpy()
@@ -296,5 +338,5 @@ def _rational(
             vector = torch.from_numpy(lu.solve(right, "T" if transposed else "N"))
             c = w * np.exp(t * z)
             lack, slope = lack - (c / z).real, slope - c.real
-            yield columns, vector.to(x.device, x.dtype.to_complex()), c, z * c
-        yield columns, part, lack, slope
+            yield (every, columns), vector.to(x.device, x.dtype.to_complex()), c, z * c
+        yield (every, columns), part, lack, slope

@@ -22,7 +22,7 @@ with warnings.catch_warnings():  # torch says once, at the first CSR tensor, tha
     warnings.simplefilter("ignore")
     torch.sparse_csr_tensor([0, 1], [0], [1.0], (1, 1))
 
-__all__ = ["csr_product", "from_scipy", "matmul", "to_scipy", "transpose_pattern"]
+__all__ = ["csr_product", "from_scipy", "matmul", "multiply", "to_scipy", "transpose_pattern"]
 
 
 def transpose_pattern(
@@ -89,6 +89,23 @@ def _csr(crow: Tensor, col: Tensor, values: Tensor, num_cols: int) -> Tensor:
     return torch.sparse_csr_tensor(crow, col, values, shape, check_invariants=False)
 
 
+def multiply(
+    crow: Int[Tensor, " rows_plus_1"],
+    col: Int[Tensor, " nnz"],
+    values: Float[Tensor, " nnz"],
+    x: Float[Tensor, "cols C"],
+) -> Float[Tensor, "rows C"]:
+    """A x alone, for operations with derivatives of their own; values and x of one type, at least float32."""
+    x = x.contiguous()
+    if x.device.type == "cpu" and x.dtype == torch.float32 and x.numel():
+        # A row of the result is a weighted sum of rows of x; in this type bags beat MKL twofold.
+        return embedding_bag(
+            col, x, crow, mode="sum", per_sample_weights=values, include_last_offset=True
+        )
+    with torch.autocast(x.device.type, enabled=False):
+        return _csr(crow, col, values, len(x)) @ x
+
+
 @torch.library.custom_op(
     "torchlb::csr_product",
     mutates_args=(),
@@ -99,17 +116,8 @@ def _product(pattern: Sequence[Tensor], values: Tensor, x: Tensor, transposed: b
     crow, col, crow_t, col_t, order_t = pattern
     if transposed:
         crow, col, values = crow_t, col_t, values.index_select(0, order_t)
-    dtype, device = _compute_dtype(values, x), x.device.type
-    weights, dense = values.to(dtype), x.to(dtype).contiguous()
-    with torch.autocast(device, enabled=False):
-        if device == "cpu" and dtype == torch.float32 and x.numel():
-            # A row of the result is a weighted sum of rows of x; in this type bags beat MKL twofold.
-            result = embedding_bag(
-                col, dense, crow, mode="sum", per_sample_weights=weights, include_last_offset=True
-            )
-        else:
-            result = _csr(crow, col, weights, len(x)) @ dense
-    return result.to(_result_dtype(values, x))
+    dtype = _compute_dtype(values, x)
+    return multiply(crow, col, values.to(dtype), x.to(dtype)).to(_result_dtype(values, x))
 
 
 @torch.library.custom_op(
