@@ -207,7 +207,9 @@ def certify(
             free = rows.rung < len(ladder.rungs)
             blamed = _responsible(matrix, mass / areas, feed, free)
             movable = blamed[free[blamed]]
-            if len(movable) == 0 and not result.holds:
+            reach = 0
+            while len(movable) == 0 and not result.holds and reach < len(blamed):
+                reach = len(blamed)
                 blamed = _around(matrix, blamed)
                 movable = blamed[free[blamed]]
             if len(movable) == 0 or rounds == MAX_ROUNDS:
