@@ -22,7 +22,7 @@ demo: .venv/installed-demo ## run the demo, on a mesh of yours with MESH=path
 	$(BIN)/python examples/demo.py $(if $(MESH),--mesh "$(MESH)")
 
 test: lint ## lint, types, tests, doctests, examples
-	$(BIN)/python -m pytest
+	$(BIN)/python -m pytest -n auto --maxprocesses 8 --dist worksteal
 
 lint: .venv/installed-dev ## ruff and pyright
 	$(BIN)/ruff check

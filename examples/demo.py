@@ -1,6 +1,6 @@
 """A high-order Laplacian on a real surface: its report, its accuracy beside the cotangent's, two pictures.
 
-Usage: python examples/demo.py [--mesh FILE] [--order 3] [--out demo_output] [--quick]
+Usage: python examples/demo.py [--mesh FILE] [--order 3] [--output demo_output] [--quick]
 """
 
 import argparse
@@ -8,34 +8,18 @@ import sys
 import time
 from pathlib import Path
 
-import matplotlib as mpl
-
-mpl.use("Agg")  # pictures go to files; no screen is needed
 import matplotlib.pyplot as plt
 import numpy as np
 import torch
 import trimesh
+from _common import cortex
 from tqdm import tqdm
 
 from torchlb import LaplaceBeltrami, clean_mesh
 from torchlb.plot import plot_convergence, plot_orders, plot_points, plot_surface
-from torchlb.surfaces import Ellipsoid, Torus, smooth_function
+from torchlb.surfaces import Ellipsoid, smooth_function
 
 SIDES = [(15.0, 200.0), (15.0, 20.0)]  # views of the user's surface: elevation, azimuth
-
-
-def cortex():
-    """The left cortical surface fsaverage5, mm: 10,242 vertices that come with nilearn. A torus without it."""
-    try:
-        from nilearn.datasets import fetch_surf_fsaverage
-        from nilearn.surface import load_surf_mesh
-    except ImportError:
-        print("nilearn is not installed, so a torus stands in for its cortex (pip install nilearn)")
-        return *Torus().mesh(6000), "torus", ""
-    surface = load_surf_mesh(fetch_surf_fsaverage("fsaverage5")["pial_left"])  # no download
-    vertices = np.asarray(surface.coordinates, dtype=np.float64)
-    faces = np.asarray(surface.faces, dtype=np.int64)
-    return torch.tensor(vertices), torch.tensor(faces), "fsaverage5 (left pial surface)", "mm"
 
 
 def read(path):
@@ -120,11 +104,11 @@ def main(arguments=None):
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--mesh", type=Path, help="a mesh or cloud, any file that trimesh reads")
     parser.add_argument("--order", type=int, default=3, help="order of accuracy (default: 3)")
-    parser.add_argument("--out", type=Path, default=Path("demo_output"), help="for the pictures")
+    parser.add_argument("--output", type=Path, default=Path("demo_output"), help="for the pictures")
     parser.add_argument("--quick", action="store_true", help="a smaller table")
     options = parser.parse_args(arguments)
     try:
-        vertices, faces, name, unit = read(options.mesh) if options.mesh else cortex()
+        vertices, faces, name, unit = read(options.mesh) if options.mesh else cortex("pial_left")
         start = time.perf_counter()
         if faces is None:
             lb = LaplaceBeltrami.from_points(vertices, order=options.order)
@@ -138,10 +122,10 @@ def main(arguments=None):
         print(lb.certificate)
     sizes = [250, 500, 1000] if options.quick else [500, 1000, 2000, 4000, 8000]
     errors = accuracy(sizes)
-    options.out.mkdir(parents=True, exist_ok=True)
-    draw_accuracy(sizes, errors, options.out / "accuracy.png")
-    draw_surface(vertices, faces, lb, name, unit, options.out / "surface.png")
-    print(f"\n{options.out / 'accuracy.png'}\n{options.out / 'surface.png'}")
+    options.output.mkdir(parents=True, exist_ok=True)
+    draw_accuracy(sizes, errors, options.output / "accuracy.png")
+    draw_surface(vertices, faces, lb, name, unit, options.output / "surface.png")
+    print(f"\n{options.output / 'accuracy.png'}\n{options.output / 'surface.png'}")
     return 0
 
 

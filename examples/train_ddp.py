@@ -1,6 +1,6 @@
 """The same training on one process and on several: DiffusionNet learns the mean curvature of ellipsoids.
 
-Usage: python examples/train_ddp.py [--out ddp_output] [--steps 40]
+Usage: python examples/train_ddp.py [--output ddp_output] [--steps 40]
        torchrun --nproc_per_node=2 examples/train_ddp.py
 """
 
@@ -37,7 +37,8 @@ def train(rank, processes, options):
     net = DiffusionNet(3, 1, 16, 2, dropout=False, diffusion_method="spectral", k=16).double()
     model = DistributedDataParallel(net) if processes > 1 else net
     optimizer = torch.optim.Adam(model.parameters(), lr=5e-3)
-    mine = [shape(i, options.points, options.out / "cache") for i in range(SHAPES)][rank::processes]
+    cache = options.output / "cache"
+    mine = [shape(i, options.points, cache) for i in range(SHAPES)][rank::processes]
     losses = []
     for _ in tqdm(range(options.steps), "training", disable=rank > 0, delay=2):
         optimizer.zero_grad()
@@ -54,7 +55,7 @@ def train(rank, processes, options):
 
 def main():
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--out", type=Path, default=Path("ddp_output"), help="cache and picture")
+    parser.add_argument("--output", type=Path, default=Path("ddp_output"), help="cache and picture")
     parser.add_argument("--steps", type=int, default=40)
     parser.add_argument("--points", type=int, default=500, help="of each shape")
     options = parser.parse_args()
@@ -64,11 +65,11 @@ def main():
         dist.init_process_group("gloo")
     losses = train(rank, processes, options)
     if rank == 0:
-        (options.out / f"losses_{processes}.json").write_text(json.dumps(losses))
+        (options.output / f"losses_{processes}.json").write_text(json.dumps(losses))
         plt.semilogy(losses)
         plt.gca().set(xlabel="step", ylabel="loss", title=f"{processes} process(es)")
-        plt.savefig(options.out / "loss.png", dpi=130)
-        print(f"loss {losses[0]:.4f} → {losses[-1]:.4f}; {options.out / 'loss.png'}")
+        plt.savefig(options.output / "loss.png", dpi=130)
+        print(f"loss {losses[0]:.4f} → {losses[-1]:.4f}; {options.output / 'loss.png'}")
     if processes > 1:
         dist.destroy_process_group()
 

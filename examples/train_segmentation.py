@@ -116,8 +116,10 @@ def main(arguments=None):
     parser.add_argument("--epochs", type=int, default=30)
     parser.add_argument("--width", type=int, default=32, help="channels of the network")
     parser.add_argument("--k", type=int, default=64, help="eigenpairs")
-    parser.add_argument("--out", type=Path, default=Path("segmentation_output"))
-    parser.add_argument("--resume", action="store_true", help="go on from the checkpoint in --out")
+    parser.add_argument("--output", type=Path, default=Path("segmentation_output"))
+    parser.add_argument(
+        "--resume", action="store_true", help="go on from the checkpoint in --output"
+    )
     options = parser.parse_args(arguments)
     shapes = [decimated(*shape, options.decimate) for shape in read(options.data)]
     if options.test == "clouds":  # which have no cotangent operator: the stencil of points serves
@@ -127,7 +129,7 @@ def main(arguments=None):
         lb = load_or_build(
             vertices,
             faces,
-            cache=options.out / "operators",
+            cache=options.output / "operators",
             operator="stencil" if faces is None else options.operator,
             k=options.k,
             progress=False,
@@ -146,7 +148,7 @@ def main(arguments=None):
         k=options.k,
     )
     optimizer = torch.optim.Adam(net.parameters(), lr=3e-3)
-    first, checkpoint = 0, options.out / "checkpoint.pt"
+    first, checkpoint = 0, options.output / "checkpoint.pt"
     if options.resume and checkpoint.exists():
         state = torch.load(checkpoint)
         net.load_state_dict(state["net"])
@@ -160,9 +162,9 @@ def main(arguments=None):
             torch.save(state | {"epoch": epoch + 1}, checkpoint.with_suffix(".new"))
             os.replace(checkpoint.with_suffix(".new"), checkpoint)  # whole or not at all
     accuracy, predicted = evaluate(net, test)
-    draw(shapes[2::3][:3], predicted[:3], options.out / "labels.png")
+    draw(shapes[2::3][:3], predicted[:3], options.output / "labels.png")
     print(f"accuracy on {len(test)} test {options.test}: {accuracy:.3f}")
-    print(f"{options.out / 'labels.png'}\n{checkpoint}")
+    print(f"{options.output / 'labels.png'}\n{checkpoint}")
     return accuracy
 
 

@@ -19,7 +19,7 @@ def run(launcher, out):
             sys.executable,
             *launcher,
             str(EXAMPLE),
-            "--out",
+            "--output",
             str(out),
             "--points",
             "150",

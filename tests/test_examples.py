@@ -14,6 +14,7 @@ from torchlb.surfaces import Ellipsoid
 pytest.importorskip("matplotlib")
 EXAMPLES = Path(__file__).parents[1] / "examples"
 PNG = b"\x89PNG"
+sys.path.append(str(EXAMPLES))  # as python does for a script
 
 
 def load(name):
@@ -52,7 +53,9 @@ def test_demo_prints_report_certificate_and_table_and_writes_two_pictures(
 ):
     ellipsoid.export(tmp_path / "ellipsoid.ply")
     out = tmp_path / "new" / "folder"
-    assert demo.main(["--mesh", str(tmp_path / "ellipsoid.ply"), "--out", str(out), "--quick"]) == 0
+    assert (
+        demo.main(["--mesh", str(tmp_path / "ellipsoid.ply"), "--output", str(out), "--quick"]) == 0
+    )
     printed = capsys.readouterr().out
     assert pictures_in(out) == ["accuracy.png", "surface.png"]
     for part in (
@@ -74,7 +77,8 @@ def test_demo_takes_a_cloud_for_a_file_without_faces(demo, ellipsoid, tmp_path, 
     trimesh.PointCloud(ellipsoid.vertices).export(tmp_path / "cloud.ply")
     out = tmp_path / "out"
     assert (
-        demo.main(["--mesh", str(tmp_path / "cloud.ply"), "--out", str(out), "--order", "2"]) == 0
+        demo.main(["--mesh", str(tmp_path / "cloud.ply"), "--output", str(out), "--order", "2"])
+        == 0
     )
     printed = capsys.readouterr().out
     assert "has no faces: it is taken for a cloud" in printed
@@ -113,25 +117,25 @@ def test_demo_ends_with_1_and_a_message_for_a_file_that_is_no_use(
     if content is not None:
         (tmp_path / name).write_text(content)
     out = tmp_path / "out"
-    assert demo.main(["--mesh", str(tmp_path / name), "--out", str(out), "--quick"]) == 1
+    assert demo.main(["--mesh", str(tmp_path / name), "--output", str(out), "--quick"]) == 1
     error = capsys.readouterr().err
     assert error.startswith("error: ")
     assert message in error
     assert not out.exists()
 
 
-def test_demo_brings_a_closed_surface(demo):
+def test_the_cortex_is_a_closed_surface():
     pytest.importorskip("nilearn")
-    vertices, faces, name, unit = demo.cortex()
+    vertices, faces, name, unit = load("_common").cortex("pial_left")
     assert (tuple(vertices.shape), tuple(faces.shape)) == ((10242, 3), (20480, 3))
-    assert ("fsaverage5" in name, unit) == (True, "mm")
+    assert (name, unit) == ("fsaverage5 (pial_left)", "mm")
     assert trimesh.Trimesh(vertices.numpy(), faces.numpy(), process=False).is_watertight
 
 
-def test_demo_draws_a_torus_where_nilearn_is_missing(demo, monkeypatch, capsys):
+def test_an_analytic_surface_stands_in_for_the_cortex_where_nilearn_is_missing(monkeypatch, capsys):
     monkeypatch.setitem(sys.modules, "nilearn.datasets", None)
-    vertices, _, name, _ = demo.cortex()
-    assert (len(vertices), name) == (6000, "torus")
+    vertices, _, name, unit = load("_common").cortex()
+    assert (len(vertices), name, unit) == (4000, "star-shaped surface", "")
     assert "nilearn is not installed" in capsys.readouterr().out
 
 
@@ -144,9 +148,9 @@ def test_segmentation_trains_resumes_where_it_stopped_and_draws(tmp_path, operat
     method = "full" if operator == "stencil" else "spectral"
     chosen = [*SMALL, "--operator", operator, "--test", test, "--method", method]
     whole, parts = tmp_path / "whole", tmp_path / "parts"
-    accuracy = example.main([*chosen, "--out", str(whole), "--epochs", "2"])
-    example.main([*chosen, "--out", str(parts), "--epochs", "1"])
-    assert example.main([*chosen, "--out", str(parts), "--epochs", "2", "--resume"]) == accuracy
+    accuracy = example.main([*chosen, "--output", str(whole), "--epochs", "2"])
+    example.main([*chosen, "--output", str(parts), "--epochs", "1"])
+    assert example.main([*chosen, "--output", str(parts), "--epochs", "2", "--resume"]) == accuracy
     assert f"accuracy on 4 test {test}: {accuracy:.3f}" in capsys.readouterr().out
     expected, resumed = (torch.load(folder / "checkpoint.pt") for folder in (whole, parts))
     assert expected["epoch"] == resumed["epoch"] == 2
@@ -173,7 +177,45 @@ def test_segmentation_reads_one_shape_a_file_or_a_stack_and_drops_loose_vertices
         assert points.mean(0).abs().max() < 1e-6
 
 
-def test_spectral_gallery_writes_one_picture(tmp_path, capsys):
-    load("spectral_gallery").main(["--out", str(tmp_path), "--points", "400", "--k", "40"])
-    assert "Eigenbasis(40 pairs of 400 points" in capsys.readouterr().out
-    assert pictures_in(tmp_path) == ["spectral.png"]
+GALLERY = {  # options of a small run, and what it prints
+    "first_laplacian": (["--points", "300"], "cloud: relative error of Δf "),
+    "cotangent_vs_orders": (["--points", "960"], "   cotangent     order 1     order 3"),
+    "cortical_eigenmodes": (["--points", "400", "--k", "10"], "     torchlb        LaPy   cosine"),
+    "diffusion_distances": (["--points", "400", "--k", "40"], "   order 3: "),
+    "signatures_matching": (["--points", "300", "--k", "40"], "wave kernel signature: "),
+    "wavelets": (["--points", "400", "--k", "40"], "low-pass: "),
+    "diffusion_maps": (["--points", "400"], "correlation of coordinate 2 with cos(π width): 0.99"),
+    "train_pyg": (["--points", "150", "--epochs", "2"], "right on a shape never seen: "),
+    "spectral_gallery": (["--points", "400", "--k", "40"], "Eigenbasis(40 pairs of 400 points"),
+}
+NEEDS = {"cortical_eigenmodes": "lapy", "train_pyg": "torch_geometric"}
+
+
+@pytest.mark.parametrize("name", GALLERY)
+def test_an_example_of_the_gallery_prints_its_result_and_writes_one_picture(name, tmp_path, capsys):
+    pytest.importorskip(NEEDS.get(name, "torchlb"))
+    arguments, printed = GALLERY[name]
+    load(name).main(["--output", str(tmp_path), *arguments])
+    assert printed in capsys.readouterr().out
+    assert pictures_in(tmp_path) == [f"{name}.png"]
+
+
+@pytest.mark.parametrize("name", NEEDS)
+def test_an_example_says_what_to_install(name, monkeypatch, tmp_path):
+    monkeypatch.setitem(sys.modules, NEEDS[name], None)
+    for module in [m for m in sys.modules if m.startswith(f"{NEEDS[name]}.")]:
+        monkeypatch.setitem(sys.modules, module, None)
+    with pytest.raises(SystemExit, match="pip install"):
+        load(name).main(["--output", str(tmp_path)])
+
+
+def test_every_example_of_the_gallery_is_run_here_short_and_shown_in_the_docs():
+    shown = (EXAMPLES.parent / "docs" / "gallery.md").read_text("utf-8")
+    names = {path.stem for path in EXAMPLES.glob("*.py")}
+    assert names == {*GALLERY, "_common", "demo", "train_ddp", "train_segmentation"}
+    for name in GALLERY:
+        lines = (EXAMPLES / f"{name}.py").read_text("utf-8").splitlines()
+        assert len(lines) <= 80, name
+        picture = EXAMPLES.parent / "docs" / "gallery" / f"{name}.png"
+        assert picture.stat().st_size <= 120_000, name
+        assert f"(gallery/{name}.png)" in shown, name

@@ -43,6 +43,7 @@ ORDER = [
     "precompute",
     "manifold",
     "surfaces",
+    "drawing",
     "plot",
     "comparison",
     "__init__",

@@ -7,7 +7,13 @@ import pytest
 import torch
 from jaxtyping import TypeCheckError
 
-from torchlb.plot import plot_convergence, plot_orders, plot_points, plot_surface
+from torchlb.plot import (
+    plot_convergence,
+    plot_orders,
+    plot_points,
+    plot_surface,
+    plot_vectors,
+)
 from torchlb.surfaces import Sphere, smooth_function
 
 plt = pytest.importorskip("matplotlib.pyplot")
@@ -74,6 +80,83 @@ def test_colors_of_one_sign_start_at_the_least_value_and_a_constant_has_a_range(
     assert low < 3 < high
 
 
+@pytest.mark.parametrize("draw", ["surface", "cloud"])
+def test_limits_are_those_of_the_colors(sphere, draw):
+    vertices, faces = sphere
+    shape = (vertices, faces) if draw == "surface" else (vertices,)
+    plot = {"surface": plot_surface, "cloud": plot_points}[draw]
+    assert colorbar_limits(plot(*shape, vertices[:, 0], limits=(-3.0, 0.5))) == (-3.0, 0.5)
+
+
+def test_isolines_of_a_linear_function_lie_on_its_level_and_cross_every_triangle_there(sphere):
+    vertices, faces = sphere
+    levels = [-0.5, 0.123]
+    ax = plot_surface(vertices, faces, vertices[:, 0], levels=levels, view=(90.0, -90.0))
+    (collection,) = ax.collections
+    drawn = [path.vertices for path in collection.get_paths()]
+    segments = np.array([path[:2] for path in drawn if len(path) == 3])  # there and back
+    x = vertices[faces][..., 0]
+    crossed = [int(((x > c).any(1) & ~(x > c).all(1)).sum()) for c in levels]
+    assert (len(segments), len(drawn)) == (sum(crossed), sum(crossed) + len(faces))
+    middle = (vertices[:, 0].amax() + vertices[:, 0].amin()) / 2  # is at 0 in the picture
+    centred = (
+        segments[..., 0] + vertices[:, 0].mean().item() + (middle - vertices[:, 0].mean()).item()
+    )
+    off = np.abs(centred[..., None] - levels).min(axis=-1)
+    assert off.max() < 1e-12
+
+
+def test_isolines_leave_out_triangles_with_nan(sphere):
+    vertices, faces = sphere
+    values = vertices[:, 0].clone()
+    values[values > -0.9] = torch.nan
+    ax = plot_surface(vertices, faces, values, levels=[0.0])
+    assert len(ax.collections[0].get_paths()) == len(faces)
+
+
+def arrows_in(ax):
+    """Tails (A, 2) and arrows (A, 2) of the picture."""
+    (quiver,) = [c for c in ax.collections if hasattr(c, "U")]
+    return np.asarray(quiver.get_offsets()), np.stack([quiver.U, quiver.V], axis=1)
+
+
+def test_arrows_of_the_plane_are_the_vectors_in_one_scale_at_the_points_themselves():
+    points = torch.rand(50, 2, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
+    vectors = torch.stack([points[:, 1], -points[:, 0]], dim=1)
+    ax = plot_vectors(points, None, vectors, count=50)
+    tails, arrows = arrows_in(ax)
+    assert len(tails) == 50
+    middle = torch.stack([(points[:, 0].amax() + points[:, 0].amin()) / 2, points[:, 1].amax()])
+    places = tails + middle.numpy()  # the picture hangs from y = 0
+    expected = np.stack([places[:, 1], -places[:, 0]], axis=1)
+    scale = (arrows * expected).sum() / (expected**2).sum()
+    assert scale > 0
+    assert np.allclose(arrows, scale * expected, atol=1e-12)
+    assert colorbar_limits(ax)[0] > 0  # of the lengths
+
+
+def test_a_surface_hides_the_arrows_behind_it(sphere):
+    vertices, faces = sphere
+    east = torch.stack([-vertices[:, 1], vertices[:, 0], 0 * vertices[:, 2]], dim=1)
+    ax = plot_vectors(vertices, faces, east, vertices[:, 2], count=200, view=(90.0, -90.0))
+    tails, _ = arrows_in(ax)
+    above = int((vertices[:, 2] > 0.1).sum())
+    assert above <= len(tails) <= int((vertices[:, 2] > -0.25).sum())  # the spacing is 0.25
+    assert colorbar_limits(ax)[0] < 0  # of the scalar
+
+
+def test_arrows_are_evenly_spread_and_none_stands_for_zero_or_nan(sphere):
+    vertices, _ = sphere
+    vectors = torch.ones_like(vertices)
+    vectors[:50] = 0
+    vectors[50:100] = torch.nan
+    tails, _ = arrows_in(plot_vectors(vertices, None, vectors, count=200))
+    assert len(tails) == 100
+    assert len(arrows_in(plot_vectors(vertices, None, 0 * vertices + 1, count=30))[0]) == 30
+    empty = plot_vectors(vertices, None, torch.zeros_like(vertices))
+    assert not [c for c in empty.collections if hasattr(c, "U")]
+
+
 def test_nan_is_grey(sphere):
     vertices, _ = sphere
     ax = plot_points(vertices, torch.full((200,), torch.nan))
@@ -94,6 +177,12 @@ def test_points_of_the_plane_keep_their_coordinates_apart_from_a_shift():
     ax = plot_points(points, points[:, 0], size=4.0)
     drawn = np.asarray(ax.collections[0].get_offsets())
     assert np.allclose(np.ptp(drawn, axis=0), np.ptp(points.numpy(), axis=0), atol=1e-6)
+
+
+def test_points_of_the_plane_are_all_equally_near():
+    points = torch.rand(50, 2, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
+    colors = plot_points(points, torch.ones(50)).collections[0].get_facecolors()
+    assert np.ptp(colors, axis=0).max() < 1e-6
 
 
 def test_order_map_counts_points_and_shows_the_lowest_order_of_a_triangle():
@@ -148,6 +237,12 @@ def test_what_does_not_fit_is_refused(sphere):
         plot_surface(vertices, torch.tensor([[0, 1, 200]]), values)
     with pytest.raises(ValueError, match=r"choose the coordinates to draw"):
         plot_points(torch.rand(9, 4), torch.rand(9))
+    with pytest.raises(ValueError, match=r"choose the coordinates to draw"):
+        plot_vectors(torch.rand(9, 4), None, torch.rand(9, 4))
+    with pytest.raises(WRONG):
+        plot_vectors(vertices, faces, torch.rand(199, 3))
+    with pytest.raises(WRONG):
+        plot_vectors(vertices, faces, vertices, values[:-1])
     with pytest.raises(ValueError, match=r"expected 2, one for a size, got 1"):
         plot_convergence([10, 20], {"p": [0.1]})
     with pytest.raises(ValueError, match=r"expected some that are positive"):

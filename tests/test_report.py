@@ -98,6 +98,31 @@ def test_a_crease_falls_below_the_order_and_says_why():
     assert (lb.report.reason[near >= 2] > 0).all()
 
 
+@cache
+def rippled():
+    """A sphere of 1,500 vertices with ripples of 5 spacings from crest to crest, steep as 35°."""
+    vertices, faces = Sphere().mesh(1500)
+    return vertices * (1 + 0.05 * (15 * vertices).sin().prod(1, keepdim=True)), faces
+
+
+def test_unresolved_ripples_are_reported():
+    """Most points ask for more than order 3 can follow, whatever stencils would pass otherwise."""
+    report = LaplaceBeltrami.from_mesh(*rippled(), order=3, certify=False).report
+    assert report.reason_counts["points do not resolve the surface"] > 1200
+    cloud = LaplaceBeltrami.from_points(rippled()[0], order=3, certify=False).report
+    assert cloud.reason_counts["points do not resolve the surface"] > 100
+
+
+def test_eigenvalues_of_an_unresolved_mesh_are_those_of_its_triangles():
+    """Within 1 % of robust_laplacian's on the mesh refined by midpoints; smooth fits alone are 3 % above."""
+    vertices, faces = rippled()
+    lb = LaplaceBeltrami.from_mesh(vertices, faces, order=3)
+    finer, smaller = trimesh.remesh.subdivide(vertices.numpy(), faces.numpy())
+    exact = LaplaceBeltrami.from_cotangent(torch.tensor(finer), torch.tensor(smaller))
+    found, expected = (each.eigenbasis(10).eigenvalues[1:] for each in (lb, exact))
+    assert (found / expected - 1).abs().max() < 0.01
+
+
 def test_every_row_of_a_creased_mesh_is_valid():
     """Finite, Σ_j w_ij = 0, w_ii < 0, and stable as a whole."""
     _, lb = cube()

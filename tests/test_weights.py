@@ -246,6 +246,22 @@ def test_neighbours_on_a_circle():
     assert least_squares_weights(coords, 3).deficit.item() == 2
 
 
+@pytest.mark.parametrize("rule", WEIGHT_RULES)
+def test_misfit_is_what_polynomials_leave_of_the_heights(rule):
+    """Zero for heights of degree ≤ m; for noise of deviation σ about σ over the distances; of no unit."""
+    degree, sigma = 2, 1e-3
+    coords = cloud(2, degree, batch=100, factor=4)
+    smooth = torch.stack([coords[..., 0] * coords[..., 1], coords.square().sum(-1)], -1)
+    noise = sigma * torch.randn_like(smooth)
+    assert (WEIGHT_RULES[rule](coords, degree, heights=smooth).misfit <= 1e-12).all()
+    found = WEIGHT_RULES[rule](coords, degree, heights=smooth + noise).misfit
+    assert (found > sigma).all()  # the distances are below 1
+    assert (found < 10 * sigma).all()
+    scaled = WEIGHT_RULES[rule](7 * coords, degree, heights=7 * (smooth + noise)).misfit
+    torch.testing.assert_close(scaled, found)
+    assert (WEIGHT_RULES[rule](coords, degree).misfit == 0).all()
+
+
 def test_left_out_neighbours_have_no_weight():
     coords = cloud(2, 2)
     keep = torch.rand(coords.shape[:2]) < 0.8

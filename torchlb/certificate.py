@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import warnings
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 import torch
@@ -47,6 +48,8 @@ PATIENCE = 20
 LARGEST = 150_000
 """Beyond this many points the sparse factors outgrow an ordinary machine."""
 MAX_VECTORS = 128
+ROUGH: Any = 1e-3
+"""The spectral radius is wanted to a few digits only."""
 FEED_SHARE = 0.2
 WEIGHT_SHARE = 0.1
 STEPPED_DOWN = REASONS.index("stepped down by the certificate")
@@ -150,9 +153,7 @@ def dissipation(
     symmetric = sparse.csc_array((scaled + scaled.T) / 2)
     # A fixed start, so that the same shape always walks the same way.
     start = np.random.default_rng(0).standard_normal(len(root))
-    radius = abs(
-        float(eigsh(symmetric, 1, which="LM", return_eigenvectors=False, v0=start, tol=1e-3)[0])
-    )
+    radius = float(abs(eigsh(symmetric, 1, v0=start, tol=ROUGH, return_eigenvectors=False)[0]))
     lu = factorized(
         sparse.csc_array(STRICTNESS * radius * sparse.eye_array(len(root)) - symmetric), 0.0
     )
@@ -206,7 +207,9 @@ def certify(
             free = rows.rung < len(ladder.rungs)
             blamed = _responsible(matrix, mass / areas, feed, free)
             movable = blamed[free[blamed]]
-            if len(movable) == 0 and not result.holds:
+            reach = 0
+            while len(movable) == 0 and not result.holds and reach < len(blamed):
+                reach = len(blamed)
                 blamed = _around(matrix, blamed)
                 movable = blamed[free[blamed]]
             if len(movable) == 0 or rounds == MAX_ROUNDS:

@@ -13,6 +13,7 @@ import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
 from scipy import sparse
+from scipy.sparse import csgraph
 from torch import Tensor
 
 from torchlb.boundary import Boundary
@@ -120,11 +121,12 @@ class CloudFallback:
     ) -> tuple[Int[Tensor, "B K"], Float[Tensor, "B neighbors d"], Bool[Tensor, "B neighbors"]]:
         """Neighbours, their coordinates, and which are real.
 
-        A point with hardly an admissible neighbour takes the nearest points, whatever they are.
+        A point with hardly an admissible neighbour, or on an island smaller than a row, takes the nearest points,
+        whatever they are: crumpled corners of a scan hang together with the rest.
         """
         points, frames = self.balls.points, self.balls.frames
         index, count = self.balls(centers, self.size)
-        lonely = count <= 2 * frames.shape[-1]
+        lonely = (count <= 2 * frames.shape[-1]) | self._on_island[centers]
         if lonely.any():
             index[lonely, : self.few] = self._nearest[centers[lonely]]
             count[lonely] = self.few
@@ -134,6 +136,12 @@ class CloudFallback:
         length = coords.norm(dim=-1, keepdim=True).clamp_min(torch.finfo(coords.dtype).tiny)
         coords = coords * (offset.norm(dim=-1, keepdim=True) / length)
         return index, coords, torch.arange(1, self.size) < count[:, None]
+
+    @cached_property
+    def _on_island(self) -> Bool[Tensor, " N"]:
+        """Points of components of the graph with fewer points than a row looks at."""
+        _, component = csgraph.connected_components(self.balls.graph, directed=False)
+        return torch.from_numpy(np.bincount(component)[component] < self.size)
 
     @cached_property
     def _nearest(self) -> Int[Tensor, "N few"]:

@@ -20,6 +20,7 @@ REASONS = (
     "neighbours outweigh the centre",
     "growth beyond that of good stencils",
     "stepped down by the certificate",
+    "points do not resolve the surface",
 )
 """Why a row is below the requested order; its last failure there. `Rows.reason` counts in this list."""
 

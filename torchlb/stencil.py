@@ -16,13 +16,14 @@ from scipy import sparse
 from torch import Tensor
 from tqdm import tqdm
 
+from torchlb.fallback import MeshFallback
 from torchlb.geometry import Geometry
 from torchlb.ladder import Rung, chunks, ladder_rungs, walk_ladder
 from torchlb.neighbors import GraphBalls
 from torchlb.polynomials import num_monomials
 from torchlb.rows import Rows
 from torchlb.sparse import from_scipy
-from torchlb.tangent import local_offsets
+from torchlb.tangent import local_heights, local_offsets
 from torchlb.weights import (
     WEIGHT_RULES,
     Weights,
@@ -43,6 +44,12 @@ MAX_DOMINANCE_AT_BOUNDARY = 6.0
 MAX_SIZE_AT_BOUNDARY = 2.5
 """Points of a stencil per polynomial that holds points of the boundary."""
 MAX_RESIDUAL = 1e-10
+MAX_MISFIT = 0.07
+MAX_MISFIT_ON_MESH = 0.03
+"""Heights that no polynomial of the stencil's degree follows: a crease, an unresolved fold, noise. Triangles know more
+of the surface there than a fit, points alone do not."""
+HOPELESS = 2.5
+"""The widest stencil of a degree is 2.5 times as wide as the first, so noise of the heights can fall by that much."""
 
 
 class StencilError(ValueError):
@@ -73,6 +80,9 @@ class Ladder:
         self.fallback, self.boundary = geometry.fallback, geometry.boundary
         self.balls = GraphBalls(geometry.points, geometry.graph, geometry.frames, geometry.sides)
         self.projection, self.fixed_size = projection, num_neighbors is not None
+        on_mesh = isinstance(geometry.fallback, MeshFallback)
+        self.max_misfit = MAX_MISFIT_ON_MESH if on_mesh else MAX_MISFIT
+        self.hopeless = self.max_misfit * (1 if on_mesh else HOPELESS)
         dim = self.frames.shape[-1]
         rules = [weights] if weights == "least_squares" else [weights, "least_squares"]
         self.rungs = ladder_rungs(dim, range(order + 1, 1, -1), rules, num_neighbors)
@@ -84,13 +94,17 @@ class Ladder:
         reason = torch.ones(len(centers), dtype=torch.int64)  # until something is tried: too few
         place = torch.empty(len(self.points), dtype=torch.int64)
         place[centers] = torch.arange(len(centers))
+        start = torch.zeros_like(centers) if start is None else start.clone()
         top = self.rungs[0].degree
+        lower = [sum(other.degree >= rung.degree for other in self.rungs) for rung in self.rungs]
 
         def attempt(rows: Tensor, index: Tensor, rung: Rung) -> tuple[Tensor, Rows]:
             weights = self._weights(rows, index, rung)
-            failure = _failure(weights, *self._limits(index, rung))
+            failure = _failure(weights, *self._limits(index, rung), self.max_misfit)
             if rung.degree == top and rung.rule != "positive":
                 reason[place[rows]] = failure
+            unresolved = rows[weights.misfit > self.hopeless]
+            start[place[unresolved]] = lower[self.rungs.index(rung)]
             return failure == 0, _stencil_rows(index, weights, rung.degree)
 
         for number, rows, block in walk_ladder(self.balls, centers, self.rungs, attempt, start):
@@ -133,7 +147,8 @@ class Ladder:
         if not touching.all():
             own, around = centers[~touching], index[~touching]
             coords = local_offsets(self.points, self.frames, own, around[:, 1:], self.projection)
-            parts.append(WEIGHT_RULES[rung.rule](coords, rung.degree))
+            heights = local_heights(self.points, self.frames, own, around[:, 1:])
+            parts.append(WEIGHT_RULES[rung.rule](coords, rung.degree, heights=heights))
         if touching.any():
             parts.append(self._neumann_weights(centers[touching], index[touching], rung))
         order = torch.cat([(~touching).nonzero()[:, 0], touching.nonzero()[:, 0]]).argsort()
@@ -164,9 +179,11 @@ class Ladder:
         flux = self.boundary.conormals[index] @ self.frames[centers]
         rule = positive_weights if rung.rule == "positive" else least_squares_weights
         weights = rule(coords, rung.degree, flux=flux)
-        free = least_squares_weights(coords, rung.degree)
+        heights = local_heights(self.points, self.frames, centers, index[:, 1:])
+        free = least_squares_weights(coords, rung.degree, heights=heights)
         usable = (free.residual <= MAX_RESIDUAL)[:, None, None]
-        return replace(weights, gradient=torch.where(usable, free.gradient, weights.gradient))
+        gradient = torch.where(usable, free.gradient, weights.gradient)
+        return replace(weights, gradient=gradient, misfit=free.misfit)
 
     def _fallback_rows(self, centers: Int[Tensor, " B"]) -> Rows:
         matrix = self.fallback.rows(centers)
@@ -183,7 +200,10 @@ class Ladder:
 
 
 def _failure(
-    weights: Weights, max_growth: Float[Tensor, " B"], max_dominance: Float[Tensor, " B"]
+    weights: Weights,
+    max_growth: Float[Tensor, " B"],
+    max_dominance: Float[Tensor, " B"],
+    max_misfit: float,
 ) -> Int[Tensor, " B"]:
     """Which of the local tests a stencil fails first, as an index into `REASONS`; 0 if none."""
     laplacian = weights.laplacian
@@ -192,6 +212,7 @@ def _failure(
     for code, passed in (
         (2, weights.deficit == 0),
         (3, weights.residual <= MAX_RESIDUAL),  # false for NaN
+        (8, weights.misfit <= max_misfit),
         (4, center < 0),
         (5, others <= max_dominance * center.abs()),
         (6, weights.radius.square() * (others + center.abs()) <= max_growth),

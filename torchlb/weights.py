@@ -6,7 +6,7 @@ Local coordinates y_j of the K − 1 neighbours, centre at the origin. One facto
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from functools import lru_cache
 
 import torch
@@ -46,6 +46,7 @@ class Weights:
     condition : (B,): 2-norm condition of the column-scaled √ω V.
     deficit : (B,): M − 1 less its numerical rank; 0 for a poised stencil.
     residual : (B,): largest violation of the moment equations, in units of the largest right-hand side.
+    misfit : (B,): what a polynomial leaves of the heights, in units of the distances; 0 where no heights were given.
     """
 
     gradient: Float[Tensor, "B K d"]
@@ -54,6 +55,7 @@ class Weights:
     condition: Float[Tensor, " B"]
     deficit: Int[Tensor, " B"]
     residual: Float[Tensor, " B"]
+    misfit: Float[Tensor, " B"]
 
     def __getitem__(self, rows: Tensor) -> Weights:
         """The given stencils."""
@@ -94,6 +96,7 @@ def _finish(
     residual: Float[Tensor, " B"],
     radius: Float[Tensor, " B"],
     singular_values: Float[Tensor, "B M"],
+    misfit: Float[Tensor, " B"],
     dim: int,
 ) -> Weights:
     """Return from scaled coordinates to units of length."""
@@ -106,7 +109,26 @@ def _finish(
         condition=singular_values[:, 0] / singular_values[:, -1],
         deficit=(singular_values <= RANK_TOLERANCE * largest).sum(1),
         residual=residual,
+        misfit=misfit,
     )
+
+
+def _misfit(
+    basis: Float[Tensor, "B neighbors M"],
+    root: Float[Tensor, "B neighbors"],
+    coords: Float[Tensor, "B neighbors d"],
+    heights: Float[Tensor, "B neighbors n"],
+) -> Float[Tensor, " B"]:
+    """Scatter of the heights about their fit over root mean square distance, both weighted by ω.
+
+    `basis` spans the polynomials, times √ω. The scatter is per degree of freedom, so their number does not matter.
+    """
+    weighted = root[..., None] * heights
+    left = weighted - basis @ (basis.mT @ weighted)
+    freedom = max(basis.shape[1] - basis.shape[2], 1) / basis.shape[1]
+    square = coords.square().sum(-1) + heights.square().sum(-1)
+    distance = (root.square() * square).sum(1)
+    return (left.square().sum((1, 2)) / freedom / distance).sqrt()
 
 
 def _scaled_system(
@@ -125,6 +147,7 @@ def least_squares_weights(
     degree: int,
     keep: Bool[Tensor, "B neighbors"] | None = None,
     flux: Float[Tensor, "B K d"] | None = None,
+    heights: Float[Tensor, "B neighbors n"] | None = None,
 ) -> Weights:
     r"""Centre-constrained moving least squares.
 
@@ -146,6 +169,7 @@ def least_squares_weights(
     flux : (B, K, d), the conormal at each point of the stencil that lies on a Neumann boundary (centre first), zero at
         the others. Adds an unknown v_b for the datum ∂_ν f(x_b) = 0: minimise Σ w²/ω + Σ v²/ω subject to
         Σ w_j y_j^α + Σ v_b ∂_ν y^α(y_b) = (D y^α)(0) (`method.md`, section 6). Only w is returned.
+    heights : (B, K − 1, n), ℓ, of the neighbours over the tangent plane, for the `misfit`; not together with `flux`.
 
     >>> line = torch.tensor([[[-1.0], [1.0]]], dtype=torch.float64)
     >>> least_squares_weights(line, 2).laplacian.round(decimals=12).tolist()
@@ -165,7 +189,8 @@ def least_squares_weights(
     residual = (values.mT @ solution - functionals).abs().amax((1, 2)) / functionals.abs().max()
     neighbors = solution[:, : coords.shape[1]]
     weights = torch.cat([-neighbors.sum(1, keepdim=True), neighbors], dim=1)
-    return _finish(weights, residual, radius, torch.linalg.svdvals(r), coords.shape[-1])
+    misfit = torch.zeros_like(radius) if heights is None else _misfit(q, root, coords, heights)
+    return _finish(weights, residual, radius, torch.linalg.svdvals(r), misfit, coords.shape[-1])
 
 
 def _with_fluxes(
@@ -200,15 +225,18 @@ def positive_weights(
     coords: Float[Tensor, "B neighbors d"],
     degree: int,
     flux: Float[Tensor, "B K d"] | None = None,
+    heights: Float[Tensor, "B neighbors n"] | None = None,
 ) -> Weights:
     """Least squares over as many neighbours as can have weights Δ ≥ 0: a row of an M-matrix, and consistent.
 
     Neighbours with a negative weight are left out and the rest solved again until none is negative or the rank is
     lost. This finds a positive stencil nearly wherever one exists (non-negative least squares finds 0–3 % more).
-    Positive weights exist up to degree 3 only, since Σ w |y|⁴ = 0 excludes them beyond (`method.md`, section 10).
+    Positive weights exist up to degree 3 only, since Σ w |y|⁴ = 0 excludes them beyond (`method.md`, section 10). The
+    misfit is that of all neighbours.
     """
     keep = torch.ones(coords.shape[:2], dtype=torch.bool)
-    weights = least_squares_weights(coords, degree, flux=flux)
+    weights = least_squares_weights(coords, degree, flux=flux, heights=heights)
+    misfit = weights.misfit
     for _ in range(coords.shape[1]):
         others = weights.laplacian[:, 1:]
         rounding = 1e-12 * others.abs().amax(1, keepdim=True)
@@ -217,10 +245,14 @@ def positive_weights(
             break
         keep &= ~negative
         weights = least_squares_weights(coords, degree, keep, flux)
-    return weights
+    return replace(weights, misfit=misfit)
 
 
-def polyharmonic_weights(coords: Float[Tensor, "B neighbors d"], degree: int) -> Weights:
+def polyharmonic_weights(
+    coords: Float[Tensor, "B neighbors d"],
+    degree: int,
+    heights: Float[Tensor, "B neighbors n"] | None = None,
+) -> Weights:
     r"""Derivatives of the interpolant by the spline :math:`|y|^{2m+3}` plus polynomials of degree m.
 
     Against least squares on Deserno's sphere with 2,022 nodes the error is 10 times smaller at p = 3 and 80 times at
@@ -232,7 +264,7 @@ def polyharmonic_weights(coords: Float[Tensor, "B neighbors d"], degree: int) ->
     functionals = _functionals(dim, degree).to(coords)
     system = root[..., None] * values
     scale = system.norm(dim=1).clamp_min(torch.finfo(coords.dtype).tiny)
-    singular_values = torch.linalg.svdvals(system / scale[:, None])
+    q, r = torch.linalg.qr(system / scale[:, None])
 
     nodes = torch.cat([scaled.new_zeros(batch, 1, dim), scaled], dim=1)
     # Distances from differences: |a|² − 2ab + |b|² would lose half the digits.
@@ -254,7 +286,8 @@ def polyharmonic_weights(coords: Float[Tensor, "B neighbors d"], degree: int) ->
     weights = torch.linalg.lu_solve(factors, pivots, right)[:, :num_points]
     moments = values.mT @ weights[:, 1:]
     residual = (moments - functionals).abs().amax((1, 2)) / functionals.abs().max()
-    return _finish(weights, residual, radius, singular_values, dim)
+    misfit = torch.zeros_like(radius) if heights is None else _misfit(q, root, coords, heights)
+    return _finish(weights, residual, radius, torch.linalg.svdvals(r), misfit, dim)
 
 
 def _kernel_derivatives(

@@ -3,6 +3,9 @@
     from diffusion_net.geometry import get_operators      # before
     from torchlb.interop.diffusion_net import get_operators  # after
 
+Its own data sets call `get_all_operators`, which finds ours after
+``diffusion_net.geometry.get_operators = get_operators``.
+
 The names, arguments and the 7-tuple are those of the original (github.com/nmwsharp/diffusion-net, `geometry.py`).
 
 =====================================================  =============  =========================================

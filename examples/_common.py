@@ -1,0 +1,59 @@
+"""What the examples share: their options, the surface that they show, and where their pictures go."""
+
+import argparse
+from pathlib import Path
+
+import matplotlib as mpl
+
+mpl.use("Agg")  # pictures go to files; no screen is needed
+import matplotlib.pyplot as plt
+import numpy as np
+import torch
+
+from torchlb.surfaces import StarShaped
+
+LEFT = (
+    15.0,
+    200.0,
+)  # elevation and azimuth of an eye that sees the outer side of a left hemisphere
+
+
+def read_options(doc, arguments=None, **numbers):
+    """Options of the command line: --output and, by name, whole numbers with a default and what they are."""
+    parser = argparse.ArgumentParser(description=doc.splitlines()[0])
+    parser.add_argument(
+        "--output", type=Path, default=Path("gallery_output"), help="for the picture"
+    )
+    for name, (default, text) in numbers.items():
+        parser.add_argument(
+            f"--{name}", type=int, default=default, help=f"{text} (default: {default})"
+        )
+    return parser.parse_args(arguments)
+
+
+def cortex(kind="infl_left", points=0):
+    """Vertices, faces, name and unit of a cortical surface that comes with nilearn, fsaverage5: 10,242 vertices, mm.
+
+    A star-shaped one of `points` where they are asked for, and of 4,000 where nilearn is missing.
+    """
+    try:
+        from nilearn.datasets import fetch_surf_fsaverage
+        from nilearn.surface import load_surf_mesh
+    except ImportError:
+        print(
+            "nilearn is not installed: an analytic surface stands in for its cortex (pip install nilearn)"
+        )
+        points = points or 4000
+    if points:
+        return *StarShaped().mesh(points), "star-shaped surface", ""
+    mesh = load_surf_mesh(fetch_surf_fsaverage("fsaverage5")[kind])  # no download
+    vertices, faces = np.array(mesh.coordinates, float), np.array(mesh.faces, int)
+    return torch.tensor(vertices), torch.tensor(faces), f"fsaverage5 ({kind})", "mm"
+
+
+def save(figure, folder, name):
+    """Write a figure as a picture, close it, and say where it is."""
+    folder.mkdir(parents=True, exist_ok=True)
+    figure.savefig(folder / name, dpi=90)
+    plt.close(figure)
+    print(folder / name)
