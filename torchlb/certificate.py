@@ -45,6 +45,8 @@ POSITIVE = 1e-10
 MAX_ROUNDS = 80
 PATIENCE = 20
 """Rounds after which rows step down to the bottom at once."""
+SINGLE_STEPS = 4
+"""Times that a row steps down by one rung; from then on its way doubles with every second time."""
 LARGEST = 150_000
 """Beyond this many points the sparse factors outgrow an ordinary machine."""
 MAX_VECTORS = 128
@@ -216,8 +218,9 @@ def certify(
                 break
             rounds += 1
             steps[movable] += 1
-            steps[movable] += 64 * (rounds > PATIENCE)
-            rows = _step_down(ladder, rows, movable, steps[movable].clamp_max(16), first)
+            bottom = len(ladder.rungs) if rounds > PATIENCE else 0
+            start = first[movable] + _way_down(steps[movable]) + bottom
+            rows = _step_down(ladder, rows, movable, start)
     if not result.holds:
         _warn(result, mass / areas, feed)
     return rows, mass, result
@@ -231,20 +234,23 @@ def _responsible(
 ) -> Int[Tensor, " J"]:
     """Rows to step down.
 
-    Where π is small: the point's own row and those with a negative weight into it, unless slight. Also the
-    points of its row if that is at the bottom already, since they may leave it out of theirs, as on both sides of a
-    crease. Where S fails: the rows that feed its positive eigenvalues.
+    Where π is small: the rows with a negative weight into the point, unless slight, and its own if π is positive, as
+    π_i |L_ii| is what flows in, or if those are at the bottom. Also the points of its row if that is at the bottom
+    already, since they may leave it out of theirs, as on both sides of a crease. Where S fails: the rows that feed its
+    positive eigenvalues.
     """
     blamed = (feed > FEED_SHARE * feed.amax(0)).any(1) if feed.shape[1] else density.isnan()
     small = (density <= MARGIN).numpy()
     if small.any():
         columns = sparse.coo_array(sparse.csc_array(matrix)[:, np.flatnonzero(small)])
         row, col = columns.coords
+        inflow = np.where(row == np.flatnonzero(small)[col], 0.0, columns.data)
         worst = np.zeros(small.sum())
-        np.minimum.at(worst, col, columns.data * (row != np.flatnonzero(small)[col]))
-        heavy = (columns.data < WEIGHT_SHARE * worst[col]) & (columns.data < 0)
+        np.minimum.at(worst, col, inflow)
+        heavy = (inflow < WEIGHT_SHARE * worst[col]) & (inflow < 0)
         blamed[torch.from_numpy(row[heavy].astype(np.int64))] = True
-        blamed |= torch.from_numpy(small)
+        alone = not (blamed & free).any()
+        blamed |= torch.from_numpy(small) & ((density > 0) | alone)
         starved = np.flatnonzero(small & ~free.numpy())
         blamed[torch.from_numpy(np.unique(matrix[starved].indices).astype(np.int64))] = True
     return blamed.nonzero()[:, 0]
@@ -257,10 +263,19 @@ def _around(matrix: sparse.csr_array, rows: Int[Tensor, " J"]) -> Int[Tensor, " 
     return torch.from_numpy(np.unique(joined).astype(np.int64))
 
 
-def _step_down(ladder: Ladder, rows: Rows, movable: Tensor, steps: Tensor, first: Tensor) -> Rows:
-    """Rebuild the given rows one rung lower, twice as many the next time, so that the bottom is near."""
-    start = torch.maximum(rows.rung[movable] + 1, first[movable] + 2 ** (steps - 1))
-    start = start.clamp_max(len(ladder.rungs))
+def _way_down(steps: Int[Tensor, " J"]) -> Int[Tensor, " J"]:
+    """Rungs below the first that a row starts from when it is blamed for the steps-th time.
+
+    >>> _way_down(torch.arange(13)).tolist()
+    [0, 1, 2, 3, 4, 6, 8, 12, 16, 23, 32, 46, 64]
+    """
+    doubled = SINGLE_STEPS * 2 ** ((steps - SINGLE_STEPS) / 2)
+    return torch.where(steps <= SINGLE_STEPS, steps, doubled.ceil().long())
+
+
+def _step_down(ladder: Ladder, rows: Rows, movable: Tensor, start: Tensor) -> Rows:
+    """Rebuild the given rows from rung `start` on, one rung lower at least."""
+    start = torch.maximum(rows.rung[movable] + 1, start).clamp_max(len(ladder.rungs))
     rebuilt = ladder.rows(movable, start)
     top = ladder.rungs[0].degree - 1
     reason = torch.where(rebuilt.order < top, STEPPED_DOWN, 0)
