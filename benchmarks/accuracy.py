@@ -24,6 +24,7 @@ from tqdm import tqdm
 
 from torchlb import LaplaceBeltrami, surfaces
 from torchlb.surfaces import smooth_function
+from torchlb.tangent import PROJECTIONS
 
 FOUR = {
     "Sphere": surfaces.Sphere(),
@@ -263,15 +264,17 @@ def sweep(
     name: str,
     shapes: dict[str, tuple[surfaces.Surface, Sequence[int]]],
     variants: Sequence[tuple[str, int]],
-    seeds: Callable[[int], int],
+    seeds: int,
     slack: float,
 ) -> None:
     """Orders of convergence: one row a shape, projection and order."""
+    if seeds > 1:
+        print(f"\nMeans over {seeds} clouds of each size.")
     random = name == AT_RANDOM
     rows, misses = [], []
     for label, (surface, sizes) in shapes.items():
         draw = surface.random_points if random else surface.points
-        clouds = {n: [case_of(surface, draw(n, seed)) for seed in range(seeds(n))] for n in sizes}
+        clouds = {n: [case_of(surface, draw(n, seed)) for seed in range(seeds)] for n in sizes}
         apart: dict[str, Any] = {"dim": surface.dim}
         for projection, order in bar(variants, f"orders, {label}, {name}"):
             cells, rate = converge(clouds, surface, ours(order, projection, **apart))
@@ -285,36 +288,33 @@ def sweep(
     verdict(f"Slopes of at least p - {slack}", misses)
 
 
-def orders(quick: bool, sizes: Sequence[int] | None) -> None:
+def orders(asked: argparse.Namespace) -> None:
     """Orders of convergence of Δf on quasi-uniform points of surfaces in R³, estimated frames."""
-    sizes = even_sizes(quick, sizes)
-    both = [(way, p) for way in ("tangent", "normal") for p in range(1, 6)]
-    sweep(EVENLY, {k: (v, sizes) for k, v in FOUR.items()}, both, lambda n: 1, 0.3)
+    shapes = {name: (FOUR[name], even_sizes(asked)) for name in asked.surfaces}
+    sweep(EVENLY, shapes, [(way, p) for way in PROJECTIONS for p in asked.p], asked.seeds, 0.3)
 
 
-def orders_random(quick: bool, sizes: Sequence[int] | None) -> None:
+def orders_random(asked: argparse.Namespace) -> None:
     """The same on independent points, uniform in area."""
-    sizes = sizes or ((500, 1000, 2000) if quick else (2000, 4000, 8000))
-    print(f"\nMeans over 2 seeds, 1 at N={sizes[-1]}.")
-    variants = [("tangent", p) for p in range(1, 6)]
-    shapes = {k: (v, sizes) for k, v in FOUR.items()}
-    sweep(AT_RANDOM, shapes, variants, lambda n: 1 + (n < sizes[-1]), 0.5)
+    sizes = asked.sizes or ((500, 1000, 2000) if asked.quick else (2000, 4000, 8000))
+    shapes = {name: (FOUR[name], sizes) for name in asked.surfaces}
+    sweep(AT_RANDOM, shapes, [("tangent", p) for p in asked.p], asked.seeds, 0.5)
     certified(sizes[-2])
 
 
-def orders_dimensions(quick: bool, sizes: Sequence[int] | None) -> None:
+def orders_dimensions(asked: argparse.Namespace) -> None:
     """The same on quasi-uniform points of manifolds of other dimensions and codimensions."""
-    sizes = even_sizes(quick, sizes)
-    variants = [(way, p) for way in ("tangent", "normal") for p in (1, 3)]
+    sizes = even_sizes(asked)
+    variants = [(way, p) for way in PROJECTIONS for p in (1, 3)]
     for fewer in sorted({fewer for _, fewer in OTHERS.values()}):
         few = [n // fewer for n in sizes]
         shapes = {k: (shape, few) for k, (shape, share) in OTHERS.items() if share == fewer}
-        sweep(EVENLY, shapes, variants, lambda n: 1, 0.3)
+        sweep(EVENLY, shapes, variants, asked.seeds, 0.3)
 
 
-def even_sizes(quick: bool, sizes: Sequence[int] | None) -> Sequence[int]:
+def even_sizes(asked: argparse.Namespace) -> Sequence[int]:
     """Numbers of points of a convergence table."""
-    return sizes or ((500, 1000, 2000) if quick else (2000, 4000, 8000, 16000))
+    return asked.sizes or ((500, 1000, 2000) if asked.quick else (2000, 4000, 8000, 16000))
 
 
 def certified(n: int) -> None:
@@ -330,9 +330,9 @@ def certified(n: int) -> None:
     show(["surface", "operator", "error", "% at order p", "s"], rows)
 
 
-def deserno(quick: bool, sizes: Sequence[int] | None) -> None:
+def deserno(asked: argparse.Namespace) -> None:
     """Δ Y_5^4 on Deserno's nodes of the sphere."""
-    sizes = sizes or ((500, 2000) if quick else (2000, 8000))
+    sizes = asked.sizes or ((500, 2000) if asked.quick else (2000, 8000))
     methods = {}
     for order in (3, 5):
         for way in ("tangent", "normal"):
@@ -395,9 +395,9 @@ def ahead(label: str, table: dict[str, Result]) -> tuple[list[str], list[str]]:
     return ratios, misses
 
 
-def compare(quick: bool, sizes: Sequence[int] | None) -> None:
+def compare(asked: argparse.Namespace) -> None:
     """torchlb and its peers on the same nodes of four surfaces."""
-    n = sizes[-1] if sizes else (2000 if quick else 8000)
+    n = asked.sizes[-1] if asked.sizes else (2000 if asked.quick else 8000)
     methods = {f"torchlb, tangent, p={order}": ours(order) for order in range(1, 6)}
     methods |= {f"torchlb, normal, p={order}": ours(order, "normal") for order in (3, 5)}
     methods |= peers()
@@ -423,9 +423,9 @@ def compare(quick: bool, sizes: Sequence[int] | None) -> None:
     verdict("At most 0.6 of pycompadre at equal order, ahead of every other peer at p=3", misses)
 
 
-def sphere4070(quick: bool, sizes: Sequence[int] | None) -> None:
+def sphere4070(asked: argparse.Namespace) -> None:
     """Known figures on 4070 points of the sphere."""
-    n = sizes[-1] if sizes else (1000 if quick else 4070)
+    n = asked.sizes[-1] if asked.sizes else (1000 if asked.quick else 4070)
     sphere = FOUR["Sphere"]
     case = case_of(sphere, sphere.points(n))
     known = {("tangent", 3): 3.5e-5, ("tangent", 5): 4.5e-7}
@@ -443,9 +443,9 @@ def sphere4070(quick: bool, sizes: Sequence[int] | None) -> None:
     verdict("l2 within 1.5 of expected", misses)
 
 
-def noise(quick: bool, sizes: Sequence[int] | None) -> None:
+def noise(asked: argparse.Namespace) -> None:
     """Gaussian noise on the positions, in units of the spacing; values and Δ of Y_5^4 are those of the true points."""
-    n = sizes[-1] if sizes else (500 if quick else 2000)
+    n = asked.sizes[-1] if asked.sizes else (500 if asked.quick else 2000)
     sphere, harmonic = FOUR["Sphere"], surfaces.spherical_harmonic(5, 4)
     true = sphere.points(n)
     spacing = (sphere.area / n) ** 0.5
@@ -474,9 +474,9 @@ def noise(quick: bool, sizes: Sequence[int] | None) -> None:
     verdict("Certificate at every noise", misses)
 
 
-def theorem(quick: bool, sizes: Sequence[int] | None) -> None:
+def theorem(asked: argparse.Namespace) -> None:
     """Both terms of the error h^p + h^q, and p = q = 2 beside the cotangent formula."""
-    sizes = sizes or ((500, 1000, 2000) if quick else (2000, 4000, 8000))
+    sizes = asked.sizes or ((500, 1000, 2000) if asked.quick else (2000, 4000, 8000))
     order, rows, misses = 4, [], []
     for label, ways in {"Torus": ("normal", "tangent"), "Sphere": ("normal",)}.items():
         surface = FOUR[label]
@@ -491,7 +491,7 @@ def theorem(quick: bool, sizes: Sequence[int] | None) -> None:
     print(f"\n### The two terms h^p + h^q, p={order}")
     show(["surface", "projection", "p", "q", *[f"N={n}" for n in sizes], *ends], rows)
     verdict("l2 slopes of at least min(p, q) - 0.3", misses)
-    second_order(2000 if quick else 8000)
+    second_order(2000 if asked.quick else 8000)
 
 
 def second_order(n: int) -> None:
@@ -528,12 +528,15 @@ def main() -> None:
     parser.add_argument("--quick", action="store_true", help="small clouds, for a first look")
     parser.add_argument("--table", choices=TABLES, action="append", help="only this one")
     parser.add_argument("--sizes", type=int, nargs="+", help="numbers of points, ascending")
+    parser.add_argument("--seeds", type=int, default=1, help="clouds of each size for the orders")
+    parser.add_argument("--surfaces", nargs="+", default=list(FOUR), help="of the orders")
+    parser.add_argument("--p", type=int, nargs="+", default=[1, 2, 3, 4, 5], help="of the orders")
     options = parser.parse_args()
     torch.set_num_threads(1)  # small batches: more threads wait for each other
     print("# Accuracy\n", *versions(), sep="\n", flush=True)
     for name in options.table or TABLES:
         print(f"\n## {name}\n\n{TABLES[name].__doc__}", flush=True)
-        TABLES[name](options.quick, options.sizes)
+        TABLES[name](options)
 
 
 if __name__ == "__main__":
