@@ -291,7 +291,8 @@ def sweep(
 def orders(asked: argparse.Namespace) -> None:
     """Orders of convergence of Δf on quasi-uniform points of surfaces in R³, estimated frames."""
     shapes = {name: (FOUR[name], even_sizes(asked)) for name in asked.surfaces}
-    sweep(EVENLY, shapes, [(way, p) for way in PROJECTIONS for p in asked.p], asked.seeds, 0.3)
+    variants = [(way, p) for way in asked.projections for p in asked.p]
+    sweep(EVENLY, shapes, variants, asked.seeds, 0.3)
 
 
 def orders_random(asked: argparse.Namespace) -> None:
@@ -305,7 +306,7 @@ def orders_random(asked: argparse.Namespace) -> None:
 def orders_dimensions(asked: argparse.Namespace) -> None:
     """The same on quasi-uniform points of manifolds of other dimensions and codimensions."""
     sizes = even_sizes(asked)
-    variants = [(way, p) for way in PROJECTIONS for p in (1, 3)]
+    variants = [(way, p) for way in asked.projections for p in (1, 3)]
     for fewer in sorted({fewer for _, fewer in OTHERS.values()}):
         few = [n // fewer for n in sizes]
         shapes = {k: (shape, few) for k, (shape, share) in OTHERS.items() if share == fewer}
@@ -530,6 +531,7 @@ def main() -> None:
     parser.add_argument("--sizes", type=int, nargs="+", help="numbers of points, ascending")
     parser.add_argument("--seeds", type=int, default=1, help="clouds of each size for the orders")
     parser.add_argument("--surfaces", nargs="+", default=list(FOUR), help="of the orders")
+    parser.add_argument("--projections", nargs="+", default=list(PROJECTIONS), help="of the orders")
     parser.add_argument("--p", type=int, nargs="+", default=[1, 2, 3, 4, 5], help="of the orders")
     options = parser.parse_args()
     torch.set_num_threads(1)  # small batches: more threads wait for each other

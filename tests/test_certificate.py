@@ -111,6 +111,17 @@ def test_every_component_has_its_own_null_vector():
     assert abs(ratio - 4) < 0.05
 
 
+@pytest.mark.parametrize(("gap", "pieces"), [(0.08, 1), (0.4, 2)], ids=["crumple", "apart"])
+def test_a_piece_smaller_than_a_row_hangs_together_with_what_is_near(gap, pieces):
+    """A strip of 20 points on end over a sphere: no tangent plane joins it to the sphere."""
+    step = 0.02 * torch.arange(5.0, dtype=torch.float64)
+    y, z = torch.meshgrid(step[:4], step, indexing="ij")
+    strip = torch.stack([torch.zeros(20).double(), y.flatten(), 1 + gap + z.flatten()], 1)
+    lb = LaplaceBeltrami.from_points(torch.cat([Sphere().points(800), strip]))
+    assert lb.certificate.holds
+    assert lb.certificate.components == pieces
+
+
 def test_left_null_vector_of_a_known_chain():
     """Birth and death with rates 1 up, 2 down on three states: π ∝ (4, 2, 1)."""
     matrix = sparse.csr_array(np.array([[-1.0, 1, 0], [2, -3, 1], [0, 2, -2]]))

@@ -121,15 +121,17 @@ class CloudFallback:
     ) -> tuple[Int[Tensor, "B K"], Float[Tensor, "B neighbors d"], Bool[Tensor, "B neighbors"]]:
         """Neighbours, their coordinates, and which are real.
 
-        A point with hardly an admissible neighbour, or on an island smaller than a row, takes the nearest points,
-        whatever they are: crumpled corners of a scan hang together with the rest.
+        A point with hardly an admissible neighbour takes the few nearest points, whatever they are. One on an island of
+        fewer points than a row takes all that are not much farther, as many as a row has, some of which lie beyond:
+        crumpled corners of a scan hang together with the rest.
         """
         points, frames = self.balls.points, self.balls.frames
         index, count = self.balls(centers, self.size)
-        lonely = (count <= 2 * frames.shape[-1]) | self._on_island[centers]
-        if lonely.any():
-            index[lonely, : self.few] = self._nearest[centers[lonely]]
-            count[lonely] = self.few
+        alone = (count <= 2 * frames.shape[-1]) | self._on_island[centers]
+        nearest = self._nearest[centers[alone]]
+        distance = (points[nearest] - points[centers[alone], None]).norm(dim=-1)
+        reach = distance[:, self.few - 1 : self.few] * (1 + self._on_island[centers[alone], None])
+        index[alone], count[alone] = nearest, (distance <= reach).sum(1)
         offset = points[index[:, 1:]] - points[centers, None]
         coords = offset @ frames[centers]
         # Unrolled to their true distance, so that neighbours above one another do not collapse.
@@ -144,8 +146,8 @@ class CloudFallback:
         return torch.from_numpy(np.bincount(component)[component] < self.size)
 
     @cached_property
-    def _nearest(self) -> Int[Tensor, "N few"]:
-        return nearest_neighbors(self.balls.points, self.few)
+    def _nearest(self) -> Int[Tensor, "N K"]:
+        return nearest_neighbors(self.balls.points, self.size)
 
     @cached_property
     def _robust(self) -> tuple[sparse.csr_array, Tensor, sparse.csr_array]:
