@@ -47,8 +47,8 @@ PATIENCE = 20
 """Rounds after which rows step down to the bottom at once."""
 SINGLE_STEPS = 4
 """Times that a row steps down by one rung; from then on its way doubles with every second time."""
-LARGEST = 150_000
-"""Beyond this many points the sparse factors outgrow an ordinary machine."""
+LARGEST = 300_000
+"""Beyond this many points the sparse factors outgrow an ordinary machine: 4 GB there, and minutes each."""
 MAX_VECTORS = 128
 ROUGH: Any = 1e-3
 """The spectral radius is wanted to a few digits only."""
