@@ -197,6 +197,22 @@ def test_a_surface_with_slivers_does_not_blow_up():
             assert norm(lb, heat_flow(lb, f, t, method=method, k=30) - exact) <= 1e-6 * norm(lb, f)
 
 
+def test_full_diffusion_takes_any_spectral_radius(monkeypatch):
+    """Where the series would be too long the rational sum stands in, with the same values and derivatives."""
+    lb = LaplaceBeltrami.from_points(Torus().random_points(500))
+    f = rough(500)
+    results = []
+    for products in (5_000, 10):
+        monkeypatch.setattr("torchlb.heat.PRODUCTS", products)
+        x, t = f.clone().requires_grad_(), torch.tensor(0.01, dtype=f.dtype, requires_grad=True)
+        y = heat_flow(lb, x, t, k=30)
+        results.append([y, *torch.autograd.grad((y**3).sum(), [x, t])])
+        single = heat_flow(lb, f, 0.01, k=30).float()
+        assert norm(lb, single - y.detach()) <= 1e-6 * norm(lb, f)
+    for one, other in zip(*results, strict=True):
+        assert (one - other).norm() <= 1e-5 * one.norm()
+
+
 def test_learned_times_stay_positive_and_are_learned():
     """A flow for t = 0.2 is found from t = 0.01, by unconstrained minimisation."""
     lb = BUILDERS["points"]()

@@ -115,7 +115,7 @@ def _spectral(basis: Eigenbasis, x: Tensor, time: Tensor) -> Tensor:
 def _full(
     lb: LaplaceBeltrami, basis: Eigenbasis, x: Tensor, time: Tensor, tolerance: float
 ) -> Tensor:
-    """e^{−tB} on the span, Chebyshev on the rest, whose time is cut where it has decayed below the tolerance."""
+    """e^{−tB} on the span, a series on the rest, whose time is cut where it has decayed below the tolerance."""
     if basis.mixing is None or basis.rates is None:
         raise StencilError(
             "method='full': the slow eigenvectors are too close to dependent, or fewer than the components; "
@@ -137,7 +137,7 @@ def _full(
         incomplete = torch.tensor([size > k for size in basis.sizes], device=x.device)
         fastest = torch.where(incomplete, fastest, torch.inf).amin()
     enough = math.log(1 / tolerance) / fastest
-    return slow + _expanded(lb, rest, torch.minimum(time, enough), "chebyshev", tolerance)
+    return slow + _expanded(lb, rest, torch.minimum(time, enough), "either", tolerance)
 
 
 def _expanded(

@@ -8,7 +8,8 @@ Two expansions e^{tL}x = Σ_k c_k(t) v_k, whose vectors v_k all channels and tim
 - "rational": v_k = (z_k − L)⁻¹x on a hyperbola in the left half plane (Weideman, Trefethen 2007), by sparse LU on
   the CPU; about 15 of them, for any spectrum in a sector around the negative axis and all times within a factor 10.
 
-In both p(0) = 1 is restored exactly, so that Σ π u is conserved to rounding. The derivatives come from the adjoint
+"either" is the first unless that takes more than `PRODUCTS` of them, where slivers make the spectrum long. In both
+p(0) = 1 is restored exactly, so that Σ π u is conserved to rounding. The derivatives come from the adjoint
 expansion w_k of the gradient g: Σ c_k w_k in x, and Σ c_k'(t) ⟨w_k, x⟩ in t.
 """
 
@@ -34,6 +35,8 @@ __all__ = ["EXPANSIONS", "chebyshev_coefficients", "heat", "hyperbola"]
 
 EXPANSIONS = ["chebyshev", "rational"]
 MAX_TERMS = 30_000
+PRODUCTS = 5_000
+"""Beyond this many the sparse factors of the rational sum are quicker."""
 SECTOR = 0.4
 """Half angle (radians) around the negative axis that the hyperbola stays clear of; the largest seen is 0.35."""
 WINDOW = 10.0
@@ -61,15 +64,12 @@ def heat(
     values : of L, 1/ℓ²; no gradient goes there.
     time : t ≥ 0, ℓ².
     extent : (R, b): the spectrum lies in the ellipse of half axes R/2, b around −R/2.
-    expansion : one of `EXPANSIONS`.
+    expansion : one of `EXPANSIONS`, or "either".
     tolerance : of the result, relative to x.
     sizes : numbers of rows of the diagonal blocks of L; (N,) for one shape.
     """
-    # The rational sum cancels: its terms are some hundred times larger than it.
-    wide = x.double() if expansion == "rational" else x
     options = list(extent), expansion, tolerance, list(sizes)
-    y = _heat(list(pattern), values, wide, time, *options, False)
-    return y.to(x.dtype)
+    return _heat(list(pattern), values, x, time, *options, False)
 
 
 @torch.library.custom_op(
@@ -89,11 +89,14 @@ def _heat(
     sizes: Sequence[int],
     transposed: bool,
 ) -> Tensor:
-    y = torch.zeros_like(x, memory_format=torch.contiguous_format)
-    terms = _terms(pattern, values, x, time, extent, expansion, tolerance, sizes, transposed)
+    expansion, wide = _chosen(expansion, time, extent, tolerance), x
+    if expansion == "rational":  # it cancels: its terms are some hundred times larger than the sum
+        wide = x.double()
+    y = torch.zeros_like(wide, memory_format=torch.contiguous_format)
+    terms = _terms(pattern, values, wide, time, extent, expansion, tolerance, sizes, transposed)
     for where, vector, coefficient, _ in terms:
         _add_scaled(y, where, vector, coefficient)
-    return y
+    return y.to(x.dtype)
 
 
 @torch.library.custom_op(
@@ -114,6 +117,9 @@ def _heat_backward(
     transposed: bool,
     grad: Tensor,
 ) -> tuple[Tensor, Tensor]:
+    expansion, dtype = _chosen(expansion, time, extent, tolerance), x.dtype
+    if expansion == "rational":
+        x, grad = x.double(), grad.double()
     grad_x = torch.zeros_like(x, memory_format=torch.contiguous_format)
     grad_t = torch.zeros_like(time)
     options = extent, expansion, tolerance, sizes, not transposed
@@ -122,7 +128,16 @@ def _heat_backward(
         _add_scaled(grad_x, where, vector, coefficient)
         along = (vector * x[where]).sum(0)
         grad_t[where[1]] += _real(along * _like(derivative, vector)).to(time)
-    return grad_x, grad_t
+    return grad_x.to(dtype), grad_t
+
+
+def _chosen(expansion: str, time: Tensor, extent: Sequence[float], tolerance: float) -> str:
+    """What "either" stands for, here for the sake of the times: outside the operation they have no values yet."""
+    if expansion != "either":
+        return expansion
+    longest = float(time.max()) if len(time) else 0.0
+    few = _estimate(longest, extent[0] / 2, extent[1], tolerance) < PRODUCTS
+    return "chebyshev" if few else "rational"
 
 
 @_heat.register_fake
@@ -187,6 +202,12 @@ def _terms(
     return _rational(pattern, values, x, times, extent[0], tolerance, transposed)
 
 
+def _estimate(longest: float, a: float, b: float, tolerance: float) -> float:
+    """Products that the Chebyshev series takes, from above."""
+    digits = math.log(1 / tolerance)
+    return longest * b + math.sqrt(4 * digits * longest * a) + 2 * digits + 8
+
+
 def chebyshev_coefficients(
     times: np.ndarray, radius: float, height: float, tolerance: float
 ) -> tuple[np.ndarray, np.ndarray, float, float]:
@@ -202,8 +223,8 @@ def chebyshev_coefficients(
     b = min(height, 0.9 * a)
     d = np.sqrt(a * a - b * b)
     r = (a + b) / d
-    digits, longest = np.log(1 / tolerance), float(times.max())
-    estimate = longest * b + np.sqrt(4 * digits * longest * a) + 2 * digits + 8
+    longest = float(times.max())
+    estimate = _estimate(longest, a, b, tolerance)
     if not estimate < MAX_TERMS:
         raise ValueError(
             f"a diffusion time of {longest:.3g} with a spectral radius of {radius:.3g} takes {estimate:.0f} products; "
