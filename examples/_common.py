@@ -12,10 +12,8 @@ import torch
 
 from torchlb.surfaces import StarShaped
 
-LEFT = (
-    15.0,
-    200.0,
-)  # elevation and azimuth of an eye that sees the outer side of a left hemisphere
+# Elevation and azimuth of an eye that sees the outer side of a left hemisphere.
+LEFT = (15.0, 200.0)
 
 
 def read_options(doc, arguments=None, **numbers):

@@ -242,17 +242,18 @@ def _responsible(
     blamed = (feed > FEED_SHARE * feed.amax(0)).any(1) if feed.shape[1] else density.isnan()
     small = (density <= MARGIN).numpy()
     if small.any():
-        columns = sparse.coo_array(sparse.csc_array(matrix)[:, np.flatnonzero(small)])
+        starved = np.flatnonzero(small)
+        columns = sparse.coo_array(sparse.csc_array(matrix)[:, starved])
         row, col = columns.coords
-        inflow = np.where(row == np.flatnonzero(small)[col], 0.0, columns.data)
-        worst = np.zeros(small.sum())
+        inflow = np.where(row == starved[col], 0.0, columns.data)
+        worst = np.zeros(len(starved))
         np.minimum.at(worst, col, inflow)
         heavy = (inflow < WEIGHT_SHARE * worst[col]) & (inflow < 0)
         blamed[torch.from_numpy(row[heavy].astype(np.int64))] = True
         alone = not (blamed & free).any()
         blamed |= torch.from_numpy(small) & ((density > 0) | alone)
-        starved = np.flatnonzero(small & ~free.numpy())
-        blamed[torch.from_numpy(np.unique(matrix[starved].indices).astype(np.int64))] = True
+        at_bottom = starved[~free.numpy()[starved]]
+        blamed[torch.from_numpy(np.unique(matrix[at_bottom].indices).astype(np.int64))] = True
     return blamed.nonzero()[:, 0]
 
 

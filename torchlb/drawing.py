@@ -173,9 +173,8 @@ def paint(
         if isolines is not None:
             edges, share = isolines
             ends = flat[edges[..., 0]] * (1 - share) + flat[edges[..., 1]] * share  # (S, 2, 3)
-            above = np.linalg.norm(
-                corners[:, 1] - corners[:, 0], axis=1
-            ).mean()  # the triangles beside
+            # Above the triangles beside.
+            above = np.linalg.norm(corners[:, 1] - corners[:, 0], axis=1).mean()
             polygons += list(ends[..., :2])
             depth = np.append(depth, ends[..., 2].mean(axis=1) + above)
             shaded = np.append(shaded, plain(INK, len(ends)), axis=0)
@@ -275,9 +274,8 @@ def _visible(flat: np.ndarray, faces: np.ndarray, chosen: np.ndarray) -> np.ndar
     """Which of the chosen points no triangle hides: none covers it in the picture and is nearer to the eye."""
     a, b, c = (flat[faces[:, i]] for i in range(3))
     normal = np.cross(b - a, c - a)
-    area = np.where(
-        normal[:, 2] == 0, np.nan, normal[:, 2]
-    )  # a triangle seen from the side hides nothing
+    # A triangle seen from the side hides nothing.
+    area = np.where(normal[:, 2] == 0, np.nan, normal[:, 2])
     slack = 1e-6 * np.ptp(flat[:, 2])  # its own triangles cover a point, too
     visible = np.ones(len(chosen), dtype=bool)
     for i, point in enumerate(flat[chosen]):

@@ -23,6 +23,8 @@ from torchlb.voronoi import cell_laplacian, cell_volume
 
 __all__ = ["CloudFallback", "MeshFallback"]
 
+ISLAND_REACH = 2
+"""How much farther a point on an island looks than the few nearest."""
 MAX_HOPS = 3
 """Neighbours of a row of robust_laplacian farther than this along the graph lie across a gap."""
 
@@ -122,16 +124,18 @@ class CloudFallback:
         """Neighbours, their coordinates, and which are real.
 
         A point with hardly an admissible neighbour takes the few nearest points, whatever they are. One on an island of
-        fewer points than a row takes all that are not much farther, as many as a row has, some of which lie beyond:
+        fewer points than a row looks `ISLAND_REACH` times as far, at as many as a row has, some of which lie beyond:
         crumpled corners of a scan hang together with the rest.
         """
         points, frames = self.balls.points, self.balls.frames
         index, count = self.balls(centers, self.size)
-        alone = (count <= 2 * frames.shape[-1]) | self._on_island[centers]
-        nearest = self._nearest[centers[alone]]
-        distance = (points[nearest] - points[centers[alone], None]).norm(dim=-1)
-        reach = distance[:, self.few - 1 : self.few] * (1 + self._on_island[centers[alone], None])
-        index[alone], count[alone] = nearest, (distance <= reach).sum(1)
+        on_island = self._on_island[centers]
+        alone = on_island | (count <= 2 * frames.shape[-1])
+        if alone.any():
+            nearest = self._nearest[centers[alone]]
+            distance = (points[nearest] - points[centers[alone], None]).norm(dim=-1)
+            reach = distance[:, self.few - 1] * torch.where(on_island[alone], ISLAND_REACH, 1)
+            index[alone], count[alone] = nearest, (distance <= reach[:, None]).sum(1)
         offset = points[index[:, 1:]] - points[centers, None]
         coords = offset @ frames[centers]
         # Unrolled to their true distance, so that neighbours above one another do not collapse.

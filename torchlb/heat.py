@@ -89,12 +89,10 @@ def _heat(
     sizes: Sequence[int],
     transposed: bool,
 ) -> Tensor:
-    expansion, wide = _chosen(expansion, time, extent, tolerance), x
-    if expansion == "rational":  # it cancels: its terms are some hundred times larger than the sum
-        wide = x.double()
-    y = torch.zeros_like(wide, memory_format=torch.contiguous_format)
-    terms = _terms(pattern, values, wide, time, extent, expansion, tolerance, sizes, transposed)
-    for where, vector, coefficient, _ in terms:
+    expansion, dtype = _settled(expansion, x, time, extent, tolerance)
+    y = torch.zeros_like(x, dtype=dtype, memory_format=torch.contiguous_format)
+    options = extent, expansion, tolerance, sizes, transposed
+    for where, vector, coefficient, _ in _terms(pattern, values, x.to(dtype), time, *options):
         _add_scaled(y, where, vector, coefficient)
     return y.to(x.dtype)
 
@@ -117,27 +115,30 @@ def _heat_backward(
     transposed: bool,
     grad: Tensor,
 ) -> tuple[Tensor, Tensor]:
-    expansion, dtype = _chosen(expansion, time, extent, tolerance), x.dtype
-    if expansion == "rational":
-        x, grad = x.double(), grad.double()
-    grad_x = torch.zeros_like(x, memory_format=torch.contiguous_format)
+    expansion, dtype = _settled(expansion, x, time, extent, tolerance)
+    grad_x = torch.zeros_like(x, dtype=dtype, memory_format=torch.contiguous_format)
     grad_t = torch.zeros_like(time)
     options = extent, expansion, tolerance, sizes, not transposed
-    terms = _terms(pattern, values, grad, time, *options)
+    terms = _terms(pattern, values, grad.to(dtype), time, *options)
     for where, vector, coefficient, derivative in terms:
         _add_scaled(grad_x, where, vector, coefficient)
         along = (vector * x[where]).sum(0)
         grad_t[where[1]] += _real(along * _like(derivative, vector)).to(time)
-    return grad_x.to(dtype), grad_t
+    return grad_x.to(x.dtype), grad_t
 
 
-def _chosen(expansion: str, time: Tensor, extent: Sequence[float], tolerance: float) -> str:
-    """What "either" stands for, here for the sake of the times: outside the operation they have no values yet."""
-    if expansion != "either":
-        return expansion
-    longest = float(time.max()) if len(time) else 0.0
-    few = _estimate(longest, extent[0] / 2, extent[1], tolerance) < PRODUCTS
-    return "chebyshev" if few else "rational"
+def _settled(
+    expansion: str, x: Tensor, time: Tensor, extent: Sequence[float], tolerance: float
+) -> tuple[str, torch.dtype]:
+    """What "either" stands for, and the type to sum in; here, since outside the operation times have no values yet.
+
+    The rational sum cancels: its terms are some hundred times larger than it.
+    """
+    if expansion == "either":
+        longest = float(time.max()) if len(time) else 0.0
+        few = _estimate(longest, extent[0] / 2, extent[1], tolerance) < PRODUCTS
+        expansion = "chebyshev" if few else "rational"
+    return expansion, torch.float64 if expansion == "rational" else x.dtype
 
 
 @_heat.register_fake

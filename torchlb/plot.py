@@ -130,9 +130,8 @@ def plot_points(
     ax = axes_of(ax)
     places = cloud_of(points)
     numbers = values_of(values, places)
-    shades, extend = color_map(
-        numbers, cmap, symmetric, limits, "coolwarm"
-    )  # whose middle is no white
+    # The middle of "coolwarm" is no white.
+    shades, extend = color_map(numbers, cmap, symmetric, limits, "coolwarm")
     draw_dots(ax, places, shades.to_rgba(numbers), view, size)
     finish(ax, title, shades, extend, label)
     return ax
@@ -185,10 +184,7 @@ def plot_vectors(
     shades, extend = color_map(numbers, cmap, symmetric, limits)
     painted = numbers if corners is None else numbers[corners].mean(axis=1)  # by dot or triangle
     ground = plain(PALE, len(painted)) if values is None else shades.to_rgba(painted)
-    if corners is None:
-        draw_dots(ax, places, ground, view, None)
-    else:
-        paint(ax, places, corners, ground, view)
+    _fill(ax, places, corners, ground, view)
     inks = shades.to_rgba(lengths) if values is None else plain(INK, len(places))
     draw_arrows(ax, places, corners, field, inks, view, count)
     finish(ax, title, shades, extend, label)
@@ -230,11 +226,9 @@ def plot_orders(
     last = len(palette) - 1
     places = cloud_of(vertices)
     reached = values_of(order, places).astype(int)
-    if faces is None:
-        draw_dots(ax, places, palette[reached.clip(0, last)], view, None)
-    else:
-        points, corners = mesh_of(vertices, faces)
-        paint(ax, points, corners, palette[reached[corners].min(axis=1).clip(0, last)], view)
+    corners = None if faces is None else mesh_of(vertices, faces)[1]
+    shown = reached if corners is None else reached[corners].min(axis=1)  # by dot or triangle
+    _fill(ax, places, corners, palette[shown.clip(0, last)], view)
     counts = np.bincount(reached)
     handles = [
         Patch(color=palette[min(p, last)], label=f"{f'order {p}' if p else 'fallback'}: {count:,}")
@@ -244,6 +238,20 @@ def plot_orders(
     ax.legend(handles=handles, loc="center left", bbox_to_anchor=(1.0, 0.5), frameon=False)
     finish(ax, title)
     return ax
+
+
+def _fill(
+    ax: Any,
+    points: np.ndarray,
+    faces: np.ndarray | None,
+    colors: np.ndarray,
+    view: Eye | Sequence[Eye],
+) -> None:
+    """A surface by the colours of its triangles, or a cloud by those of its points."""
+    if faces is None:
+        draw_dots(ax, points, colors, view, None)
+    else:
+        paint(ax, points, faces, colors, view)
 
 
 def plot_convergence(
