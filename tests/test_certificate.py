@@ -8,7 +8,9 @@ import torch
 from scipy import sparse
 
 from torchlb import LaplaceBeltrami, StabilityWarning
-from torchlb.certificate import check_certificate, left_null_vector
+from torchlb.certificate import certify, check_certificate, left_null_vector
+from torchlb.geometry import cloud_geometry
+from torchlb.stencil import Ladder, build_stencil
 from torchlb.surfaces import Sphere, StarShaped, ThreeSphere, Torus, smooth_function
 
 
@@ -142,6 +144,29 @@ def test_an_unstable_operator_is_told_from_a_stable_one():
     assert indefinite.max_s > 0
     assert feed.shape[1] >= 1
     assert result.holds == (result.min_pi > 0 and result.max_s == 0)
+
+
+def test_only_the_rows_that_lead_into_a_sink_step_down():
+    """Twelve points refer to each other alone and take all of π: everywhere else it is zero, which says nothing."""
+    points = Sphere().points(800)
+    geometry = cloud_geometry(points, 2, 4)
+    ladder = Ladder(geometry, 3)
+    rows = build_stencil(ladder, progress=False)
+    cap = points[:, 2].topk(12).indices
+    capped = torch.zeros(800, dtype=torch.bool)
+    capped[cap] = True
+    row = torch.arange(800).repeat_interleave(rows.length)
+    rows.laplacian[capped[row]] = 0.0
+    within = capped[row] & capped[rows.col]
+    rows.laplacian[within] = 1.0
+    rows.laplacian[within & (row == rows.col)] = 0.0
+    degree = torch.zeros(800).double().index_add(0, row[within], rows.laplacian[within])
+    rows.laplacian[within & (row == rows.col)] = -degree[cap.sort().values]
+    rows, mass, certificate = certify(ladder, rows, geometry.areas, progress=False)
+    assert certificate.holds
+    assert certificate.components == 1
+    assert mass.max() < 3 * geometry.areas.max()
+    assert (rows.order == 3).sum() > 650
 
 
 def test_uncertified_operator_says_so():

@@ -207,7 +207,9 @@ def certify(
             bar.set_postfix_str(f"min π {result.min_pi:.2g}, {stepped} rows down", refresh=False)
             bar.update()
             free = rows.rung < len(ladder.rungs)
-            blamed = _responsible(matrix, mass / areas, feed, free)
+            blamed = astray = _into_sinks(matrix)
+            if len(astray) == 0:
+                blamed = _responsible(matrix, mass / areas, feed, free)
             movable = blamed[free[blamed]]
             reach = 0
             while len(movable) == 0 and not result.holds and reach < len(blamed):
@@ -218,12 +220,37 @@ def certify(
                 break
             rounds += 1
             steps[movable] += 1
-            bottom = len(ladder.rungs) if rounds > PATIENCE else 0
+            at_once = rounds > PATIENCE or len(astray) > 0
+            bottom = len(ladder.rungs) if at_once else 0
             start = first[movable] + _way_down(steps[movable]) + bottom
             rows = _step_down(ladder, rows, movable, start)
     if not result.holds:
         _warn(result, mass / areas, feed)
     return rows, mass, result
+
+
+def _into_sinks(matrix: sparse.csr_array) -> Int[Tensor, " J"]:
+    """Rows that refer to a sink: to a few points that refer to each other alone.
+
+    What flows in never leaves, so all of π is there, and nothing can be told from its zeros elsewhere. The largest
+    class of points that refer to each other, on a connected component, is none.
+    """
+    matrix = sparse.csr_array(matrix, copy=True)
+    matrix.eliminate_zeros()
+    _, component = csgraph.connected_components(matrix, directed=False)
+    count, label = csgraph.connected_components(matrix, connection="strong")
+    if count == component.max() + 1:
+        return torch.empty(0, dtype=torch.int64)
+    row, col = sparse.coo_array(matrix).coords
+    leaving = label[row] != label[col]
+    sink = np.ones(count, dtype=bool)
+    sink[label[row[leaving]]] = False
+    by_size = np.bincount(label).argsort()
+    place = np.empty(count, dtype=np.int64)
+    place[label] = component
+    _, last = np.unique(place[by_size][::-1], return_index=True)
+    sink[by_size[::-1][last]] = False
+    return torch.from_numpy(np.unique(row[leaving & sink[label[col]]]).astype(np.int64))
 
 
 def _responsible(

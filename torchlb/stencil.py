@@ -23,7 +23,7 @@ from torchlb.neighbors import GraphBalls
 from torchlb.polynomials import num_monomials
 from torchlb.rows import Rows
 from torchlb.sparse import from_scipy
-from torchlb.tangent import local_heights, local_offsets
+from torchlb.tangent import local_offsets
 from torchlb.weights import (
     WEIGHT_RULES,
     Weights,
@@ -46,10 +46,10 @@ MAX_SIZE_AT_BOUNDARY = 2.5
 MAX_RESIDUAL = 1e-10
 MAX_MISFIT = 0.07
 MAX_MISFIT_ON_MESH = 0.03
-"""Heights that no polynomial of the stencil's degree follows: a crease, an unresolved fold, noise. Triangles know more
-of the surface there than a fit, points alone do not."""
+"""Positions that no polynomial of the local coordinates follows: a crease, an unresolved fold, noise. Triangles know
+more of the surface there than a fit, points alone do not."""
 HOPELESS = 2.5
-"""The widest stencil of a degree is 2.5 times as wide as the first, so noise of the heights can fall by that much."""
+"""The widest stencil of a degree is 2.5 times as wide as the first, so noise of the positions can fall by that much."""
 
 
 class StencilError(ValueError):
@@ -147,8 +147,8 @@ class Ladder:
         if not touching.all():
             own, around = centers[~touching], index[~touching]
             coords = local_offsets(self.points, self.frames, own, around[:, 1:], self.projection)
-            heights = local_heights(self.points, self.frames, own, around[:, 1:])
-            parts.append(WEIGHT_RULES[rung.rule](coords, rung.degree, heights=heights))
+            offsets = self.points[around[:, 1:]] - self.points[own, None]
+            parts.append(WEIGHT_RULES[rung.rule](coords, rung.degree, offsets=offsets))
         if touching.any():
             parts.append(self._neumann_weights(centers[touching], index[touching], rung))
         order = torch.cat([(~touching).nonzero()[:, 0], touching.nonzero()[:, 0]]).argsort()
@@ -179,8 +179,8 @@ class Ladder:
         flux = self.boundary.conormals[index] @ self.frames[centers]
         rule = positive_weights if rung.rule == "positive" else least_squares_weights
         weights = rule(coords, rung.degree, flux=flux)
-        heights = local_heights(self.points, self.frames, centers, index[:, 1:])
-        free = least_squares_weights(coords, rung.degree, heights=heights)
+        offsets = self.points[index[:, 1:]] - self.points[centers, None]
+        free = least_squares_weights(coords, rung.degree, offsets=offsets)
         usable = (free.residual <= MAX_RESIDUAL)[:, None, None]
         gradient = torch.where(usable, free.gradient, weights.gradient)
         return replace(weights, gradient=gradient, misfit=free.misfit)

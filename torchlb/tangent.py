@@ -20,7 +20,6 @@ __all__ = [
     "cloud_frames",
     "complete_frames",
     "face_normals",
-    "local_heights",
     "local_offsets",
     "mesh_frames",
     "normals_of_frames",
@@ -138,17 +137,6 @@ def local_offsets(
     in the note (with its sign corrected). Both give order p; see `method.md`, section 3.
     """
     return PROJECTIONS[projection](points, frames, centers, neighbors)
-
-
-def local_heights(
-    points: Float[Tensor, "N n"],
-    frames: Float[Tensor, "N n d"],
-    centers: Int[Tensor, " B"],
-    neighbors: Int[Tensor, "B K"],
-) -> Float[Tensor, "B K n"]:
-    """Components e − E_i E_iᵀ e of the neighbours across the centre's tangent plane, as vectors of space."""
-    offset = points[neighbors] - points[centers, None]
-    return offset - (offset @ frames[centers]) @ frames[centers].mT
 
 
 def _tangent_offsets(points: Tensor, frames: Tensor, centers: Tensor, neighbors: Tensor) -> Tensor:
