@@ -8,6 +8,8 @@ rows at p: share of the rows that keep the order p, then that of rows of last re
 eigenvalue of Δ over the spectral radius, densely up to 3,000 points, by Arnoldi above; λ: the largest relative
 difference between eigenvalues 1 to 9 of −Δ and those of robust_laplacian on the same mesh, or on the mesh refined
 twice by midpoints where `--refine 2` asks for it; seconds: of the build, with `--split` stencils + certificate.
+
+`--summarize TABLE …` sums up tables printed before, over their shapes: ranges, and of λ and seconds the median.
 """
 
 from __future__ import annotations
@@ -15,8 +17,10 @@ from __future__ import annotations
 import argparse
 import time
 import warnings
-from collections.abc import Callable, Iterator
+from collections import defaultdict
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
+from statistics import median
 from typing import NamedTuple
 
 import numpy as np
@@ -183,6 +187,40 @@ def run(
     return "| " + " | ".join(cells) + " |"
 
 
+def summarize(tables: Sequence[Path]) -> Iterator[str]:
+    """A line for each kind, order and projection, over all shapes of the tables."""
+    header = [
+        "as",
+        "p",
+        "projection",
+        "shapes",
+        "certificate",
+        "rounds",
+        "% of rows at p",
+        "% last resort",
+    ]
+    header += ["λ, median (max) %", "seconds, median"]
+    yield "| " + " | ".join(header) + " |\n|" + "---|" * len(header)
+    groups = defaultdict(list)
+    for table in tables:
+        for line in table.read_text().splitlines():
+            cells = [cell.strip() for cell in line.strip("|").split("|")]
+            if len(cells) == len(HEADER) and cells[5] in ("holds", "FAILS"):
+                groups[cells[2], cells[3], cells[4]].append(cells)
+    for (kind, order, projection), lines in groups.items():
+
+        def numbers(column: int, lines: list[list[str]] = lines) -> list[float]:
+            return [float(cells[column].rstrip("%")) for cells in lines if cells[column] != "–"]
+
+        ranges = [f"{min(numbers(k)):g}–{max(numbers(k)):g}" for k in (6, 7, 8)]
+        failures = sum(cells[5] == "FAILS" for cells in lines)
+        verdict = f"{failures} FAIL" if failures else "all hold"
+        known = numbers(10)
+        spectrum = f"{median(known):.2g} ({max(known):.3g})" if known else "–"
+        cells = [kind, order, projection, str(len(lines)), verdict, *ranges, spectrum]
+        yield "| " + " | ".join([*cells, f"{median(numbers(11)):.0f}"]) + " |"
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     parser.add_argument("--data", type=Path, help="folder of meshes; without it the generated ones")
@@ -199,7 +237,11 @@ def main() -> None:
     parser.add_argument(
         "--split", action="store_true", help="seconds of stencils + certificate, by building twice"
     )
+    parser.add_argument("--summarize", type=Path, nargs="+", metavar="TABLE")
     options = parser.parse_args()
+    if options.summarize:
+        print(*summarize(options.summarize), sep="\n")
+        return
     torch.set_num_threads(1)
     warnings.simplefilter("ignore")
     every = list(shapes_in(options.data)) if options.data else list(dirty())
