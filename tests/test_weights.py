@@ -247,17 +247,17 @@ def test_neighbours_on_a_circle():
 
 
 @pytest.mark.parametrize("rule", WEIGHT_RULES)
-def test_misfit_is_what_polynomials_leave_of_the_offsets(rule):
-    """Zero for offsets of degree ≤ m; for noise of deviation σ about σ over the distances; of no unit."""
+def test_misfit_is_what_polynomials_leave_of_the_heights(rule):
+    """Zero for heights of degree ≤ m; for noise of deviation σ about σ over the distances; of no unit."""
     degree, sigma = 2, 1e-3
     coords = cloud(2, degree, batch=100, factor=4)
-    smooth = torch.cat([coords, coords.square().sum(-1, keepdim=True)], -1)
+    smooth = torch.stack([coords[..., 0] * coords[..., 1], coords.square().sum(-1)], -1)
     noise = sigma * torch.randn_like(smooth)
-    assert (WEIGHT_RULES[rule](coords, degree, offsets=smooth).misfit <= 1e-12).all()
-    found = WEIGHT_RULES[rule](coords, degree, offsets=smooth + noise).misfit
+    assert (WEIGHT_RULES[rule](coords, degree, heights=smooth).misfit <= 1e-12).all()
+    found = WEIGHT_RULES[rule](coords, degree, heights=smooth + noise).misfit
     assert (found > sigma).all()  # the distances are below 1
     assert (found < 10 * sigma).all()
-    scaled = WEIGHT_RULES[rule](7 * coords, degree, offsets=7 * (smooth + noise)).misfit
+    scaled = WEIGHT_RULES[rule](7 * coords, degree, heights=7 * (smooth + noise)).misfit
     torch.testing.assert_close(scaled, found)
     assert (WEIGHT_RULES[rule](coords, degree).misfit == 0).all()
 

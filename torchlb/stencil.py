@@ -23,7 +23,7 @@ from torchlb.neighbors import GraphBalls
 from torchlb.polynomials import num_monomials
 from torchlb.rows import Rows
 from torchlb.sparse import from_scipy
-from torchlb.tangent import local_offsets
+from torchlb.tangent import local_heights, local_offsets
 from torchlb.weights import (
     WEIGHT_RULES,
     Weights,
@@ -46,10 +46,10 @@ MAX_SIZE_AT_BOUNDARY = 2.5
 MAX_RESIDUAL = 1e-10
 MAX_MISFIT = 0.07
 MAX_MISFIT_ON_MESH = 0.03
-"""Positions that no polynomial of the local coordinates follows: a crease, an unresolved fold, noise. Triangles know
-more of the surface there than a fit, points alone do not."""
+"""Heights that no polynomial of the stencil's degree follows: a crease, an unresolved fold, noise. Triangles know more
+of the surface there than a fit, points alone do not."""
 HOPELESS = 2.5
-"""The widest stencil of a degree is 2.5 times as wide as the first, so noise of the positions can fall by that much."""
+"""The widest stencil of a degree is 2.5 times as wide as the first, so noise of the heights can fall by that much."""
 
 
 class StencilError(ValueError):
@@ -80,9 +80,9 @@ class Ladder:
         self.fallback, self.boundary = geometry.fallback, geometry.boundary
         self.balls = GraphBalls(geometry.points, geometry.graph, geometry.frames, geometry.sides)
         self.projection, self.fixed_size = projection, num_neighbors is not None
-        on_mesh = isinstance(geometry.fallback, MeshFallback)
-        self.max_misfit = MAX_MISFIT_ON_MESH if on_mesh else MAX_MISFIT
-        self.hopeless = self.max_misfit * (1 if on_mesh else HOPELESS)
+        self.on_mesh = isinstance(geometry.fallback, MeshFallback)
+        self.max_misfit = MAX_MISFIT_ON_MESH if self.on_mesh else MAX_MISFIT
+        self.hopeless = self.max_misfit * (1 if self.on_mesh else HOPELESS)
         dim = self.frames.shape[-1]
         rules = [weights] if weights == "least_squares" else [weights, "least_squares"]
         self.rungs = ladder_rungs(dim, range(order + 1, 1, -1), rules, num_neighbors)
@@ -147,12 +147,23 @@ class Ladder:
         if not touching.all():
             own, around = centers[~touching], index[~touching]
             coords = local_offsets(self.points, self.frames, own, around[:, 1:], self.projection)
-            offsets = self.points[around[:, 1:]] - self.points[own, None]
-            parts.append(WEIGHT_RULES[rung.rule](coords, rung.degree, offsets=offsets))
+            heights = self._heights(own, around, coords)
+            parts.append(WEIGHT_RULES[rung.rule](coords, rung.degree, heights=heights))
         if touching.any():
             parts.append(self._neumann_weights(centers[touching], index[touching], rung))
         order = torch.cat([(~touching).nonzero()[:, 0], touching.nonzero()[:, 0]]).argsort()
         return Weights.stack(parts)[order]
+
+    def _heights(self, centers: Tensor, index: Tensor, coords: Tensor) -> Float[Tensor, "B K n"]:
+        """What a polynomial must follow: heights over the points of the plane that the coordinates name, on a mesh.
+
+        So the note's coordinates are tested too, which need normals that folds do not have. On a cloud there is nothing
+        better to fall to: heights straight over the plane.
+        """
+        neighbors = index[:, 1:]
+        if not self.on_mesh and self.projection != "tangent":
+            coords = local_offsets(self.points, self.frames, centers, neighbors, "tangent")
+        return local_heights(self.points, self.frames, centers, neighbors, coords)
 
     def _limits(self, index: Tensor, rung: Rung) -> tuple[Float[Tensor, " B"], Float[Tensor, " B"]]:
         """Bounds on growth and dominance; none passes where points of the boundary make a wide stencil lopsided."""
@@ -179,8 +190,8 @@ class Ladder:
         flux = self.boundary.conormals[index] @ self.frames[centers]
         rule = positive_weights if rung.rule == "positive" else least_squares_weights
         weights = rule(coords, rung.degree, flux=flux)
-        offsets = self.points[index[:, 1:]] - self.points[centers, None]
-        free = least_squares_weights(coords, rung.degree, offsets=offsets)
+        heights = self._heights(centers, index, coords)
+        free = least_squares_weights(coords, rung.degree, heights=heights)
         usable = (free.residual <= MAX_RESIDUAL)[:, None, None]
         gradient = torch.where(usable, free.gradient, weights.gradient)
         return replace(weights, gradient=gradient, misfit=free.misfit)

@@ -20,6 +20,7 @@ __all__ = [
     "cloud_frames",
     "complete_frames",
     "face_normals",
+    "local_heights",
     "local_offsets",
     "mesh_frames",
     "normals_of_frames",
@@ -137,6 +138,17 @@ def local_offsets(
     in the note (with its sign corrected). Both give order p; see `method.md`, section 3.
     """
     return PROJECTIONS[projection](points, frames, centers, neighbors)
+
+
+def local_heights(
+    points: Float[Tensor, "N n"],
+    frames: Float[Tensor, "N n d"],
+    centers: Int[Tensor, " B"],
+    neighbors: Int[Tensor, "B K"],
+    coords: Float[Tensor, "B K d"],
+) -> Float[Tensor, "B K n"]:
+    """e − E_i y, from the points y of the centre's tangent plane to the neighbours, as vectors of space."""
+    return points[neighbors] - points[centers, None] - coords @ frames[centers].mT
 
 
 def _tangent_offsets(points: Tensor, frames: Tensor, centers: Tensor, neighbors: Tensor) -> Tensor:

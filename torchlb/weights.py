@@ -46,7 +46,7 @@ class Weights:
     condition : (B,): 2-norm condition of the column-scaled √ω V.
     deficit : (B,): M − 1 less its numerical rank; 0 for a poised stencil.
     residual : (B,): largest violation of the moment equations, in units of the largest right-hand side.
-    misfit : (B,): what a polynomial leaves of the offsets, in units of the distances; 0 where no offsets were given.
+    misfit : (B,): what a polynomial leaves of the heights, in units of the distances; 0 where no heights were given.
     """
 
     gradient: Float[Tensor, "B K d"]
@@ -116,16 +116,19 @@ def _finish(
 def _misfit(
     basis: Float[Tensor, "B neighbors M"],
     root: Float[Tensor, "B neighbors"],
-    offsets: Float[Tensor, "B neighbors n"],
+    coords: Float[Tensor, "B neighbors d"],
+    heights: Float[Tensor, "B neighbors n"],
 ) -> Float[Tensor, " B"]:
-    """Scatter of the offsets about their fit over root mean square distance, both weighted by ω.
+    """Scatter of the heights about their fit over root mean square distance, both weighted by ω.
 
     `basis` spans the polynomials, times √ω. The scatter is per degree of freedom, so their number does not matter.
     """
-    weighted = root[..., None] * offsets
+    weighted = root[..., None] * heights
     left = weighted - basis @ (basis.mT @ weighted)
     freedom = max(basis.shape[1] - basis.shape[2], 1) / basis.shape[1]
-    return (left.square().sum((1, 2)) / freedom / weighted.square().sum((1, 2))).sqrt()
+    square = coords.square().sum(-1) + heights.square().sum(-1)
+    distance = (root.square() * square).sum(1)
+    return (left.square().sum((1, 2)) / freedom / distance).sqrt()
 
 
 def _scaled_system(
@@ -144,7 +147,7 @@ def least_squares_weights(
     degree: int,
     keep: Bool[Tensor, "B neighbors"] | None = None,
     flux: Float[Tensor, "B K d"] | None = None,
-    offsets: Float[Tensor, "B neighbors n"] | None = None,
+    heights: Float[Tensor, "B neighbors n"] | None = None,
 ) -> Weights:
     r"""Centre-constrained moving least squares.
 
@@ -166,7 +169,7 @@ def least_squares_weights(
     flux : (B, K, d), the conormal at each point of the stencil that lies on a Neumann boundary (centre first), zero at
         the others. Adds an unknown v_b for the datum ∂_ν f(x_b) = 0: minimise Σ w²/ω + Σ v²/ω subject to
         Σ w_j y_j^α + Σ v_b ∂_ν y^α(y_b) = (D y^α)(0) (`method.md`, section 6). Only w is returned.
-    offsets : (B, K − 1, n), ℓ, of the neighbours in space, for the `misfit`; not together with `flux`.
+    heights : (B, K − 1, n), ℓ, of the neighbours over the tangent plane, for the `misfit`; not together with `flux`.
 
     >>> line = torch.tensor([[[-1.0], [1.0]]], dtype=torch.float64)
     >>> least_squares_weights(line, 2).laplacian.round(decimals=12).tolist()
@@ -186,7 +189,7 @@ def least_squares_weights(
     residual = (values.mT @ solution - functionals).abs().amax((1, 2)) / functionals.abs().max()
     neighbors = solution[:, : coords.shape[1]]
     weights = torch.cat([-neighbors.sum(1, keepdim=True), neighbors], dim=1)
-    misfit = torch.zeros_like(radius) if offsets is None else _misfit(q, root, offsets)
+    misfit = torch.zeros_like(radius) if heights is None else _misfit(q, root, coords, heights)
     return _finish(weights, residual, radius, torch.linalg.svdvals(r), misfit, coords.shape[-1])
 
 
@@ -222,7 +225,7 @@ def positive_weights(
     coords: Float[Tensor, "B neighbors d"],
     degree: int,
     flux: Float[Tensor, "B K d"] | None = None,
-    offsets: Float[Tensor, "B neighbors n"] | None = None,
+    heights: Float[Tensor, "B neighbors n"] | None = None,
 ) -> Weights:
     """Least squares over as many neighbours as can have weights Δ ≥ 0: a row of an M-matrix, and consistent.
 
@@ -232,7 +235,7 @@ def positive_weights(
     misfit is that of all neighbours.
     """
     keep = torch.ones(coords.shape[:2], dtype=torch.bool)
-    weights = least_squares_weights(coords, degree, flux=flux, offsets=offsets)
+    weights = least_squares_weights(coords, degree, flux=flux, heights=heights)
     misfit = weights.misfit
     for _ in range(coords.shape[1]):
         others = weights.laplacian[:, 1:]
@@ -248,7 +251,7 @@ def positive_weights(
 def polyharmonic_weights(
     coords: Float[Tensor, "B neighbors d"],
     degree: int,
-    offsets: Float[Tensor, "B neighbors n"] | None = None,
+    heights: Float[Tensor, "B neighbors n"] | None = None,
 ) -> Weights:
     r"""Derivatives of the interpolant by the spline :math:`|y|^{2m+3}` plus polynomials of degree m.
 
@@ -283,7 +286,7 @@ def polyharmonic_weights(
     weights = torch.linalg.lu_solve(factors, pivots, right)[:, :num_points]
     moments = values.mT @ weights[:, 1:]
     residual = (moments - functionals).abs().amax((1, 2)) / functionals.abs().max()
-    misfit = torch.zeros_like(radius) if offsets is None else _misfit(q, root, offsets)
+    misfit = torch.zeros_like(radius) if heights is None else _misfit(q, root, coords, heights)
     return _finish(weights, residual, radius, torch.linalg.svdvals(r), misfit, dim)
 
 
