@@ -6,10 +6,13 @@ import numpy as np
 import pytest
 import torch
 from scipy import sparse
+from scipy.sparse import csgraph
 
 from torchlb import LaplaceBeltrami, StabilityWarning
 from torchlb.certificate import certify, check_certificate, left_null_vector
+from torchlb.fallback import CloudFallback
 from torchlb.geometry import cloud_geometry
+from torchlb.neighbors import GraphBalls, nearest_graph, nearest_neighbors
 from torchlb.stencil import Ladder, build_stencil
 from torchlb.surfaces import Sphere, StarShaped, ThreeSphere, Torus, smooth_function
 
@@ -122,6 +125,22 @@ def test_a_piece_smaller_than_a_row_hangs_together_with_what_is_near(gap, pieces
     lb = LaplaceBeltrami.from_points(torch.cat([Sphere().points(800), strip]))
     assert lb.certificate.holds
     assert lb.certificate.components == pieces
+
+
+def test_rows_of_last_resort_leave_no_pocket_behind():
+    """Twelve points of a plane whose sides turn away from all others, joined to them by the graph alone."""
+    x, y = torch.meshgrid(torch.arange(12.0), torch.arange(12.0), indexing="ij")
+    points = torch.stack([x.flatten(), y.flatten(), torch.zeros(144)], 1).double()
+    points[:, :2] += 0.1 * torch.rand(144, 2, generator=torch.Generator().manual_seed(0)).double()
+    frames = torch.eye(3, 2).double().expand(144, 3, 2)
+    graph = nearest_graph(points, frames, nearest_neighbors(points, 25))
+    sides = torch.tensor([0.0, 0.0, 1.0]).double().repeat(144, 1)
+    pocket = ((x - 5.5).abs() < 1) & ((y - 5.5).abs() < 3.1)
+    sides[pocket.flatten()] *= -1
+    fallback = CloudFallback(GraphBalls(points, graph, frames, sides), None, surface=False)
+    count, _ = csgraph.connected_components(fallback.rows(torch.arange(144)), directed=False)
+    assert int(pocket.sum()) == 12
+    assert count == 1
 
 
 def test_left_null_vector_of_a_known_chain():

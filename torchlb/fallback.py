@@ -68,7 +68,7 @@ class CloudFallback:
     def _volumes(self) -> Float[Tensor, " N"]:
         volumes = []
         for centers in torch.arange(len(self.balls.points)).split(4096):
-            _, coords, valid = self._cells(centers)
+            _, coords, valid = self._cells(centers, self._on_island)
             outward = torch.zeros_like(coords[:, 0])
             if self.boundary is not None:
                 conormals = self.boundary.conormals[centers, None]
@@ -82,11 +82,20 @@ class CloudFallback:
 
     @cached_property
     def _matrix(self) -> sparse.csr_array:
-        """All rows, W/m less its sums, with m the volumes and W the mean of what both ends make of the flux.
+        """All rows. Small pieces that they leave by themselves are islands, too."""
+        matrix = self._joined(self._on_island)
+        pieces = self._small_pieces(matrix)
+        if (pieces & ~self._on_island).any():
+            matrix = self._joined(pieces | self._on_island)
+        return matrix
+
+    def _joined(self, on_island: Bool[Tensor, " N"]) -> sparse.csr_array:
+        """W/m less its sums, with m the volumes and W the mean of what both ends make of the flux.
 
         So the rows of last resort alone are an M-matrix, symmetric in m. A flux that one end alone knows is its own.
         """
-        parts = [self._one_sided(part) for part in torch.arange(len(self._volumes)).split(4096)]
+        chunks = torch.arange(len(self._volumes)).split(4096)
+        parts = [self._one_sided(chunk, on_island) for chunk in chunks]
         volumes = np.concatenate([volume for volume, _ in parts])
         rows = sparse.vstack([row for _, row in parts], format="csr")
         flux = sparse.csr_array(sparse.diags_array(volumes) @ rows)
@@ -97,9 +106,11 @@ class CloudFallback:
         flux = flux - sparse.diags_array(flux.sum(axis=1))
         return sparse.csr_array(sparse.diags_array(1 / volumes) @ flux)
 
-    def _one_sided(self, centers: Int[Tensor, " B"]) -> tuple[np.ndarray, sparse.csr_array]:
+    def _one_sided(
+        self, centers: Int[Tensor, " B"], on_island: Bool[Tensor, " N"]
+    ) -> tuple[np.ndarray, sparse.csr_array]:
         """Volumes and rows as each point by itself would have them."""
-        index, coords, valid = self._cells(centers)
+        index, coords, valid = self._cells(centers, on_island)
         flux = cell_laplacian(coords, valid)
         weights = torch.cat([-flux.sum(1, keepdim=True), flux], dim=1)
         row = np.arange(len(centers)).repeat(index.shape[1])
@@ -119,7 +130,7 @@ class CloudFallback:
         return volumes, sparse.csr_array(ours @ cells + theirs @ robust)
 
     def _cells(
-        self, centers: Int[Tensor, " B"]
+        self, centers: Int[Tensor, " B"], on_island: Bool[Tensor, " N"]
     ) -> tuple[Int[Tensor, "B K"], Float[Tensor, "B neighbors d"], Bool[Tensor, "B neighbors"]]:
         """Neighbours, their coordinates, and which are real.
 
@@ -129,12 +140,12 @@ class CloudFallback:
         """
         points, frames = self.balls.points, self.balls.frames
         index, count = self.balls(centers, self.size)
-        on_island = self._on_island[centers]
-        alone = on_island | (count <= 2 * frames.shape[-1])
+        far = on_island[centers]
+        alone = far | (count <= 2 * frames.shape[-1])
         if alone.any():
             nearest = self._nearest[centers[alone]]
             distance = (points[nearest] - points[centers[alone], None]).norm(dim=-1)
-            reach = distance[:, self.few - 1] * torch.where(on_island[alone], ISLAND_REACH, 1)
+            reach = distance[:, self.few - 1] * torch.where(far[alone], ISLAND_REACH, 1)
             index[alone], count[alone] = nearest, (distance <= reach[:, None]).sum(1)
         offset = points[index[:, 1:]] - points[centers, None]
         coords = offset @ frames[centers]
@@ -145,8 +156,11 @@ class CloudFallback:
 
     @cached_property
     def _on_island(self) -> Bool[Tensor, " N"]:
-        """Points of components of the graph with fewer points than a row looks at."""
-        _, component = csgraph.connected_components(self.balls.graph, directed=False)
+        return self._small_pieces(self.balls.graph)
+
+    def _small_pieces(self, graph: sparse.csr_array) -> Bool[Tensor, " N"]:
+        """Points of components with fewer points than a row looks at."""
+        _, component = csgraph.connected_components(graph, directed=False)
         return torch.from_numpy(np.bincount(component)[component] < self.size)
 
     @cached_property
