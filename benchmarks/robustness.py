@@ -50,6 +50,8 @@ HEADER = [
     "last resort",
 ]
 HEADER += ["abscissa", "λ", "seconds"]
+SUMMARY = "| as | p | projection | shapes | certificate | rounds | % of rows at p | % last resort "
+SUMMARY += "| λ, median (max) % | seconds, median |"
 
 
 class Shape(NamedTuple):
@@ -189,18 +191,8 @@ def run(
 
 def summarize(tables: Sequence[Path]) -> Iterator[str]:
     """A line for each kind, order and projection, over all shapes of the tables."""
-    header = [
-        "as",
-        "p",
-        "projection",
-        "shapes",
-        "certificate",
-        "rounds",
-        "% of rows at p",
-        "% last resort",
-    ]
-    header += ["λ, median (max) %", "seconds, median"]
-    yield "| " + " | ".join(header) + " |\n|" + "---|" * len(header)
+    yield SUMMARY
+    yield "|" + "---|" * (SUMMARY.count("|") - 1)
     groups = defaultdict(list)
     for table in tables:
         for line in table.read_text().splitlines():
