@@ -198,18 +198,22 @@ def certify(
     count = len(areas)
     first = rows.rung.clone()
     steps = torch.zeros(count, dtype=torch.int64)
-    rounds = 0
+    rounds, bottom = 0, len(ladder.rungs)
     with tqdm(desc="certificate", delay=2, disable=not progress, leave=False) as bar:
         while True:
+            bar.update()
             matrix = to_scipy(rows.crow, rows.col, rows.laplacian, (count, count))
+            free = rows.rung < bottom
+            astray = _into_sinks(matrix)
+            astray = astray[free[astray]]
+            if len(astray) > 0 and rounds < MAX_ROUNDS:
+                rounds += 1
+                rows = _step_down(ladder, rows, astray, torch.full_like(astray, bottom))
+                continue
             stepped = int((rows.rung > first).sum())
             mass, result, feed = check_certificate(matrix, areas, rounds, stepped)
             bar.set_postfix_str(f"min π {result.min_pi:.2g}, {stepped} rows down", refresh=False)
-            bar.update()
-            free = rows.rung < len(ladder.rungs)
-            blamed = astray = _into_sinks(matrix)
-            if len(astray) == 0:
-                blamed = _responsible(matrix, mass / areas, feed, free)
+            blamed = _responsible(matrix, mass / areas, feed, free)
             movable = blamed[free[blamed]]
             reach = 0
             while len(movable) == 0 and not result.holds and reach < len(blamed):
@@ -220,10 +224,8 @@ def certify(
                 break
             rounds += 1
             steps[movable] += 1
-            at_once = rounds > PATIENCE or len(astray) > 0
-            bottom = len(ladder.rungs) if at_once else 0
-            start = first[movable] + _way_down(steps[movable]) + bottom
-            rows = _step_down(ladder, rows, movable, start)
+            way = _way_down(steps[movable]) if rounds <= PATIENCE else bottom
+            rows = _step_down(ladder, rows, movable, first[movable] + way)
     if not result.holds:
         _warn(result, mass / areas, feed)
     return rows, mass, result
@@ -245,11 +247,10 @@ def _into_sinks(matrix: sparse.csr_array) -> Int[Tensor, " J"]:
     leaving = label[row] != label[col]
     sink = np.ones(count, dtype=bool)
     sink[label[row[leaving]]] = False
-    by_size = np.bincount(label).argsort()
-    place = np.empty(count, dtype=np.int64)
-    place[label] = component
-    _, last = np.unique(place[by_size][::-1], return_index=True)
-    sink[by_size[::-1][last]] = False
+    by_size = np.bincount(label)[label].argsort(kind="stable")
+    largest = np.zeros(component.max() + 1, dtype=np.int64)
+    largest[component[by_size]] = label[by_size]  # the last one written stays
+    sink[largest] = False
     return torch.from_numpy(np.unique(row[leaving & sink[label[col]]]).astype(np.int64))
 
 

@@ -1,14 +1,15 @@
 """From points to the rows of a sparse operator: every point takes the first stencil that passes.
 
 The ladder of a point at order p (`method.md`, section 4): least-squares (or polyharmonic) stencils of degree p + 1
-with K = 1.6, 2, …, 10 times as many points as polynomials; then the same at p − 1, …, 1; then positive weights of
-order 1; then the fallback row. How far down each point had to step is part of the result and never silent.
+with K = 1.6, 2, … times as many points as polynomials, up to 10 on a cloud and 3 on a mesh; then the same at every odd
+order below; then positive weights of order 1; then the fallback row. How far down each point had to step is part of
+the result and never silent.
 """
 
 from __future__ import annotations
 
 from dataclasses import replace
-from math import ceil
+from math import ceil, inf
 
 import torch
 from jaxtyping import Float, Int
@@ -43,13 +44,16 @@ MAX_DOMINANCE_AT_BOUNDARY = 6.0
 """One-sided stencils have larger weights, and wide ones would be balanced but poor: a lower order is better there."""
 MAX_SIZE_AT_BOUNDARY = 2.5
 """Points of a stencil per polynomial that holds points of the boundary."""
+MAX_SIZE_ON_MESH = 3.0
+"""Points of a stencil per polynomial: beyond it a fit reaches over too much of the surface, and triangles know more."""
 MAX_RESIDUAL = 1e-10
 MAX_MISFIT = 0.07
 MAX_MISFIT_ON_MESH = 0.03
 """Heights that no polynomial of the stencil's degree follows: a crease, an unresolved fold, noise. Triangles know more
 of the surface there than a fit, points alone do not."""
 HOPELESS = 2.5
-"""The widest stencil of a degree is 2.5 times as wide as the first, so noise of the heights can fall by that much."""
+"""The widest stencil of a degree on a cloud is 2.5 times as wide as the first, so noise of the heights can fall by that
+much."""
 
 
 class StencilError(ValueError):
@@ -85,7 +89,10 @@ class Ladder:
         self.hopeless = self.max_misfit * (1 if self.on_mesh else HOPELESS)
         dim = self.frames.shape[-1]
         rules = [weights] if weights == "least_squares" else [weights, "least_squares"]
-        self.rungs = ladder_rungs(dim, range(order + 1, 1, -1), rules, num_neighbors)
+        # Rows of an even order are no better on evenly spread points than those of the odd order below.
+        degrees = [order + 1, *range(order // 2 * 2, 1, -2)]
+        widest = MAX_SIZE_ON_MESH if self.on_mesh else inf
+        self.rungs = ladder_rungs(dim, degrees, rules, num_neighbors, widest)
         self.rungs += ladder_rungs(dim, [2], ["positive"], num_neighbors)
 
     def rows(self, centers: Int[Tensor, " B"], start: Int[Tensor, " B"] | None = None) -> Rows:
