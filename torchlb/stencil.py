@@ -50,7 +50,11 @@ MAX_RESIDUAL = 1e-10
 MAX_MISFIT = 0.07
 MAX_MISFIT_ON_MESH = 0.03
 """Heights that no polynomial of the stencil's degree follows: a crease, an unresolved fold, noise. Triangles know more
-of the surface there than a fit, points alone do not."""
+of the surface there than a fit, points alone do not. On a mesh it is the bound up to the degree below, and beyond it
+falls as the growth g∞ rises, since what heights do to Δ is misfit times growth."""
+DEGREE_OF_MISFIT = 4
+MISFIT_OF_NORMALS = 0.5
+"""Share of the bound beyond degree 2 by the note's projection, whose errors on the same mesh are larger."""
 HOPELESS = 2.5
 """The widest stencil of a degree on a cloud is 2.5 times as wide as the first, so noise of the heights can fall by that
 much."""
@@ -85,8 +89,6 @@ class Ladder:
         self.balls = GraphBalls(geometry.points, geometry.graph, geometry.frames, geometry.sides)
         self.projection, self.fixed_size = projection, num_neighbors is not None
         self.on_mesh = isinstance(geometry.fallback, MeshFallback)
-        self.max_misfit = MAX_MISFIT_ON_MESH if self.on_mesh else MAX_MISFIT
-        self.hopeless = self.max_misfit * (1 if self.on_mesh else HOPELESS)
         dim = self.frames.shape[-1]
         rules = [weights] if weights == "least_squares" else [weights, "least_squares"]
         # Rows of an even order are no better on evenly spread points than those of the odd order below.
@@ -107,10 +109,12 @@ class Ladder:
 
         def attempt(rows: Tensor, index: Tensor, rung: Rung) -> tuple[Tensor, Rows]:
             weights = self._weights(rows, index, rung)
-            failure = _failure(weights, *self._limits(index, rung), self.max_misfit)
+            max_misfit = self._max_misfit(rung.degree)
+            failure = _failure(weights, *self._limits(index, rung), max_misfit)
             if rung.degree == top and rung.rule != "positive":
                 reason[place[rows]] = failure
-            unresolved = rows[weights.misfit > self.hopeless]
+            hopeless = max_misfit * (1 if self.on_mesh else HOPELESS)
+            unresolved = rows[weights.misfit > hopeless]
             start[place[unresolved]] = lower[self.rungs.index(rung)]
             return failure == 0, _stencil_rows(index, weights, rung.degree)
 
@@ -171,6 +175,14 @@ class Ladder:
         if not self.on_mesh and self.projection != "tangent":
             coords = local_offsets(self.points, self.frames, centers, neighbors, "tangent")
         return local_heights(self.points, self.frames, centers, neighbors, coords)
+
+    def _max_misfit(self, degree: int) -> float:
+        if not self.on_mesh:
+            return MAX_MISFIT
+        dim = self.frames.shape[-1]
+        growth = typical_growth(dim, DEGREE_OF_MISFIT) / typical_growth(dim, degree)
+        straight = degree == 2 or self.projection == "tangent"
+        return MAX_MISFIT_ON_MESH * min(1.0, growth) * (1.0 if straight else MISFIT_OF_NORMALS)
 
     def _limits(self, index: Tensor, rung: Rung) -> tuple[Float[Tensor, " B"], Float[Tensor, " B"]]:
         """Bounds on growth and dominance; none passes where points of the boundary make a wide stencil lopsided."""
