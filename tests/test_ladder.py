@@ -31,13 +31,6 @@ def test_a_given_size_replaces_those_of_the_ladder():
     assert [rung.degree for rung in rungs] == [4, 4, 3, 3]
 
 
-def test_no_size_is_wider_than_asked():
-    rungs = ladder_rungs(2, [4], widest=3.0)
-    assert [rung.size for rung in rungs] == [24, 30, 38, 45]
-    # Who fixes the size means it.
-    assert ladder_rungs(2, [4], num_neighbors=60, widest=3.0) == [Rung(4, 60, "least_squares")]
-
-
 @pytest.mark.parametrize("degree", [2, 9])
 def test_chunks_cover_all_points_within_the_bound(degree):
     rungs = ladder_rungs(2, [degree])

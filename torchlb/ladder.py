@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from math import ceil, inf
+from math import ceil
 from typing import Any, NamedTuple
 
 import torch
@@ -46,16 +46,11 @@ def ladder_rungs(
     degrees: Sequence[int],
     rules: Sequence[str] = ("least_squares",),
     num_neighbors: int | None = None,
-    widest: float = inf,
 ) -> list[Rung]:
-    """Candidates, best first: for each degree every rule, for each rule every size.
-
-    No size has more than `widest` points per polynomial. `num_neighbors` fixes the size instead.
+    """Candidates, best first: for each degree every rule, for each rule every size. `num_neighbors` fixes the size.
 
     >>> [rung.size for rung in ladder_rungs(2, [2])]
     [10, 12, 15, 18, 24, 30, 42, 60]
-    >>> [rung.size for rung in ladder_rungs(2, [2], widest=3.0)]
-    [10, 12, 15, 18]
     >>> ladder_rungs(2, [3, 2], num_neighbors=20)[1]
     Rung(degree=2, size=20, rule='least_squares')
     """
@@ -63,8 +58,7 @@ def ladder_rungs(
     for degree in degrees:
         count = num_monomials(dim, degree)
         for rule in rules:
-            factors = [factor for factor in SIZE_FACTORS[rule] if factor <= widest]
-            sizes = [ceil(factor * count - 1e-9) for factor in factors]
+            sizes = [ceil(factor * count - 1e-9) for factor in SIZE_FACTORS[rule]]
             fixed = sizes if num_neighbors is None else [num_neighbors]
             rungs += [Rung(degree, size, rule) for size in fixed]
     return rungs

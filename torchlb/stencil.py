@@ -1,15 +1,15 @@
 """From points to the rows of a sparse operator: every point takes the first stencil that passes.
 
 The ladder of a point at order p (`method.md`, section 4): least-squares (or polyharmonic) stencils of degree p + 1
-with K = 1.6, 2, … times as many points as polynomials, up to 10 on a cloud and 3 on a mesh; then the same at every odd
-order below; then positive weights of order 1; then the fallback row. How far down each point had to step is part of
-the result and never silent.
+with K = 1.6, 2, …, 10 times as many points as polynomials; then the same at every odd order below; then positive
+weights of order 1; then the fallback row. On a mesh that is better than order 1, which is tried there only if asked
+for. How far down each point had to step is part of the result and never silent.
 """
 
 from __future__ import annotations
 
 from dataclasses import replace
-from math import ceil, inf
+from math import ceil
 
 import torch
 from jaxtyping import Float, Int
@@ -44,15 +44,17 @@ MAX_DOMINANCE_AT_BOUNDARY = 6.0
 """One-sided stencils have larger weights, and wide ones would be balanced but poor: a lower order is better there."""
 MAX_SIZE_AT_BOUNDARY = 2.5
 """Points of a stencil per polynomial that holds points of the boundary."""
-MAX_SIZE_ON_MESH = 3.0
-"""Points of a stencil per polynomial: beyond it a fit reaches over too much of the surface, and triangles know more."""
 MAX_RESIDUAL = 1e-10
 MAX_MISFIT = 0.07
 MAX_MISFIT_ON_MESH = 0.03
 """Heights that no polynomial of the stencil's degree follows: a crease, an unresolved fold, noise. Triangles know more
-of the surface there than a fit, points alone do not. On a mesh it is the bound up to the degree below, and beyond it
-falls as the growth g∞ rises, since what heights do to Δ is misfit times growth."""
+of the surface there than a fit, points alone do not."""
 DEGREE_OF_MISFIT = 4
+"""The bound on a mesh holds up to it; beyond it falls as g∞ rises, as heights do to Δ misfit times growth."""
+WIDE_ON_MESH = 3.0
+MISFIT_OF_WIDE = 1 / 3
+"""Share of the bound for stencils with more points per polynomial than that: uneven points of a surface that is well
+resolved need them, and a fit to folds does not become better over more of them."""
 MISFIT_OF_NORMALS = 0.5
 """Share of the bound beyond degree 2 by the note's projection, whose errors on the same mesh are larger."""
 HOPELESS = 2.5
@@ -91,11 +93,13 @@ class Ladder:
         self.on_mesh = isinstance(geometry.fallback, MeshFallback)
         dim = self.frames.shape[-1]
         rules = [weights] if weights == "least_squares" else [weights, "least_squares"]
-        # Rows of an even order are no better on evenly spread points than those of the odd order below.
-        degrees = [order + 1, *range(order // 2 * 2, 1, -2)]
-        widest = MAX_SIZE_ON_MESH if self.on_mesh else inf
-        self.rungs = ladder_rungs(dim, degrees, rules, num_neighbors, widest)
-        self.rungs += ladder_rungs(dim, [2], ["positive"], num_neighbors)
+        # Rows of an even order are no better on evenly spread points than those of the odd order below, and rows of
+        # order 1 no better on a mesh than its triangles.
+        lowest = 4 if self.on_mesh else 2
+        degrees = [order + 1, *range(order // 2 * 2, lowest - 1, -2)]
+        self.rungs = ladder_rungs(dim, degrees, rules, num_neighbors)
+        if order == 1 or not self.on_mesh:
+            self.rungs += ladder_rungs(dim, [2], ["positive"], num_neighbors)
 
     def rows(self, centers: Int[Tensor, " B"], start: Int[Tensor, " B"] | None = None) -> Rows:
         """Rows of `centers`, each at the first rung (from `start` on) that passes, else the fallback row."""
@@ -110,7 +114,8 @@ class Ladder:
         def attempt(rows: Tensor, index: Tensor, rung: Rung) -> tuple[Tensor, Rows]:
             weights = self._weights(rows, index, rung)
             max_misfit = self._max_misfit(rung.degree)
-            failure = _failure(weights, *self._limits(index, rung), max_misfit)
+            share = MISFIT_OF_WIDE if self._wide_on_mesh(rung) else 1.0
+            failure = _failure(weights, *self._limits(index, rung), share * max_misfit)
             if rung.degree == top and rung.rule != "positive":
                 reason[place[rows]] = failure
             hopeless = max_misfit * (1 if self.on_mesh else HOPELESS)
@@ -175,6 +180,10 @@ class Ladder:
         if not self.on_mesh and self.projection != "tangent":
             coords = local_offsets(self.points, self.frames, centers, neighbors, "tangent")
         return local_heights(self.points, self.frames, centers, neighbors, coords)
+
+    def _wide_on_mesh(self, rung: Rung) -> bool:
+        size = ceil(WIDE_ON_MESH * num_monomials(self.frames.shape[-1], rung.degree))
+        return self.on_mesh and rung.size > size and not self.fixed_size
 
     def _max_misfit(self, degree: int) -> float:
         if not self.on_mesh:
