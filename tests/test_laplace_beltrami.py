@@ -397,12 +397,15 @@ def test_gradient_divergence_and_mean_curvature(surface):
 
 @pytest.mark.parametrize("name", ["points", "mesh", "polyharmonic", "curve", "clifford"])
 def test_divergence_of_the_position_is_the_dimension(name):
-    """Σ_c E_c·∂_c x = d exactly for straight projection, whose coordinates are linear in x."""
+    """Σ_c E_c·∂_c x = d exactly for straight projection, whose coordinates are linear in x.
+
+    Fallback rows fit first derivatives, and are left out.
+    """
     lb = built(name)
-    if (lb.report.order == 0).any():
-        pytest.skip("fallback rows fit first derivatives")
-    expected = torch.full((lb.num_points,), float(lb.dim), dtype=torch.float64)
-    same(lb.divergence(lb.points), expected, 1e-8)
+    fitted = lb.report.order > 0
+    assert fitted.double().mean() > 0.9
+    expected = torch.full((int(fitted.sum()),), float(lb.dim), dtype=torch.float64)
+    same(lb.divergence(lb.points)[fitted], expected, 1e-8)
 
 
 @pytest.mark.parametrize(
