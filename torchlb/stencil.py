@@ -113,12 +113,10 @@ class Ladder:
 
         def attempt(rows: Tensor, index: Tensor, rung: Rung) -> tuple[Tensor, Rows]:
             weights = self._weights(rows, index, rung)
-            max_misfit = self._max_misfit(rung.degree)
-            share = MISFIT_OF_WIDE if self._wide_on_mesh(rung) else 1.0
-            failure = _failure(weights, *self._limits(index, rung), share * max_misfit)
+            max_misfit, hopeless = self._misfits(rung)
+            failure = _failure(weights, *self._limits(index, rung), max_misfit)
             if rung.degree == top and rung.rule != "positive":
                 reason[place[rows]] = failure
-            hopeless = max_misfit * (1 if self.on_mesh else HOPELESS)
             unresolved = rows[weights.misfit > hopeless]
             start[place[unresolved]] = lower[self.rungs.index(rung)]
             return failure == 0, _stencil_rows(index, weights, rung.degree)
@@ -181,17 +179,20 @@ class Ladder:
             coords = local_offsets(self.points, self.frames, centers, neighbors, "tangent")
         return local_heights(self.points, self.frames, centers, neighbors, coords)
 
-    def _wide_on_mesh(self, rung: Rung) -> bool:
-        size = ceil(WIDE_ON_MESH * num_monomials(self.frames.shape[-1], rung.degree))
-        return self.on_mesh and rung.size > size and not self.fixed_size
+    def _widened(self, rung: Rung, factor: float) -> bool:
+        """Whether the ladder, not the user, has come to more than `factor` points per polynomial."""
+        size = ceil(factor * num_monomials(self.frames.shape[-1], rung.degree))
+        return rung.size > size and not self.fixed_size
 
-    def _max_misfit(self, degree: int) -> float:
+    def _misfits(self, rung: Rung) -> tuple[float, float]:
+        """Bounds on the misfit: of this rung, and of all rungs of its degree."""
         if not self.on_mesh:
-            return MAX_MISFIT
+            return MAX_MISFIT, MAX_MISFIT * HOPELESS
         dim = self.frames.shape[-1]
-        growth = typical_growth(dim, DEGREE_OF_MISFIT) / typical_growth(dim, degree)
-        straight = degree == 2 or self.projection == "tangent"
-        return MAX_MISFIT_ON_MESH * min(1.0, growth) * (1.0 if straight else MISFIT_OF_NORMALS)
+        growth = typical_growth(dim, DEGREE_OF_MISFIT) / typical_growth(dim, rung.degree)
+        straight = rung.degree == 2 or self.projection == "tangent"
+        bound = MAX_MISFIT_ON_MESH * min(1.0, growth) * (1.0 if straight else MISFIT_OF_NORMALS)
+        return bound * (MISFIT_OF_WIDE if self._widened(rung, WIDE_ON_MESH) else 1.0), bound
 
     def _limits(self, index: Tensor, rung: Rung) -> tuple[Float[Tensor, " B"], Float[Tensor, " B"]]:
         """Bounds on growth and dominance; none passes where points of the boundary make a wide stencil lopsided."""
@@ -201,8 +202,7 @@ class Ladder:
         dominance = torch.full_like(growth, MAX_DOMINANCE)
         if self.boundary is not None:
             touching = self.boundary.mask[index].any(1)
-            wide = rung.size > ceil(MAX_SIZE_AT_BOUNDARY * num_monomials(dim, rung.degree))
-            refused = wide and rung.degree > 2 and not self.fixed_size
+            refused = rung.degree > 2 and self._widened(rung, MAX_SIZE_AT_BOUNDARY)
             growth[touching] = 0.0 if refused else MAX_GROWTH_AT_BOUNDARY
             dominance[touching] = MAX_DOMINANCE_AT_BOUNDARY
         return growth * typical_growth(dim, rung.degree), dominance
