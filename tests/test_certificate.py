@@ -204,6 +204,34 @@ def test_meshes_of_random_vertices_keep_their_order_and_accuracy(order, bound):
     assert error <= bound * exact.norm()
 
 
+@pytest.mark.parametrize(("share", "bound"), [(0.01, 1e-3), (0.1, 1e-2)])
+def test_noise_keeps_the_operator_stable_and_its_spectrum(share, bound):
+    lb = LaplaceBeltrami.from_points(noisy_sphere(2000, share), order=3)
+    assert lb.certificate.holds
+    assert spectral_error(lb) <= bound
+
+
+def test_wider_stencils_of_a_fixed_size_average_noise():
+    """Nothing can widen them, so they are judged as the widest of the ladder: few fall, and the spectrum gains."""
+    points = noisy_sphere(2000, 0.1)
+    fixed = LaplaceBeltrami.from_points(points, order=3, num_neighbors=60)
+    assert fixed.certificate.holds
+    assert fixed.report.order_counts[3] >= 0.99 * 2000
+    assert spectral_error(fixed) < 0.7 * spectral_error(LaplaceBeltrami.from_points(points))
+
+
+def noisy_sphere(count, share):
+    """Noise in all directions, in units of the spacing."""
+    noise = torch.randn(count, 3, generator=torch.Generator().manual_seed(0)).double()
+    return Sphere().points(count) + share * math.sqrt(Sphere().area / count) * noise
+
+
+def spectral_error(lb):
+    """Of eigenvalues 1 to 15 of the unit sphere, the largest relative one."""
+    exact = Sphere().eigenvalues(16)[1:]
+    return float((lb.eigenbasis(16).eigenvalues[1:] / exact - 1).abs().max())
+
+
 def test_uncertified_operator_says_so():
     lb = LaplaceBeltrami.from_points(Sphere().points(300), certify=False)
     assert lb.certificate is None

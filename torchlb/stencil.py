@@ -59,7 +59,7 @@ MISFIT_OF_NORMALS = 0.5
 """Share of the bound beyond degree 2 by the note's projection, whose errors on the same mesh are larger."""
 HOPELESS = 2.5
 """The widest stencil of a degree on a cloud is 2.5 times as wide as the first, so noise of the heights can fall by that
-much."""
+much. A size that the user fixed cannot widen and falls only beyond."""
 
 
 class StencilError(ValueError):
@@ -187,7 +187,8 @@ class Ladder:
     def _misfits(self, rung: Rung) -> tuple[float, float]:
         """Bounds on the misfit: of this rung, and of all rungs of its degree."""
         if not self.on_mesh:
-            return MAX_MISFIT, MAX_MISFIT * HOPELESS
+            hopeless = MAX_MISFIT * HOPELESS
+            return (hopeless if self.fixed_size else MAX_MISFIT), hopeless
         dim = self.frames.shape[-1]
         growth = typical_growth(dim, DEGREE_OF_MISFIT) / typical_growth(dim, rung.degree)
         straight = rung.degree == 2 or self.projection == "tangent"
