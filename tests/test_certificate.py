@@ -238,8 +238,10 @@ def test_uncertified_operator_says_so():
     assert "certify=False" in repr(lb)
 
 
-def test_too_many_points_are_not_certified_silently(monkeypatch):
-    monkeypatch.setattr("torchlb.build.LARGEST", 100)
-    with pytest.warns(StabilityWarning, match="200 points are more than the 100"):
-        lb = LaplaceBeltrami.from_points(Sphere().points(200))
-    assert lb.certificate is None
+def test_a_certificate_that_does_not_hold_is_a_warning_with_names(monkeypatch):
+    monkeypatch.setattr("torchlb.certificate.MAX_ROUNDS", 0)
+    points = Sphere().random_points(500)
+    with pytest.warns(StabilityWarning, match=r"does NOT hold.*the worst points: \d+, \d+"):
+        lb = LaplaceBeltrami.from_points(points)
+    assert not lb.certificate.holds
+    assert "NOT STABLE" in repr(lb)

@@ -25,6 +25,7 @@ ORDER = [
     "stencil",
     "checks",
     "report",
+    "iterative",
     "certificate",
     "eigenbasis",
     "eigensolver",

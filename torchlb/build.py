@@ -9,7 +9,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from torchlb.certificate import LARGEST, Certificate, StabilityWarning, certify
+from torchlb.certificate import Certificate, certify
 from torchlb.checks import (
     check_boundary,
     check_distinct,
@@ -153,7 +153,7 @@ def build_cotangent(vertices: Any, faces: Any) -> Built:
 
 
 def _finished(geometry: Geometry, kind: str, options: Options, progress: bool) -> Built:
-    """Rows from the ladder, certified if asked for and possible."""
+    """Rows from the ladder, certified if asked for."""
     ladder = Ladder(
         geometry,
         options.order,
@@ -162,15 +162,7 @@ def _finished(geometry: Geometry, kind: str, options: Options, progress: bool) -
         num_neighbors=options.num_neighbors,
     )
     rows = build_stencil(ladder, progress=progress)
-    count = len(geometry.points)
-    if options.certify and count > LARGEST:
-        warnings.warn(
-            f"{count} points are more than the {LARGEST} that can be certified: the operator is the raw one, which may "
-            "not be stable under diffusion. Thin the points, or pass certify=False to say that this is known",
-            StabilityWarning,
-            stacklevel=4,
-        )
-    if not options.certify or count > LARGEST:
-        return Built(rows, geometry, kind, {**asdict(options), "certify": False}, None)
+    if not options.certify:
+        return Built(rows, geometry, kind, asdict(options), None)
     rows, mass, certificate = certify(ladder, rows, geometry.areas, progress=progress)
     return Built(rows, replace(geometry, areas=mass), kind, asdict(options), certificate)

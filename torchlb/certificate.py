@@ -20,6 +20,7 @@ from scipy.sparse.linalg import SuperLU, eigsh, splu
 from torch import Tensor
 from tqdm import tqdm
 
+from torchlb.iterative import negative_directions, null_density, raised_peaks
 from torchlb.rows import REASONS, Rows
 from torchlb.sparse import to_scipy
 from torchlb.stencil import Ladder, StencilError
@@ -44,11 +45,11 @@ POSITIVE = 1e-10
 """Share of its area that π must reach at every point; what is below has no inflow but rounding."""
 MAX_ROUNDS = 80
 PATIENCE = 20
-"""Rounds after which rows step down to the bottom at once."""
+"""Rounds after which rows step down to the bottom at once; twice as many beyond `LARGEST_FACTORED` points."""
 SINGLE_STEPS = 4
 """Times that a row steps down by one rung; from then on its way doubles with every second time."""
-LARGEST = 300_000
-"""Beyond this many points the sparse factors outgrow an ordinary machine: 4 GB there, and minutes each."""
+LARGEST_FACTORED = 100_000
+"""Beyond this many points Krylov methods come before the sparse factors, whose memory grows faster than the points."""
 MAX_VECTORS = 128
 ROUGH: Any = 1e-3
 """The spectral radius is wanted to a few digits only."""
@@ -107,11 +108,20 @@ def left_null_vector(
 ) -> tuple[Float[Tensor, " N"], np.ndarray]:
     """π with πᵀL = 0, scaled on each component to the sum of the areas there, and the component of each point.
 
-    Inverse iteration with the LU of (AL)ᵀ, A the areas, shifted by 1e-9 of its diagonal; four solves. On a component
+    Inverse iteration with the LU of (AL)ᵀ, A the areas, shifted by 1e-9 of its diagonal; four solves. Beyond
+    `LARGEST_FACTORED` points GMRES with multigrid of the low-order part. On a component
     with rows that lose heat (L1 < 0, next to a Dirichlet boundary) π solves πᵀL = −q instead, where q ≥ 0 is what the
     areas lose there, the positive part of −aᵀL in the columns of those rows.
     """
     area = areas.numpy()
+    component, losing, lossless = _components(matrix)
+    total = np.bincount(component, area)
+    lost = losing * np.maximum(-(matrix.T @ area), 0)
+    if len(area) > LARGEST_FACTORED:
+        scale = np.where(lossless, total, np.nan)
+        found = null_density(matrix, area, lost, scale, component)
+        if found is not None:
+            return torch.from_numpy(area * found), component
     weighted = sparse.diags_array(area) @ matrix
     shift = 1e-9 * np.median(np.abs(matrix.diagonal()))
     try:
@@ -121,18 +131,22 @@ def left_null_vector(
             "certificate: the operator is singular beyond its constants; is `dim` the dimension of the manifold? "
             "Pass the right one, or certify=False to look at the raw operator"
         ) from error
-    count, component = csgraph.connected_components(matrix, directed=True, connection="weak")
-    total = np.bincount(component, area, minlength=count)
-    losing = np.abs(matrix.sum(axis=1)) > LOSS * np.abs(matrix.diagonal())
-    lost = losing * np.maximum(-(matrix.T @ area), 0)
-    lossless = np.bincount(component, losing, minlength=count) == 0
     density = np.ones(len(area))
     for _ in range(4):
         density = -lu.solve(lost + shift * area * density)
         # Each component without a loss has its own null vector, with its own scale and sign.
-        share = total / np.bincount(component, area * density, minlength=count)
+        share = total / np.bincount(component, area * density)
         density *= np.where(lossless, share, 1.0)[component]
     return torch.from_numpy(area * density), component
+
+
+def _components(
+    matrix: sparse.csr_array,
+) -> tuple[np.ndarray, Bool[np.ndarray, " N"], Bool[np.ndarray, " C"]]:
+    """The component of each point, whether its row loses heat, and whether no row of a component does."""
+    count, component = csgraph.connected_components(matrix, directed=True, connection="weak")
+    losing = np.abs(matrix.sum(axis=1)) > LOSS * np.abs(matrix.diagonal())
+    return component, losing, np.bincount(component, losing, minlength=count) == 0
 
 
 def dissipation(
@@ -145,9 +159,11 @@ def dissipation(
     is already eliminated relaxes around j, so v lives where S fails. It is A^{-1} applied to d_j times column j of
     the factor, one solve. Row i feeds vᵀSv > 0 by v_i (Lv)_i, which sums to it.
 
+    Beyond `LARGEST_FACTORED` points the v are those that conjugate gradients come upon.
+
     Returns
     -------
-    max_s : largest vᵀSv / vᵀv, a lower bound of the largest eigenvalue; 0.0 if no pivot is negative.
+    max_s : largest vᵀSv / vᵀv, a lower bound of the largest eigenvalue; 0.0 if there is no v.
     feed : (N, k), the shares of the rows in each vᵀSv; k = 0 if there is none, at most `MAX_VECTORS`.
     """
     root = np.sqrt(mass.numpy())
@@ -156,18 +172,30 @@ def dissipation(
     # A fixed start, so that the same shape always walks the same way.
     start = np.random.default_rng(0).standard_normal(len(root))
     radius = float(abs(eigsh(symmetric, 1, v0=start, tol=ROUGH, return_eigenvectors=False)[0]))
-    lu = factorized(
-        sparse.csc_array(STRICTNESS * radius * sparse.eye_array(len(root)) - symmetric), 0.0
-    )
+    shifted = sparse.csc_array(STRICTNESS * radius * sparse.eye_array(len(root)) - symmetric)
+    vectors = None
+    if len(root) > LARGEST_FACTORED:
+        weak = sparse.csr_array(sparse.diags_array(root) @ shifted @ sparse.diags_array(root))
+        vectors = negative_directions(weak)
+    vectors = _negative_pivots(shifted) if vectors is None else root[:, None] * vectors
+    if vectors.shape[1] == 0:
+        return 0.0, torch.zeros(len(root), 0)
+    feed = vectors * (scaled @ vectors)
+    rayleigh = feed.sum(axis=0) / (vectors**2).sum(axis=0)
+    if len(root) > LARGEST_FACTORED:
+        feed = raised_peaks(feed, matrix, FEED_SHARE)
+    return float(rayleigh.max()) / radius, torch.from_numpy(feed)
+
+
+def _negative_pivots(matrix: sparse.csc_array) -> Float[np.ndarray, "N k"]:
+    """For each negative pivot of the symmetric A = LDLᵀ, at most `MAX_VECTORS`, v = L^{-T}e_j."""
+    lu = factorized(matrix, 0.0)
     pivots = lu.U.diagonal()
     negative = np.flatnonzero(pivots < 0)[:MAX_VECTORS]
     if len(negative) == 0:
-        return 0.0, torch.zeros(len(root), 0)
+        return np.empty((len(pivots), 0))
     columns = (lu.L[:, negative] * pivots[negative]).toarray()
-    vectors = lu.solve(columns[lu.perm_r])
-    feed = vectors * (scaled @ vectors)
-    rayleigh = feed.sum(axis=0) / (vectors**2).sum(axis=0)
-    return float(rayleigh.max()) / radius, torch.from_numpy(feed)
+    return lu.solve(columns[lu.perm_r])
 
 
 def check_certificate(
@@ -199,6 +227,7 @@ def certify(
     first = rows.rung.clone()
     steps = torch.zeros(count, dtype=torch.int64)
     rounds, bottom = 0, len(ladder.rungs)
+    patience = PATIENCE if count <= LARGEST_FACTORED else 2 * PATIENCE
     with tqdm(desc="certificate", delay=2, disable=not progress, leave=False) as bar:
         while True:
             bar.update()
@@ -224,7 +253,7 @@ def certify(
                 break
             rounds += 1
             steps[movable] += 1
-            way = _way_down(steps[movable]) if rounds <= PATIENCE else bottom
+            way = _way_down(steps[movable]) if rounds <= patience else bottom
             rows = _step_down(ladder, rows, movable, first[movable] + way)
     if not result.holds:
         _warn(result, mass / areas, feed)

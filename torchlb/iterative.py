@@ -1,0 +1,186 @@
+r"""Null vector and sign of an operator too large to factor, by Krylov methods (`method.md`, section 5).
+
+Both work on nearly symmetric matrices and lean on the same low-order matrix: the M-matrix W of the positive weights,
+whose multigrid cycle B ≈ W⁻¹ makes their number of iterations almost independent of that of the points.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from functools import cached_property
+
+import numpy as np
+import pyamg
+from jaxtyping import Float
+from scipy import sparse
+from scipy.sparse import csgraph
+from scipy.sparse.linalg import LinearOperator, gmres
+
+__all__ = ["LowOrder", "negative_directions", "null_density", "raised_peaks"]
+
+SHIFT = 1e-9
+"""Share of its diagonal that W is shifted by, so that it is definite."""
+GROUND = 1e-4
+"""The same for the null vector itself, where B must not blow up the constants: 100 iterations instead of 1,000."""
+ROUGH, FINE = 1e-6, 1e-14
+"""Residuals of a null vector that is `NEGATIVE` somewhere, which is all that is asked then, and of any other."""
+NEGATIVE = -1e-3
+RESTART, CYCLES = 50, 20
+"""Iterations of GMRES between restarts, and bound on the restarts."""
+MISS = 1e-6
+"""Conjugate gradients end at this residual; it bounds the chance to miss a negative eigenvalue."""
+FURTHER = 60
+"""Iterations after the first negative curvature, which tell the negative directions from each other."""
+MAX_ITERATIONS = 500
+PEAK = 0.02
+"""Share of the largest feed of a direction from which on a row can be a peak of its own."""
+
+
+class LowOrder:
+    """The M-matrix of a symmetric matrix: its positive entries as weights, and what is lost.
+
+    Parameters
+    ----------
+    symmetric : (N, N).
+    loss : of each point, what the diagonal has beyond the weights of its row; negative numbers are taken for rounding.
+    """
+
+    def __init__(self, symmetric: sparse.csr_array, loss: Float[np.ndarray, " N"]) -> None:
+        upper = sparse.triu(symmetric, 1).tocoo()
+        kept = upper.data > 0
+        (row, col), weight = (index[kept] for index in upper.coords), upper.data[kept]
+        self.size, self.row, self.col, self.weight = len(symmetric.diagonal()), row, col, weight
+        diagonal = np.bincount(row, weight, self.size) + np.bincount(col, weight, self.size)
+        self.loss = np.maximum(loss, 0) + SHIFT * (diagonal + diagonal.mean())
+        both = (np.concatenate([row, col]), np.concatenate([col, row]))
+        weights = sparse.csr_array((np.tile(weight, 2), both), shape=symmetric.shape)
+        self.matrix = sparse.csr_array(sparse.diags_array(diagonal + self.loss) - weights)
+
+    @cached_property
+    def inverse(self) -> LinearOperator:
+        """B: one symmetric V-cycle of multigrid by smoothed aggregation, the same in every run."""
+        hierarchy = pyamg.smoothed_aggregation_solver(
+            sparse.csr_matrix(self.matrix),
+            symmetry="symmetric",
+            smooth=("jacobi", {"weighting": "local"}),
+            improve_candidates=None,
+            max_coarse=500,
+        )
+        return hierarchy.aspreconditioner(cycle="V")
+
+    def noise(self) -> Float[np.ndarray, " N"]:
+        """A Gaussian vector of covariance W, one number for each edge and for each loss."""
+        random = np.random.default_rng(0)
+        edges = np.sqrt(self.weight) * random.standard_normal(len(self.weight))
+        flow = np.bincount(self.row, edges, self.size) - np.bincount(self.col, edges, self.size)
+        return flow + np.sqrt(self.loss) * random.standard_normal(self.size)
+
+
+def null_density(
+    matrix: sparse.csr_array,
+    area: Float[np.ndarray, " N"],
+    lost: Float[np.ndarray, " N"],
+    scale: Float[np.ndarray, " C"],
+    component: np.ndarray,
+) -> Float[np.ndarray, " N"] | None:
+    """x with (AL)ᵀx = −lost, A the areas, by GMRES with B; None if that does not converge.
+
+    Parameters
+    ----------
+    matrix, area, lost : L, the diagonal of A, the right-hand side.
+    scale : Σ a_i x_i of each component of L; NaN where nothing is free since `lost` fixes it.
+    component : of each point.
+    """
+    weighted = sparse.csr_array((sparse.diags_array(area) @ matrix).T)
+    loss = -area * (matrix.sum(axis=1) + GROUND * matrix.diagonal())
+    low = LowOrder(sparse.csr_array((weighted + weighted.T) / 2), loss)
+    free = np.isfinite(scale)
+    largest = float(abs(weighted).sum(axis=1).max())
+    density = np.ones(len(area))
+    for _ in range(CYCLES):
+        total = np.bincount(component, area * density, minlength=len(scale))
+        density *= np.where(free, scale / np.where(free, total, 1.0), 1.0)[component]
+        residual = -lost - weighted @ density
+        error = float(np.abs(residual).max()) / (largest * float(np.abs(density).max()))
+        if error <= (ROUGH if density.min() < NEGATIVE else FINE):
+            return density
+        wanted = max(ROUGH, 0.1 * FINE / error)
+        step = gmres(weighted, residual, M=-low.inverse, rtol=wanted, restart=RESTART, maxiter=1)
+        density = density + step[0]
+    return None
+
+
+def negative_directions(matrix: sparse.csr_array) -> Float[np.ndarray, "N k"] | None:
+    """Directions v with vᵀAv < 0 of a symmetric A; k = 0 if it has none, None if that could not be told.
+
+    Conjugate gradients on Ax = b, preconditioned by B, b Gaussian of covariance W ≈ B⁻¹. While every curvature is
+    positive the residual is r(Â)b̂, Â = B^½AB^½ with the signs of A, b̂ = B^½b, and the polynomial r has r(0) = 1 and
+    positive roots, the Ritz values. So |r(λ)| > 1 for λ < 0: the part of b̂ along a negative eigenvector never shrinks,
+    and it is a Gaussian number of deviation about one. Where the residual falls to `MISS` all the same, there is no
+    such eigenvector, but for a chance of about `MISS`. Once a curvature is negative, `FURTHER` iterations and a
+    Rayleigh-Ritz step on all of them tell the directions from each other.
+    """
+    low = LowOrder(sparse.csr_array(-matrix), matrix.sum(axis=1))
+    start = _without_constants(matrix, low.noise())
+    basis: list[np.ndarray] = []
+    negative, left, residual = None, FURTHER, np.inf
+    for z, p, curvature, residual in _conjugate_gradients(matrix, low.inverse, start):
+        if residual <= MISS or left == 0 or len(basis) == MAX_ITERATIONS:
+            break
+        basis.append(z / residual)
+        if negative is None and curvature <= 0:
+            negative = p
+        left -= negative is not None
+    if negative is None:
+        return np.empty((low.size, 0)) if residual <= MISS else None
+    block = np.stack(basis, axis=1)
+    values, vectors = np.linalg.eigh(block.T @ (matrix @ block))
+    found = block @ vectors[:, values < 0]
+    return found if found.shape[1] else negative[:, None]
+
+
+def raised_peaks(
+    feed: Float[np.ndarray, "N k"], matrix: sparse.csr_array, share: float
+) -> Float[np.ndarray, "N k"]:
+    """The feed, every place where a direction fails made as high as its worst.
+
+    On many points a direction is a sum of many local ones, by chance with different weights. Row i belongs to a peak if
+    its feed is at least `share` of the largest in row and column i of the matrix, and the sum there is positive.
+    """
+    joined = sparse.csr_array(abs(matrix) + abs(matrix).T)
+    joined.data[:] = 1.0
+    raised = feed.copy()
+    for column, own in zip(raised.T, feed.T, strict=True):
+        positive = np.maximum(own, 0)
+        around = np.maximum.reduceat(positive[joined.indices], joined.indptr[:-1])
+        worst = own.max()
+        peak = (own > PEAK * worst) & (own >= share * around) & (joined @ own > 0)
+        column[peak] = worst
+    return raised
+
+
+def _without_constants(
+    matrix: sparse.csr_array, vector: Float[np.ndarray, " N"]
+) -> Float[np.ndarray, " N"]:
+    """The vector less its mean on each component where constants are null vectors of the matrix."""
+    _, component = csgraph.connected_components(matrix, directed=False)
+    loss, whole = (np.bincount(component, v) for v in (matrix.sum(axis=1), matrix.diagonal()))
+    mean = np.bincount(component, vector) / np.bincount(component)
+    return vector - np.where(loss <= SHIFT * whole, mean, 0.0)[component]
+
+
+def _conjugate_gradients(
+    matrix: sparse.csr_array, inverse: LinearOperator, right: Float[np.ndarray, " N"]
+) -> Iterator[tuple[np.ndarray, np.ndarray, float, float]]:
+    """Of each iteration z = B r, the direction p, pᵀAp, and the residual √(rᵀBr). It goes on past pᵀAp < 0."""
+    r = right
+    z = inverse.matvec(r)
+    p, square = z, float(r @ z)
+    while True:
+        product = matrix @ p
+        curvature = float(p @ product)
+        yield z, p, curvature, square**0.5
+        r = r - square / curvature * product
+        z = inverse.matvec(r)
+        before, square = square, float(r @ z)
+        p = z + square / before * p
