@@ -33,6 +33,7 @@ from scipy.sparse.linalg import ArpackError, eigs, eigsh
 from torch import Tensor
 from tqdm import tqdm
 
+import torchlb.certificate
 from torchlb import LaplaceBeltrami, clean_mesh
 from torchlb.sparse import to_scipy
 from torchlb.surfaces import Sphere, Torus
@@ -229,11 +230,16 @@ def main() -> None:
     parser.add_argument(
         "--split", action="store_true", help="seconds of stencils + certificate, by building twice"
     )
+    parser.add_argument(
+        "--unfactored", action="store_true", help="the certificate's Krylov methods at every size"
+    )
     parser.add_argument("--summarize", type=Path, nargs="+", metavar="TABLE")
     options = parser.parse_args()
     if options.summarize:
         print(*summarize(options.summarize), sep="\n")
         return
+    if options.unfactored:
+        torchlb.certificate.LARGEST_FACTORED = 0
     torch.set_num_threads(1)
     warnings.simplefilter("ignore")
     every = list(shapes_in(options.data)) if options.data else list(dirty())
