@@ -35,7 +35,6 @@ from tqdm import tqdm
 
 import torchlb.certificate
 from torchlb import LaplaceBeltrami, clean_mesh
-from torchlb.sparse import to_scipy
 from torchlb.surfaces import Sphere, Torus
 
 DENSE = 3000
@@ -142,7 +141,7 @@ def abscissa(lb: LaplaceBeltrami) -> float:
     if n <= DENSE:
         values = np.linalg.eigvals(lb.matrix.to_dense().numpy())
         return float(values.real.max() / np.abs(values).max())
-    matrix = to_scipy(lb.crow, lb.col, lb.values, (n, n))
+    matrix = lb.to_scipy()
     try:
         radius = np.abs(eigs(matrix, 1, tol=1e-2, return_eigenvectors=False)[0])
         top = eigs(matrix, 2, which="LR", tol=1e-6, ncv=60, maxiter=200, return_eigenvectors=False)

@@ -8,7 +8,6 @@ from scipy import sparse
 from torchlb import LaplaceBeltrami
 from torchlb.certificate import check_certificate, left_null_vector
 from torchlb.iterative import LowOrder, negative_directions
-from torchlb.sparse import to_scipy
 from torchlb.surfaces import Hemisphere, Sphere, Torus, smooth_function
 
 
@@ -21,10 +20,6 @@ def unfactored(monkeypatch):
         raise AssertionError("factored")
 
     monkeypatch.setattr("torchlb.certificate.factorized", refuse)
-
-
-def scipy_matrix(lb):
-    return to_scipy(lb.crow, lb.col, lb.values, (lb.num_points, lb.num_points))
 
 
 def random_cloud():
@@ -43,7 +38,7 @@ def losing():
 @pytest.mark.parametrize("build", [random_cloud, two_components, losing])
 def test_null_vector_and_verdict_are_those_of_the_factors(build, monkeypatch):
     lb = build()
-    matrix, areas = scipy_matrix(lb), lb.mass * (1 + 0.3 * torch.sin(torch.arange(lb.num_points)))
+    matrix, areas = lb.to_scipy(), lb.mass * (1 + 0.3 * torch.sin(torch.arange(lb.num_points)))
     expected, verdict, _ = check_certificate(matrix, areas)
     monkeypatch.setattr("torchlb.certificate.LARGEST_FACTORED", 0)
     mass, same_verdict, _ = check_certificate(matrix, areas)
@@ -113,11 +108,11 @@ def test_noise_has_the_low_order_matrix_as_covariance():
 
 def test_factors_step_in_where_krylov_methods_do_not_converge(monkeypatch):
     lb = LaplaceBeltrami.from_points(Sphere().random_points(400))
-    expected = left_null_vector(scipy_matrix(lb), lb.mass)[0]
+    expected = left_null_vector(lb.to_scipy(), lb.mass)[0]
     monkeypatch.setattr("torchlb.certificate.LARGEST_FACTORED", 0)
     monkeypatch.setattr("torchlb.iterative.CYCLES", 1)
     monkeypatch.setattr("torchlb.iterative.MAX_ITERATIONS", 3)
     areas = lb.mass * torch.linspace(0.5, 1.5, 400)
-    mass, verdict, _ = check_certificate(scipy_matrix(lb), areas)
+    mass, verdict, _ = check_certificate(lb.to_scipy(), areas)
     torch.testing.assert_close(mass / mass.sum(), expected / expected.sum(), rtol=1e-9, atol=0)
     assert verdict.holds

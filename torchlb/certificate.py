@@ -20,7 +20,7 @@ from scipy.sparse.linalg import SuperLU, eigsh, splu
 from torch import Tensor
 from tqdm import tqdm
 
-from torchlb.iterative import negative_directions, null_density, raised_peaks
+from torchlb.iterative import negative_directions, null_density, raised_peaks, rescaled
 from torchlb.rows import REASONS, Rows
 from torchlb.sparse import to_scipy
 from torchlb.stencil import Ladder, StencilError
@@ -109,17 +109,15 @@ def left_null_vector(
     """π with πᵀL = 0, scaled on each component to the sum of the areas there, and the component of each point.
 
     Inverse iteration with the LU of (AL)ᵀ, A the areas, shifted by 1e-9 of its diagonal; four solves. Beyond
-    `LARGEST_FACTORED` points GMRES with multigrid of the low-order part. On a component
-    with rows that lose heat (L1 < 0, next to a Dirichlet boundary) π solves πᵀL = −q instead, where q ≥ 0 is what the
-    areas lose there, the positive part of −aᵀL in the columns of those rows.
+    `LARGEST_FACTORED` points GMRES with multigrid of the low-order part. On a component with rows that lose heat
+    (L1 < 0, next to a Dirichlet boundary) π solves πᵀL = −q instead, where q ≥ 0 is what the areas lose there, the
+    positive part of −aᵀL in the columns of those rows.
     """
     area = areas.numpy()
     component, losing, lossless = _components(matrix)
-    total = np.bincount(component, area)
     lost = losing * np.maximum(-(matrix.T @ area), 0)
     if len(area) > LARGEST_FACTORED:
-        scale = np.where(lossless, total, np.nan)
-        found = null_density(matrix, area, lost, scale, component)
+        found = null_density(matrix, area, lost, component, lossless)
         if found is not None:
             return torch.from_numpy(area * found), component
     weighted = sparse.diags_array(area) @ matrix
@@ -134,9 +132,7 @@ def left_null_vector(
     density = np.ones(len(area))
     for _ in range(4):
         density = -lu.solve(lost + shift * area * density)
-        # Each component without a loss has its own null vector, with its own scale and sign.
-        share = total / np.bincount(component, area * density)
-        density *= np.where(lossless, share, 1.0)[component]
+        density = rescaled(density, area, component, lossless)
     return torch.from_numpy(area * density), component
 
 

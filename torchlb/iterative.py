@@ -11,12 +11,12 @@ from functools import cached_property
 
 import numpy as np
 import pyamg
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from scipy import sparse
 from scipy.sparse import csgraph
 from scipy.sparse.linalg import LinearOperator, gmres
 
-__all__ = ["LowOrder", "negative_directions", "null_density", "raised_peaks"]
+__all__ = ["LowOrder", "negative_directions", "null_density", "raised_peaks", "rescaled"]
 
 SHIFT = 1e-9
 """Share of its diagonal that W is shifted by, so that it is definite."""
@@ -76,30 +76,39 @@ class LowOrder:
         return flow + np.sqrt(self.loss) * random.standard_normal(self.size)
 
 
+def rescaled(
+    density: Float[np.ndarray, " N"],
+    area: Float[np.ndarray, " N"],
+    component: np.ndarray,
+    free: Bool[np.ndarray, " C"],
+) -> Float[np.ndarray, " N"]:
+    """The density with a mean of one over the area of each free component, as 1 has: its own scale, its own sign."""
+    share = np.bincount(component, area) / np.bincount(component, area * density)
+    return density * np.where(free, share, 1.0)[component]
+
+
 def null_density(
     matrix: sparse.csr_array,
     area: Float[np.ndarray, " N"],
     lost: Float[np.ndarray, " N"],
-    scale: Float[np.ndarray, " C"],
     component: np.ndarray,
+    free: Bool[np.ndarray, " C"],
 ) -> Float[np.ndarray, " N"] | None:
     """x with (AL)ᵀx = −lost, A the areas, by GMRES with B; None if that does not converge.
 
     Parameters
     ----------
     matrix, area, lost : L, the diagonal of A, the right-hand side.
-    scale : Σ a_i x_i of each component of L; NaN where nothing is free since `lost` fixes it.
     component : of each point.
+    free : whether the scale of x on a component is, which `lost` does not fix there; see `rescaled`.
     """
     weighted = sparse.csr_array((sparse.diags_array(area) @ matrix).T)
     loss = -area * (matrix.sum(axis=1) + GROUND * matrix.diagonal())
     low = LowOrder(sparse.csr_array((weighted + weighted.T) / 2), loss)
-    free = np.isfinite(scale)
     largest = float(abs(weighted).sum(axis=1).max())
     density = np.ones(len(area))
     for _ in range(CYCLES):
-        total = np.bincount(component, area * density, minlength=len(scale))
-        density *= np.where(free, scale / np.where(free, total, 1.0), 1.0)[component]
+        density = rescaled(density, area, component, free)
         residual = -lost - weighted @ density
         error = float(np.abs(residual).max()) / (largest * float(np.abs(density).max()))
         if error <= (ROUGH if density.min() < NEGATIVE else FINE):
