@@ -91,6 +91,40 @@ def test_dirichlet_rows():
     assert error.norm() < 1e-8 * (12 * x * y).norm()  # a polynomial of degree 4 is exact at p = 3
 
 
+def test_a_close_pair_on_a_dirichlet_boundary_is_not_stiff():
+    """Two rim points of a cloud 1e-9 apart: −4d/h² of that would hide all else from time steps and the certificate."""
+    points = UnitDisk().points(300)
+    mask = UnitDisk().boundary_mask(points)
+    rim = points[mask][0]
+    twin = rim + 1e-9 * torch.stack([-rim[1], rim[0], rim[2]])
+    points, mask = torch.cat([points, twin[None]]), torch.cat([mask, torch.tensor([True])])
+    lb = LaplaceBeltrami.from_points(points, dim=2, boundary=mask, condition="dirichlet")
+    assert lb.certificate.holds
+    own = lb.matrix.to_dense().diagonal().abs()
+    assert own[mask].max() < 300 * own[~mask].max()
+
+
+@pytest.mark.filterwarnings("ignore:vertices")
+def test_the_sides_of_a_slit_may_coincide():
+    """A square mesh whose seam was not merged halfway across: twins on the boundary, at the same place."""
+    step = torch.linspace(0, 1, 17, dtype=torch.float64)
+    x, y = (v.flatten() for v in torch.meshgrid(step, step, indexing="ij"))
+    vertices = torch.stack([x, y, torch.zeros(289)], 1)
+    corner = torch.arange(289).reshape(17, 17)
+    a, b, c, d = (
+        v.flatten() for v in (corner[:-1, :-1], corner[1:, :-1], corner[1:, 1:], corner[:-1, 1:])
+    )
+    faces = torch.cat([torch.stack([a, b, c], 1), torch.stack([a, c, d], 1)])
+    seam = ((y == 0.5) & (x < 0.5)).nonzero()[:, 0]
+    upper = torch.arange(289).scatter(0, seam, 289 + torch.arange(len(seam)))
+    above = (y[faces] >= 0.5).all(1)
+    faces[above] = upper[faces[above]]
+    lb = LaplaceBeltrami.from_mesh(
+        torch.cat([vertices, vertices[seam]]), faces, boundary="dirichlet", certify=False
+    )
+    assert lb.values.isfinite().all()
+
+
 def test_heat_leaves_through_a_dirichlet_boundary_only():
     """The norm of π contracts strictly; a closed component beside it keeps its heat to rounding."""
     vertices, faces = UnitDisk().mesh(300)

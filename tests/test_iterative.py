@@ -7,7 +7,7 @@ from scipy import sparse
 
 from torchlb import LaplaceBeltrami
 from torchlb.certificate import check_certificate, left_null_vector
-from torchlb.iterative import LowOrder, negative_directions
+from torchlb.iterative import LowOrder, negative_directions, raised_peaks
 from torchlb.surfaces import Hemisphere, Sphere, Torus, smooth_function
 
 
@@ -20,6 +20,11 @@ def unfactored(monkeypatch):
         raise AssertionError("factored")
 
     monkeypatch.setattr("torchlb.certificate.factorized", refuse)
+
+
+def two_scales():
+    points = torch.cat([1e-5 * Sphere().random_points(500), Torus().random_points(400) + 9])
+    return LaplaceBeltrami.from_points(points, order=3)
 
 
 def random_cloud():
@@ -35,7 +40,7 @@ def losing():
     return LaplaceBeltrami.from_mesh(*Hemisphere().mesh(500), boundary="dirichlet")
 
 
-@pytest.mark.parametrize("build", [random_cloud, two_components, losing])
+@pytest.mark.parametrize("build", [random_cloud, two_components, two_scales, losing])
 def test_null_vector_and_verdict_are_those_of_the_factors(build, monkeypatch):
     lb = build()
     matrix, areas = lb.to_scipy(), lb.mass * (1 + 0.3 * torch.sin(torch.arange(lb.num_points)))
@@ -45,6 +50,17 @@ def test_null_vector_and_verdict_are_those_of_the_factors(build, monkeypatch):
     torch.testing.assert_close(mass, expected, rtol=1e-9, atol=0)
     assert verdict.holds
     assert (same_verdict.holds, same_verdict.components) == (True, verdict.components)
+
+
+def test_what_the_factors_refuse_is_refused(monkeypatch):
+    raw = LaplaceBeltrami.from_points(Sphere().random_points(700), order=1, certify=False)
+    step = LaplaceBeltrami.from_points(Sphere().random_points(700), order=1)
+    matrix = raw.to_scipy()
+    verdicts = [check_certificate(matrix, step.mass)[1]]
+    monkeypatch.setattr("torchlb.certificate.LARGEST_FACTORED", 0)
+    verdicts.append(check_certificate(matrix, step.mass)[1])
+    assert [v.holds for v in verdicts] == [False, False]
+    assert verdicts[0].min_pi == pytest.approx(verdicts[1].min_pi, rel=1e-3)
 
 
 @pytest.mark.parametrize("order", [1, 3])
@@ -92,6 +108,35 @@ def test_a_shallow_negative_eigenvalue_is_found(depth):
     assert found.shape[1] >= 1
     rayleigh = ((found * (matrix @ found)).sum(0) / (found**2).sum(0)).min()
     assert 1.001 * lowest <= rayleigh <= 0.3 * lowest
+
+
+@pytest.mark.parametrize("weight", [1e8, 1e16])
+def test_a_light_part_is_seen_beside_a_heavy_one(weight):
+    """The residual would vanish if the preconditioner left out what is small beside its heaviest entry."""
+    pair = np.zeros(100)
+    pair[44], pair[66] = 1.0, -1.0
+    grid = sparse.csr_array(graph_laplacian(10) - 3 * np.outer(pair, pair))
+    heavy = sparse.coo_array([[weight]])
+    lowest = np.linalg.eigvalsh(grid.toarray())[0]
+    assert lowest < -1
+    found = negative_directions(sparse.csr_array(sparse.block_diag([heavy, grid])))[1:]
+    assert found.shape[1] >= 1
+    rayleigh = ((found * (grid @ found)).sum(0) / (found**2).sum(0)).min()
+    assert 1.001 * lowest <= rayleigh <= 0.3 * lowest
+
+
+def test_every_place_where_a_direction_fails_is_a_peak():
+    """Two places on a path, one a tenth as high; what only neighbours a peak, or loses in sum, stays as it is."""
+    path = sparse.csr_array(
+        sparse.diags_array([1.0, -2.0, 1.0], offsets=[-1, 0, 1], shape=(12, 12))
+    )
+    feed = np.zeros((12, 1))
+    feed[1:4, 0] = [0.1, 1.0, 0.1]
+    feed[6:9, 0] = [-0.02, 0.1, -0.02]
+    feed[10:, 0] = [0.1, -0.2]
+    raised = feed.copy()
+    raised[7] = 1.0
+    np.testing.assert_array_equal(raised_peaks(feed, path, 0.2), raised)
 
 
 def test_noise_has_the_low_order_matrix_as_covariance():

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from math import isnan
 from typing import Any
 
 import torch
@@ -65,7 +66,7 @@ def join_certificates(certificates: Sequence[Certificate | None]) -> Certificate
     return Certificate(
         holds=all(c.holds for c in known),
         min_pi=min(c.min_pi for c in known),
-        max_s=max(c.max_s for c in known),
+        max_s=max((c.max_s for c in known), key=lambda s: (isnan(s), s)),
         rounds=max(c.rounds for c in known),
         stepped_down=sum(c.stepped_down for c in known),
         components=sum(c.components for c in known),

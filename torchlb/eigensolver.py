@@ -20,8 +20,9 @@ from scipy.sparse import csgraph
 from scipy.sparse.linalg import ArpackError, LinearOperator, eigs, eigsh
 from torch import Tensor
 
-from torchlb.certificate import LOSS, factorized, left_null_vector
+from torchlb.certificate import CONSERVED, LOSS, factorized, left_null_vector
 from torchlb.eigenbasis import Eigenbasis, stack_eigenbases
+from torchlb.iterative import imbalance
 from torchlb.stencil import StencilError
 
 __all__ = ["blockwise_eigenbasis", "solve_eigenbasis"]
@@ -97,8 +98,7 @@ def solve_eigenbasis(
     count, component = csgraph.connected_components(a, directed=True, connection="weak")
     lossy = np.bincount(component, losing, minlength=count) > 0
     null_left = pi.copy()
-    flow = np.where(lossy[component], 0.0, pi @ a)
-    if np.abs(flow).max() > 1e-11 * (pi @ abs(a)).max():
+    if imbalance(sparse.csr_array(a.T), np.where(lossy[component], 0.0, pi)) > CONSERVED:
         null_left = left_null_vector(sparse.csr_array(-a), torch.from_numpy(pi.copy()))[0].numpy()
     wanted = max(min(k, len(pi)) - int((~lossy).sum()), 0)
     tolerance = max(SYMMETRY, 8 * rounding)

@@ -6,6 +6,7 @@ whose multigrid cycle B ≈ W⁻¹ makes their number of iterations almost indep
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from functools import cached_property
 
@@ -16,17 +17,24 @@ from scipy import sparse
 from scipy.sparse import csgraph
 from scipy.sparse.linalg import LinearOperator, gmres
 
-__all__ = ["LowOrder", "negative_directions", "null_density", "raised_peaks", "rescaled"]
+__all__ = [
+    "LowOrder",
+    "imbalance",
+    "negative_directions",
+    "null_density",
+    "raised_peaks",
+    "rescaled",
+]
 
 SHIFT = 1e-9
-"""Share of its diagonal that W is shifted by, so that it is definite."""
+"""Share of each diagonal entry that W is shifted by, so that it is definite."""
 GROUND = 1e-4
 """The same for the null vector itself, where B must not blow up the constants: 100 iterations instead of 1,000."""
-ROUGH, FINE = 1e-6, 1e-14
-"""Residuals of a null vector that is `NEGATIVE` somewhere, which is all that is asked then, and of any other."""
+ROUGH, FINE = 1e-5, 1e-12
+"""Imbalance of a null vector that is `NEGATIVE` somewhere, which is all that is asked then, and of any other."""
 NEGATIVE = -1e-3
-RESTART, CYCLES = 50, 20
-"""Iterations of GMRES between restarts, and bound on the restarts."""
+RESTART, CYCLES, STEP = 50, 20, 1e-6
+"""Iterations of GMRES between restarts, bound on the restarts, and what one of them asks for at most."""
 MISS = 1e-6
 """Conjugate gradients end at this residual; it bounds the chance to miss a negative eigenvalue."""
 FURTHER = 60
@@ -51,7 +59,8 @@ class LowOrder:
         (row, col), weight = (index[kept] for index in upper.coords), upper.data[kept]
         self.size, self.row, self.col, self.weight = len(symmetric.diagonal()), row, col, weight
         diagonal = np.bincount(row, weight, self.size) + np.bincount(col, weight, self.size)
-        self.loss = np.maximum(loss, 0) + SHIFT * (diagonal + diagonal.mean())
+        own = np.abs(symmetric.diagonal())
+        self.loss = np.maximum(loss, 0) + SHIFT * np.where(own > 0, own, 1.0)
         both = (np.concatenate([row, col]), np.concatenate([col, row]))
         weights = sparse.csr_array((np.tile(weight, 2), both), shape=symmetric.shape)
         self.matrix = sparse.csr_array(sparse.diags_array(diagonal + self.loss) - weights)
@@ -65,6 +74,7 @@ class LowOrder:
             smooth=("jacobi", {"weighting": "local"}),
             improve_candidates=None,
             max_coarse=500,
+            coarse_solver="cholesky",  # the default leaves out what is 1e-15 of the heaviest, and is blind to it
         )
         return hierarchy.aspreconditioner(cycle="V")
 
@@ -83,8 +93,19 @@ def rescaled(
     free: Bool[np.ndarray, " C"],
 ) -> Float[np.ndarray, " N"]:
     """The density with a mean of one over the area of each free component, as 1 has: its own scale, its own sign."""
-    share = np.bincount(component, area) / np.bincount(component, area * density)
-    return density * np.where(free, share, 1.0)[component]
+    total = np.where(free, np.bincount(component, area * density), np.bincount(component, area))
+    return density * (np.bincount(component, area) / total)[component]
+
+
+def imbalance(
+    matrix: sparse.csr_array,
+    vector: Float[np.ndarray, " N"],
+    lost: Float[np.ndarray, " N"] | float = 0.0,
+) -> float:
+    """Largest |Ax + lost| over the sum of its terms |A||x|, row by row, so that each is judged by its own scale."""
+    terms = abs(matrix) @ np.abs(vector)
+    left = np.abs(matrix @ vector + lost)
+    return float(np.max(left / np.where(terms > 0, terms, 1.0)))
 
 
 def null_density(
@@ -105,15 +126,16 @@ def null_density(
     weighted = sparse.csr_array((sparse.diags_array(area) @ matrix).T)
     loss = -area * (matrix.sum(axis=1) + GROUND * matrix.diagonal())
     low = LowOrder(sparse.csr_array((weighted + weighted.T) / 2), loss)
-    largest = float(abs(weighted).sum(axis=1).max())
     density = np.ones(len(area))
     for _ in range(CYCLES):
         density = rescaled(density, area, component, free)
         residual = -lost - weighted @ density
-        error = float(np.abs(residual).max()) / (largest * float(np.abs(density).max()))
+        error = imbalance(weighted, density, lost)
         if error <= (ROUGH if density.min() < NEGATIVE else FINE):
             return density
-        wanted = max(ROUGH, 0.1 * FINE / error)
+        if not np.isfinite(error):
+            break
+        wanted = max(STEP, 0.01 * FINE / error)
         step = gmres(weighted, residual, M=-low.inverse, rtol=wanted, restart=RESTART, maxiter=1)
         density = density + step[0]
     return None
@@ -134,10 +156,10 @@ def negative_directions(matrix: sparse.csr_array) -> Float[np.ndarray, "N k"] | 
     basis: list[np.ndarray] = []
     negative, left, residual = None, FURTHER, np.inf
     for z, p, curvature, residual in _conjugate_gradients(matrix, low.inverse, start):
-        if residual <= MISS or left == 0 or len(basis) == MAX_ITERATIONS:
+        if not residual > MISS or left == 0 or len(basis) == MAX_ITERATIONS:
             break
         basis.append(z / residual)
-        if negative is None and curvature <= 0:
+        if negative is None and curvature < 0:
             negative = p
         left -= negative is not None
     if negative is None:
@@ -181,14 +203,19 @@ def _without_constants(
 def _conjugate_gradients(
     matrix: sparse.csr_array, inverse: LinearOperator, right: Float[np.ndarray, " N"]
 ) -> Iterator[tuple[np.ndarray, np.ndarray, float, float]]:
-    """Of each iteration z = B r, the direction p, pᵀAp, and the residual √(rᵀBr). It goes on past pᵀAp < 0."""
+    """Of each iteration z = B r, the direction p, pᵀAp, and the residual √(rᵀBr), NaN if B is not positive.
+
+    It goes on past pᵀAp < 0, and ends where pᵀAp = 0.
+    """
     r = right
     z = inverse.matvec(r)
     p, square = z, float(r @ z)
     while True:
         product = matrix @ p
         curvature = float(p @ product)
-        yield z, p, curvature, square**0.5
+        yield z, p, curvature, math.sqrt(square) if square >= 0 else math.nan
+        if curvature == 0:
+            return
         r = r - square / curvature * product
         z = inverse.matvec(r)
         before, square = square, float(r @ z)

@@ -44,6 +44,8 @@ MAX_DOMINANCE_AT_BOUNDARY = 6.0
 """One-sided stencils have larger weights, and wide ones would be balanced but poor: a lower order is better there."""
 MAX_SIZE_AT_BOUNDARY = 2.5
 """Points of a stencil per polynomial that holds points of the boundary."""
+CLOSEST = 0.1
+"""Share of the farthest distance in its row that a boundary point's own scale has at least: near pairs are stiff."""
 MAX_RESIDUAL = 1e-10
 MAX_MISFIT = 0.07
 MAX_MISFIT_ON_MESH = 0.03
@@ -138,17 +140,19 @@ class Ladder:
     def _without_boundary(self, centers: Tensor, rows: Rows) -> Float[Tensor, " nnz"]:
         """Entries of Δ for f = 0 on the boundary: none joins a boundary point to another point.
 
-        A boundary point has −4d/h² for itself, as a grid's fastest wave, h its distance to the nearest point.
+        A boundary point has −4d/h² for itself, as a grid's fastest wave, h its distance to the nearest point, but at
+        least `CLOSEST` of that to the farthest in its row.
         """
         assert self.boundary is not None
         mask, dim = self.boundary.mask, self.frames.shape[-1]
         local = torch.arange(len(centers)).repeat_interleave(rows.length)
         row, col = centers[local], rows.col
         square = (self.points[col] - self.points[row]).square().sum(1)
+        farthest = square.new_zeros(len(centers)).scatter_reduce(0, local, square, "amax")
         square = torch.where(row == col, torch.inf, square)
-        nearest = square.new_full((len(centers),), torch.inf).scatter_reduce(
-            0, local, square, "amin"
-        )
+        nearest = farthest.scatter_reduce(0, local, square, "amin")
+        nearest = nearest.maximum(CLOSEST**2 * farthest)
+        nearest = torch.where(nearest > 0, nearest, 1.0)  # a row of coincident points has no scale
         kept = torch.where(mask[row] | mask[col], 0.0, rows.laplacian)
         return torch.where(mask[row] & (row == col), -4 * dim / nearest[local], kept)
 
