@@ -163,6 +163,22 @@ def test_balls_start_at_the_centre_and_ascend_without_repetition():
         assert (distance[row, :number].diff() >= 0).all()
 
 
+def test_a_point_comes_before_those_that_coincide_with_it():
+    points, faces = Sphere().mesh(300)
+    around = faces[(faces < 20).any(1)]
+    graph = mesh_graph(torch.cat([faces, torch.where(around < 20, around + 300, around)]), 320)
+    frames = mesh_frames(points, faces)
+    points, frames = torch.cat([points, points[:20]]), torch.cat([frames, frames[:20]])
+    index, _ = GraphBalls(points, graph, frames)(torch.arange(320), 20)
+    assert torch.equal(index[:, 0], torch.arange(320))
+    nearest = nearest_neighbors(points, 9)
+    assert torch.equal(nearest[:, 0], torch.arange(320))
+    assert all(len(set(row)) == 9 for row in nearest.tolist())
+    crowd = nearest_neighbors(torch.zeros(6, 2), 4)
+    assert torch.equal(crowd[:, 0], torch.arange(6))
+    assert all(len(set(row)) == 4 for row in crowd.tolist())
+
+
 def test_everything_in_a_ball_is_admissible():
     points = Ellipsoid((1.0, 1.0, 0.1)).points(800)
     balls = cloud_balls(points)

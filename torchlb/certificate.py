@@ -41,7 +41,7 @@ __all__ = [
 ]
 
 LOSS = 1e-9
-"""A row whose sum is above this share of its diagonal loses heat; all others sum to zero up to rounding."""
+"""A row whose sum is above this share of its size loses heat; all others sum to zero up to rounding."""
 MARGIN = 0.02
 """A point whose π is below this share of its area asks the rows around it to step down while they can."""
 STRICTNESS = 1e-12
@@ -149,7 +149,7 @@ def _components(
 ) -> tuple[np.ndarray, Bool[np.ndarray, " N"], Bool[np.ndarray, " C"]]:
     """The component of each point, whether its row loses heat, and whether no row of a component does."""
     count, component = csgraph.connected_components(matrix, directed=True, connection="weak")
-    losing = np.abs(matrix.sum(axis=1)) > LOSS * np.abs(matrix.diagonal())
+    losing = np.abs(matrix.sum(axis=1)) > LOSS * abs(matrix).sum(axis=1)
     return component, losing, np.bincount(component, losing, minlength=count) == 0
 
 

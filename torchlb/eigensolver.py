@@ -92,7 +92,7 @@ def solve_eigenbasis(
     a = -sparse.csr_array(matrix, dtype=np.float64, copy=True)
     a.eliminate_zeros()
     total = a.sum(axis=1)
-    losing = np.abs(total) > max(LOSS, 64 * rounding) * np.abs(a.diagonal())
+    losing = np.abs(total) > max(LOSS, 64 * rounding) * abs(a).sum(axis=1)
     a = sparse.csr_array(a - sparse.diags_array(np.where(losing, 0.0, total)))
     pi = mass.detach().cpu().double().numpy()
     count, component = csgraph.connected_components(a, directed=True, connection="weak")

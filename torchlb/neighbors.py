@@ -37,14 +37,18 @@ BALL_SURPLUS = 1.5
 
 
 def nearest_neighbors(points: Float[Tensor, "N n"], size: int) -> Int[Tensor, "N K"]:
-    """The `size` nearest points of each point by distance, the point itself first.
+    """The `size` nearest points of each point by distance, the point itself first, also where others coincide with it.
 
     >>> nearest_neighbors(torch.tensor([[0.0], [1.0], [3.0]]), 2).tolist()
     [[0, 1], [1, 0], [2, 1]]
     """
     tree = KDTree(points.numpy())
     _, index = tree.query(points.numpy(), k=size, workers=-1)
-    return torch.from_numpy(np.asarray(index, dtype=np.int64).reshape(len(points), size))
+    found = torch.from_numpy(np.asarray(index, dtype=np.int64).reshape(len(points), size))
+    own = torch.arange(len(points))[:, None]
+    others = found != own
+    others[:, -1] &= ~others.all(1)  # it was crowded out by points at the same place
+    return torch.cat([own, found[others].view(len(points), size - 1)], 1)
 
 
 def _smallest_singular_value(
@@ -169,6 +173,7 @@ class GraphBalls:
         local, others = self._reach(centers, size)
         offset = self.points[others] - self.points[centers[local]]
         distance = offset.square().sum(-1)
+        distance[others == centers[local]] = -1.0  # before all that coincide with it
         order = np.lexsort((others.numpy(), distance.numpy(), local.numpy()))
         local, others = local[order], others[order]
         total = torch.bincount(local, minlength=len(centers))
