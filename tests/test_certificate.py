@@ -15,7 +15,7 @@ from torchlb.fallback import CloudFallback
 from torchlb.geometry import cloud_geometry
 from torchlb.neighbors import GraphBalls, nearest_graph, nearest_neighbors
 from torchlb.stencil import Ladder, build_stencil
-from torchlb.surfaces import Sphere, StarShaped, ThreeSphere, Torus, smooth_function
+from torchlb.surfaces import Hemisphere, Sphere, StarShaped, ThreeSphere, Torus, smooth_function
 
 
 def dense(lb):
@@ -119,6 +119,23 @@ def test_every_component_has_its_own_null_vector():
     assert lb.certificate.holds
     ratio = lb.mass[500:].sum() / lb.mass[:500].sum()
     assert abs(ratio - 4) < 0.05
+
+
+@pytest.mark.parametrize("boundary", ["neumann", "dirichlet"])
+def test_parts_of_a_mesh_may_be_of_two_scales(boundary):
+    """A hemisphere beside a torus, as it is and smaller by 2²⁰: the same operator and mass, up to the scale."""
+    (vertices, faces), (ring, corners) = Hemisphere().mesh(500), Torus().mesh(400)
+
+    def build(factor):
+        both = torch.cat([factor * vertices, ring + 9])
+        return LaplaceBeltrami.from_mesh(both, torch.cat([faces, corners + 500]), boundary=boundary)
+
+    unscaled, lb = build(1.0), build(2.0**-20)
+    assert lb.certificate.holds
+    square = torch.ones(900, dtype=torch.float64)
+    square[:500] = 2.0**-40
+    torch.testing.assert_close(lb.mass, square * unscaled.mass, rtol=1e-9, atol=0)
+    torch.testing.assert_close(square[:, None] * dense(lb), dense(unscaled), rtol=1e-9, atol=1e-9)
 
 
 @pytest.mark.parametrize("scale", [2.0**-10, 2.0**-20], ids=["1e-3", "1e-6"])

@@ -14,12 +14,17 @@ import robust_laplacian
 import torch
 from jaxtyping import Float, Int
 from scipy import sparse
+from scipy.sparse import csgraph
 from torch import Tensor
 
 __all__ = ["cotangent_laplacian", "robust_rows"]
 
 MOLLIFY = 1e-5
 """robust_laplacian's intrinsic mollification, relative to the mean edge: lets zero-area triangles in."""
+
+
+SCALES = 1024.0
+"""Parts of a mesh with mean edges this many times apart are of two scales; a power of two rounds nothing."""
 
 
 def cotangent_laplacian(
@@ -56,15 +61,17 @@ def robust_rows(
     """
     space = np.zeros((len(points), 3))
     space[:, : points.shape[1]] = points.numpy()
+    unit = np.ones(len(points))
     if faces is None:
         # Its triangles of a cloud depend on the axes, up to 100 % of a row: these turn with the points.
         space = _principal_axes(space)
         weak, mass = robust_laplacian.point_cloud_laplacian(space, MOLLIFY, min(30, len(space) - 1))
     else:
-        weak, mass = robust_laplacian.mesh_laplacian(space, faces.numpy(), MOLLIFY)
+        unit = _units(space, faces.numpy())
+        weak, mass = robust_laplacian.mesh_laplacian(space / unit[:, None], faces.numpy(), MOLLIFY)
     area = cast(np.ndarray, mass.diagonal())
     # Degenerate triangles leave vertices with next to no area; a row must stay finite.
-    area = np.maximum(area, 1e-12 * area.mean())
+    area = np.maximum(area, 1e-12 * area.mean()) * unit**2
     off = sparse.coo_array(-weak)
     row, col = off.coords
     keep = (row != col) & (off.data > 0)
@@ -73,6 +80,21 @@ def robust_rows(
     return _with_diagonal(
         sparse.csr_array(sparse.diags_array(1 / area) @ strong)
     ), torch.from_numpy(area)
+
+
+def _units(points: np.ndarray, faces: np.ndarray) -> np.ndarray:
+    """Of each vertex, the power of `SCALES` nearest to how many times its component's mean edge is that of the mesh.
+
+    Mollification and the least area are relative to the mean edge, which says nothing of a part of another scale.
+    """
+    tail, head = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]).T
+    graph = sparse.coo_array((np.ones(len(tail)), (tail, head)), shape=(len(points), len(points)))
+    _, component = csgraph.connected_components(graph, directed=False)
+    length = np.linalg.norm(points[tail] - points[head], axis=1)
+    total, count = np.bincount(component[tail], length), np.bincount(component[tail])
+    longer = total / np.maximum(count, 1) / max(length.mean(), np.finfo(float).tiny)
+    power = np.log(np.where(longer > 0, longer, 1.0)) / np.log(SCALES)
+    return SCALES ** np.round(power)[component]
 
 
 def _principal_axes(points: np.ndarray) -> np.ndarray:
