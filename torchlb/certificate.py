@@ -112,21 +112,42 @@ def factorized(matrix: sparse.csc_array, threshold: float) -> SuperLU:
 
 def left_null_vector(
     matrix: sparse.csr_array, areas: Float[Tensor, " N"]
-) -> tuple[Float[Tensor, " N"], np.ndarray]:
-    """π with πᵀL = 0, scaled on each component to the sum of the areas there, and the component of each point.
+) -> tuple[Float[Tensor, " N"], np.ndarray, float]:
+    """π with πᵀL = 0, scaled on each component to the sum of the areas there.
 
     Inverse iteration with the LU of (AL)ᵀ, A the areas, each diagonal entry shifted by its own share. Beyond
     `LARGEST_FACTORED` points GMRES with multigrid of the low-order part. On a component with rows that lose heat
     (L1 < 0, next to a Dirichlet boundary) π solves πᵀL = −q instead, where q ≥ 0 is what the areas lose there, the
     positive part of −aᵀL in the columns of those rows.
+
+    Returns
+    -------
+    mass : π.
+    component : of each point.
+    error : largest imbalance of a point, see `imbalance`; `CONSERVED` is what rounding may leave.
     """
     area = areas.numpy()
-    component, losing, lossless = _components(matrix)
+    count, component = csgraph.connected_components(matrix, directed=True, connection="weak")
+    losing = np.abs(matrix.sum(axis=1)) > LOSS * abs(matrix).sum(axis=1)
+    lossless = np.bincount(component, losing, minlength=count) == 0
     lost = losing * np.maximum(-(matrix.T @ area), 0)
+    density = None
     if len(area) > LARGEST_FACTORED:
-        found = null_density(matrix, area, lost, component, lossless)
-        if found is not None:
-            return torch.from_numpy(area * found), component
+        density = null_density(matrix, area, lost, component, lossless)
+    if density is None:
+        density = _factored_density(matrix, area, lost, component, lossless)
+    mass = area * density
+    return torch.from_numpy(mass), component, imbalance(sparse.csr_array(matrix.T), mass, lost)
+
+
+def _factored_density(
+    matrix: sparse.csr_array,
+    area: Float[np.ndarray, " N"],
+    lost: Float[np.ndarray, " N"],
+    component: np.ndarray,
+    free: Bool[np.ndarray, " C"],
+) -> Float[np.ndarray, " N"]:
+    """What `null_density` finds, by inverse iteration."""
     weighted = sparse.diags_array(area) @ matrix
     diagonal = np.abs(weighted.diagonal())
     shift = SHIFT * np.where(diagonal > 0, diagonal, 1.0)
@@ -140,17 +161,8 @@ def left_null_vector(
     density = np.ones(len(area))
     for _ in range(SOLVES):
         density = -lu.solve(lost + shift * density)
-        density = rescaled(density, area, component, lossless)
-    return torch.from_numpy(area * density), component
-
-
-def _components(
-    matrix: sparse.csr_array,
-) -> tuple[np.ndarray, Bool[np.ndarray, " N"], Bool[np.ndarray, " C"]]:
-    """The component of each point, whether its row loses heat, and whether no row of a component does."""
-    count, component = csgraph.connected_components(matrix, directed=True, connection="weak")
-    losing = np.abs(matrix.sum(axis=1)) > LOSS * abs(matrix).sum(axis=1)
-    return component, losing, np.bincount(component, losing, minlength=count) == 0
+        density = rescaled(density, area, component, free)
+    return density
 
 
 def dissipation(
@@ -204,21 +216,14 @@ def check_certificate(
     matrix: sparse.csr_array, areas: Float[Tensor, " N"], rounds: int = 0, stepped: int = 0
 ) -> tuple[Float[Tensor, " N"], Certificate, Float[Tensor, "N k"]]:
     """π, the certificate as it stands, and the rows' shares in the positive eigenvalues of S."""
-    mass, component = left_null_vector(matrix, areas)
+    mass, component, error = left_null_vector(matrix, areas)
     smallest = float((mass / areas).min())
     max_s, feed = np.nan, torch.zeros(len(areas), 0)
-    if smallest > 0 and _conserves(matrix, mass):
+    if smallest > 0 and error <= CONSERVED:
         max_s, feed = dissipation(matrix, mass)
     holds = smallest > POSITIVE and max_s == 0
     result = Certificate(holds, smallest, max_s, rounds, stepped, int(component.max()) + 1)
     return mass, result, feed
-
-
-def _conserves(matrix: sparse.csr_array, mass: Float[Tensor, " N"]) -> bool:
-    """Whether πᵀL = 0, point by point, on the components that lose nothing."""
-    component, _, lossless = _components(matrix)
-    kept = np.where(lossless[component], mass.numpy(), 0.0)
-    return imbalance(sparse.csr_array(matrix.T), kept) <= CONSERVED
 
 
 def certify(

@@ -17,6 +17,8 @@ from scipy import sparse
 from scipy.sparse import csgraph
 from torch import Tensor
 
+from torchlb.neighbors import mesh_graph
+
 __all__ = ["cotangent_laplacian", "robust_rows"]
 
 MOLLIFY = 1e-5
@@ -67,7 +69,7 @@ def robust_rows(
         space = _principal_axes(space)
         weak, mass = robust_laplacian.point_cloud_laplacian(space, MOLLIFY, min(30, len(space) - 1))
     else:
-        unit = _units(space, faces.numpy())
+        unit = _units(space, mesh_graph(faces, len(space)))
         weak, mass = robust_laplacian.mesh_laplacian(space / unit[:, None], faces.numpy(), MOLLIFY)
     area = cast(np.ndarray, mass.diagonal())
     # Degenerate triangles leave vertices with next to no area; a row must stay finite.
@@ -82,14 +84,13 @@ def robust_rows(
     ), torch.from_numpy(area)
 
 
-def _units(points: np.ndarray, faces: np.ndarray) -> np.ndarray:
+def _units(points: np.ndarray, graph: sparse.csr_array) -> np.ndarray:
     """Of each vertex, the power of `SCALES` nearest to how many times its component's mean edge is that of the mesh.
 
     Mollification and the least area are relative to the mean edge, which says nothing of a part of another scale.
     """
-    tail, head = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]).T
-    graph = sparse.coo_array((np.ones(len(tail)), (tail, head)), shape=(len(points), len(points)))
     _, component = csgraph.connected_components(graph, directed=False)
+    tail, head = sparse.coo_array(graph).coords
     length = np.linalg.norm(points[tail] - points[head], axis=1)
     total, count = np.bincount(component[tail], length), np.bincount(component[tail])
     longer = total / np.maximum(count, 1) / max(length.mean(), np.finfo(float).tiny)
