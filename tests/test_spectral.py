@@ -171,6 +171,28 @@ def test_basis_of_a_float32_operator():
     )
 
 
+@pytest.mark.parametrize("scale", [2.0**-45, 2.0**45])
+@pytest.mark.parametrize("size", [300, 500])
+def test_a_basis_does_not_depend_on_the_unit(size, scale):
+    """Densely and by Arnoldi: λ scales by s⁻², Φ by s⁻¹, W by s."""
+    points = Torus().random_points(size)
+    one, other = (LaplaceBeltrami.from_points(s * points).eigenbasis(12) for s in (1.0, scale))
+    eigenvalues, phi, left = one.eigenvalues, one.eigenvectors, one.left
+    torch.testing.assert_close(other.eigenvalues * scale**2, eigenvalues, rtol=1e-9, atol=0)
+    torch.testing.assert_close(other.eigenvectors * scale, phi, rtol=0, atol=1e-6)
+    torch.testing.assert_close(other.left / scale, left, rtol=0, atol=1e-6)
+
+
+def test_a_small_component_has_its_eigenvalues_beside_a_large_one():
+    """Two tori, one of them 7e7 times the other: a zero for each, then those of the large one."""
+    points = Torus().points(300)
+    both = torch.cat([points, 2.0**26 * (points + 8)])
+    values = LaplaceBeltrami.from_points(both).eigenbasis(8).eigenvalues * 2.0**52
+    alone = LaplaceBeltrami.from_points(points).eigenbasis(7).eigenvalues
+    assert (values[:2] == 0).all()
+    torch.testing.assert_close(values[2:], alone[1:7], rtol=1e-7, atol=0)
+
+
 def test_a_solve_that_cannot_succeed_says_what_to_do():
     lb = LaplaceBeltrami.from_points(Sphere().points(500))
     matrix = to_scipy(lb.crow, lb.col, lb.values, (500, 500))

@@ -82,6 +82,15 @@ def test_thin_closed_surface(kind, order):
     assert not (inside & across).any()
 
 
+@pytest.mark.parametrize("scale", [2.0**-24, 2.0**24])
+def test_sides_do_not_depend_on_the_unit(scale):
+    """A lens given in micrometres has the rows of the one in metres."""
+    _, points, faces = lens()
+    one, other = (LaplaceBeltrami.from_mesh(s * points, faces, certify=False) for s in (1.0, scale))
+    assert torch.equal(other.col, one.col)
+    assert torch.equal(other.values * scale**2, one.values)
+
+
 @pytest.mark.parametrize("order", [1, 3])
 def test_thin_closed_surface_is_stable(order):
     _, points, _ = lens()

@@ -164,6 +164,9 @@ def _inverted(
     size = len(right)
     if left is None:
         right = left = np.zeros(size)
+    # ARPACK takes what is small in absolute terms for converged; a power of two rounds nothing.
+    unit = 2.0 ** np.round(np.log2(np.median(a.diagonal())))
+    a = a / unit
     shift = SHIFT * float(np.median(a.diagonal()))
     try:
         lu = factorized(sparse.csc_array(a + shift * sparse.eye_array(size)), 1e-2)
@@ -189,7 +192,7 @@ def _inverted(
                 f"eigenbasis: the iteration for {count} eigenvectors of {size} points did not converge ({error}); "
                 "ask for fewer, or for more, so that the cut does not fall into a cluster"
             ) from error
-        values = 1 / values - shift
+        values = (1 / values - shift) * unit
         order = np.argsort(np.abs(values), kind="stable")
         found.append((values[order], vectors[:, order]))
     return found[0], found[-1]
@@ -245,7 +248,8 @@ def _ritz(part: _Part, cut: float) -> Solved:
         u *= np.sign(u[np.abs(u).argmax(0), np.arange(u.shape[1])])
     phi, z = u, _real_span(part.left, cut)
     if part.null_left is not None:
-        phi, z = np.column_stack([zero, u]), np.column_stack([part.null_left, z])
+        null_left = part.null_left * linalg.norm(part.root)  # whose product with `zero` is one
+        phi, z = np.column_stack([zero, u]), np.column_stack([null_left, z])
         values = np.append(0.0, values)
     if part.symmetric or phi.shape[1] == 0:
         return values, phi, phi, np.stack([values, 0 * values]), _plain_mixing(len(values))

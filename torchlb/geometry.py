@@ -27,6 +27,7 @@ from torchlb.tangent import (
     mesh_frames,
     normals_of_frames,
     refine_frames,
+    vertex_normals,
 )
 
 __all__ = ["Geometry", "cloud_geometry", "mesh_geometry"]
@@ -117,9 +118,8 @@ def mesh_geometry(
         reference = face_normals(vertices, faces)
         if consistently_wound(faces):
             candidates = nearest_neighbors(vertices, min(CANDIDATES[2], len(vertices)))
-            sides = thin_sides(
-                vertices, torch.nn.functional.normalize(reference), nearest_pairs(candidates)
-            )
+            oriented = vertex_normals(vertices, faces)
+            sides = thin_sides(vertices, oriented, nearest_pairs(candidates))
     balls = GraphBalls(vertices, graph, poor, sides)
     frames, order = _refined(balls, normal_order, num_neighbors, progress)
     balls = GraphBalls(vertices, graph, frames, _follow(sides, frames))

@@ -80,7 +80,8 @@ class LaplaceBeltrami(OperatorStorage):
         boundary : (N,) mask of the points on the boundary, or "detect" (surfaces); None for a closed shape, or to do
             without a condition.
         condition : there: "neumann", ∂_ν f = 0, or "dirichlet", f = 0. With the latter the values of f at boundary
-            points are not used elsewhere, and have rows of their own, −4d f/h² with h the distance to the nearest.
+            points are not used elsewhere, and have rows of their own, −4d f/h² with h the distance to the nearest, at
+            least a tenth of that to the farthest of the row.
         certify : whether rows step down until the certificate of stability holds, whose π is then the mass. Without
             it the operator is the raw one, which may blow up under diffusion, and the mass is that of Voronoi cells.
         progress : whether to show a bar on what takes longer than two seconds.

@@ -25,10 +25,13 @@ __all__ = [
     "mesh_frames",
     "normals_of_frames",
     "refine_frames",
+    "vertex_normals",
 ]
 
 MAX_GRADIENT_GROWTH = 15.0
 """A slope is trusted if ρ Σ|w| of its weights stays below this; good stencils have 2 to 8."""
+NO_NORMAL = 1e-12
+"""A sum of normals below this share of the products of the edges is rounding."""
 
 
 def cloud_frames(
@@ -194,3 +197,16 @@ def face_normals(vertices: Float[Tensor, "N n"], faces: Int[Tensor, "F n"]) -> F
     for corner in faces.T:
         total.index_add_(0, corner, normal)
     return total
+
+
+def vertex_normals(
+    vertices: Float[Tensor, "N n"], faces: Int[Tensor, "F n"]
+) -> Float[Tensor, "N n"]:
+    """`face_normals` of length one; zero where a vertex has none but for the rounding of its faces."""
+    total = face_normals(vertices, faces)
+    edges = vertices[faces[:, 1:]] - vertices[faces[:, :1]]
+    size = torch.zeros_like(vertices[:, 0])
+    for corner in faces.T:
+        size.index_add_(0, corner, edges.norm(dim=-1).prod(1))
+    length = total.norm(dim=1)
+    return torch.where((length > NO_NORMAL * size)[:, None], total / length[:, None], 0.0)

@@ -38,7 +38,8 @@ def _directions(
         return table.expand(len(coords), -1, -1)
     square = coords.square().sum(-1).masked_fill(~valid, torch.inf)
     nearest = coords[torch.arange(len(coords)), square.argmin(1)]
-    x, y = torch.nn.functional.normalize(nearest, dim=-1).unbind(-1)
+    tiny = torch.finfo(coords.dtype).tiny  # the default, 1e-12, is a length
+    x, y = torch.nn.functional.normalize(nearest, dim=-1, eps=tiny).unbind(-1)
     x = torch.where((x == 0) & (y == 0), 1.0, x)
     turn = torch.stack([torch.stack([x, y], -1), torch.stack([-y, x], -1)], dim=-2)
     return table @ turn
