@@ -195,6 +195,15 @@ def test_rows_of_last_resort_leave_no_pocket_behind():
     assert count == 1
 
 
+def test_points_on_a_line_are_stable_and_said_to_be_no_surface():
+    """None has a triangle, so robust_laplacian refuses them; cells do not."""
+    line = torch.nn.functional.pad(torch.arange(100.0).double()[:, None], (0, 2))
+    with pytest.warns(UserWarning, match="manifold of dimension 2"):
+        lb = LaplaceBeltrami.from_points(line)
+    assert lb.certificate.holds
+    assert lb.certificate.components == 1
+
+
 def test_left_null_vector_of_a_known_chain():
     """Birth and death with rates 1 up, 2 down on three states: π ∝ (4, 2, 1)."""
     matrix = sparse.csr_array(np.array([[-1.0, 1, 0], [2, -3, 1], [0, 2, -2]]))

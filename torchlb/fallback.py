@@ -118,7 +118,7 @@ class CloudFallback:
         cells = sparse.csr_array((weights.flatten(), (row, index.flatten())), shape=shape)
         cells.sum_duplicates()
         volumes = self._volumes[centers].numpy()
-        if not self.surface or len(self.balls.points) < 4:
+        if self._robust is None:
             return volumes, cells
         matrix, areas, reachable = self._robust
         robust = sparse.csr_array(matrix[centers.numpy()])
@@ -168,9 +168,18 @@ class CloudFallback:
         return nearest_neighbors(self.balls.points, self.size)
 
     @cached_property
-    def _robust(self) -> tuple[sparse.csr_array, Tensor, sparse.csr_array]:
-        """Rows and areas of robust_laplacian, and who is a few hops between close or admissible neighbours away."""
+    def _robust(self) -> tuple[sparse.csr_array, Tensor, sparse.csr_array] | None:
+        """Rows and areas of robust_laplacian, and who is a few hops between close or admissible neighbours away.
+
+        None where it cannot be asked, or refuses: a point has no triangle, as on a line.
+        """
         points = self.balls.points
+        if not self.surface or len(points) < 4:
+            return None
+        try:
+            rows, areas = robust_rows(points, None)
+        except RuntimeError:
+            return None
         close = self._nearest[:, : self.balls.frames.shape[-1] + 1]
         row = np.arange(len(points)).repeat(close.shape[1])
         ones = np.ones(len(row), dtype=bool)
@@ -179,4 +188,4 @@ class CloudFallback:
         reach = step
         for _ in range(MAX_HOPS - 1):
             reach = reach @ step
-        return *robust_rows(points, None), reach
+        return rows, areas, reach
