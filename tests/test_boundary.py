@@ -9,7 +9,7 @@ import torch
 
 from torchlb import LaplaceBeltrami
 from torchlb.boundary import boundary_of_mesh
-from torchlb.surfaces import Hemisphere, Sphere, UnitDisk
+from torchlb.surfaces import Hemisphere, Sphere, Torus, UnitDisk
 from torchlb.tangent import mesh_frames
 
 
@@ -210,6 +210,31 @@ def test_boundary_of_a_cloud_is_detected():
     asked = LaplaceBeltrami.from_points(points, dim=2, boundary="detect")
     told = LaplaceBeltrami.from_points(points, dim=2, boundary=UnitDisk().boundary_mask(points))
     torch.testing.assert_close(asked.matrix.to_dense(), told.matrix.to_dense())
+
+
+@pytest.mark.parametrize("surface", [Sphere(), Torus()], ids=["sphere", "torus"])
+def test_gaps_between_random_points_are_no_boundary(surface):
+    """Asking for the boundary of a closed shape changes nothing."""
+    points = surface.random_points(800)
+    asked, told = (LaplaceBeltrami.from_points(points, boundary=b) for b in ("detect", None))
+    assert torch.equal(asked.values, told.values)
+
+
+def test_boundary_of_random_points_is_detected():
+    """Of a hemisphere, whose rim no point is on: eigenvalues within 15 %."""
+    points = Hemisphere().random_points(800)
+    values = LaplaceBeltrami.from_points(points, boundary="detect").eigenbasis(6).eigenvalues
+    exact = Hemisphere().eigenvalues(6)
+    assert ((values - exact)[1:] / exact[1:]).abs().max() < 0.15
+
+
+@pytest.mark.parametrize("condition", ["neumann", "dirichlet"])
+@pytest.mark.parametrize("count", [1, 2, 3])
+def test_a_boundary_may_be_a_few_points(count, condition):
+    points = Sphere().points(300)
+    mask = (points - points[0]).norm(dim=1).argsort().argsort() < count
+    lb = LaplaceBeltrami.from_points(points, boundary=mask, condition=condition)
+    assert lb.certificate.holds
 
 
 def test_gradient_at_the_boundary_serves_any_function():

@@ -122,6 +122,8 @@ def nearest_graph(
     wanted = 2 ** (frames.shape[-1] + 1)
     others = candidates[:, 1:]
     num_rows, size = others.shape
+    if size == 0:  # a single point
+        return sparse.csr_array((num_rows, num_rows), dtype=np.float32)
     centers = torch.arange(num_rows).repeat_interleave(size)
     flat = others.reshape(-1)
     good = admissible(points, frames, centers, flat) & admissible(points, frames, flat, centers)
