@@ -295,6 +295,23 @@ def test_dirichlet_basis(surface, dtype):
         assert (heat_flow(lb, f, 0.1, method=method, k=20) - cooled).norm() < 2e-2 * cooled.norm()
 
 
+@pytest.mark.parametrize(("order", "bound"), [(3, 1e-3), (5, 3e-4)])
+def test_dirichlet_basis_has_the_eigenvalues_of_the_operator(order, bound):
+    """Squared Bessel zeros, though π is far from the mass for which −Δ is symmetric; its sum is the area."""
+    lb = LaplaceBeltrami.from_mesh(*UnitDisk().mesh(700), order=order, boundary="dirichlet")
+    basis = lb.eigenbasis(12)
+    exact = UnitDisk().eigenvalues(10, boundary="dirichlet")
+    assert (basis.eigenvalues[:10] / exact - 1).abs().max() < bound
+    own = torch.linalg.eigvals(-lb.matrix.to_dense()).real.sort().values[:12]
+    torch.testing.assert_close(basis.eigenvalues[:12], own, rtol=1e-8, atol=0)
+    assert float(lb.mass.sum()) == pytest.approx(np.pi, rel=1e-2)
+    radius = UnitDisk().mesh(700)[0].norm(dim=1)
+    mode = torch.special.bessel_j0(5.783186**0.5 * radius)
+    mode /= (lb.mass * mode**2).sum().sqrt()
+    found = basis.eigenvectors[:, 0]
+    assert min((lb.mass * (found - s * mode) ** 2).sum().sqrt() for s in (1, -1)) < 1.5e-2
+
+
 def test_dirichlet_beside_a_closed_component():
     """One zero, of the sphere; the disk's own λ_1 = 5.783 among the sphere's 2, 2, 2, 6."""
     vertices, faces = UnitDisk().mesh(300)

@@ -117,8 +117,7 @@ def left_null_vector(
 
     Inverse iteration with the LU of (AL)ᵀ, A the areas, each diagonal entry shifted by its own share. Beyond
     `LARGEST_FACTORED` points GMRES with multigrid of the low-order part. On a component with rows that lose heat
-    (L1 < 0, next to a Dirichlet boundary) π solves πᵀL = −q instead, where q ≥ 0 is what the areas lose there, the
-    positive part of −aᵀL in the columns of those rows.
+    (L1 < 0, next to a Dirichlet boundary) π solves πᵀL = −q instead, q from `_lost`, and has the sum of the areas.
 
     Returns
     -------
@@ -130,14 +129,33 @@ def left_null_vector(
     count, component = csgraph.connected_components(matrix, directed=True, connection="weak")
     losing = np.abs(matrix.sum(axis=1)) > LOSS * abs(matrix).sum(axis=1)
     lossless = np.bincount(component, losing, minlength=count) == 0
-    lost = losing * np.maximum(-(matrix.T @ area), 0)
+    lost = _lost(matrix, area, losing)
     density = None
     if len(area) > LARGEST_FACTORED:
         density = null_density(matrix, area, lost, component, lossless)
     if density is None:
         density = _factored_density(matrix, area, lost, component, lossless)
-    mass = area * density
-    return torch.from_numpy(mass), component, imbalance(sparse.csr_array(matrix.T), mass, lost)
+    total = np.bincount(component, area * density)
+    scale = np.where(lossless | (total <= 0), 1.0, np.bincount(component, area) / total)[component]
+    mass = scale * area * density
+    error = imbalance(sparse.csr_array(matrix.T), mass, scale * lost)
+    return torch.from_numpy(mass), component, error
+
+
+def _lost(
+    matrix: sparse.csr_array, area: Float[np.ndarray, " N"], losing: Bool[np.ndarray, " N"]
+) -> Float[np.ndarray, " N"]:
+    """Heat max(0, −a L1) that areas lose, of each losing row in equal parts from those that it shares an entry with.
+
+    Spread so, the rows keep their order: where one would lose next to nothing, π is next to nothing.
+    """
+    rows = np.flatnonzero(losing)
+    joined = matrix[rows][:, rows].astype(bool)
+    joined = sparse.csr_array((joined + joined.T).astype(float))
+    spread = np.maximum(-area * matrix.sum(axis=1), 0)[rows] / np.maximum(joined.sum(axis=1), 1)
+    lost = np.zeros(len(area))
+    lost[rows] = joined @ spread
+    return lost
 
 
 def _factored_density(

@@ -243,6 +243,8 @@ def _ritz(part: _Part, cut: float) -> Solved:
             f"eigenbasis: −Δ has the eigenvalue {values.min():.3g} on a component of {len(zero)} points, where it "
             "should be positive: the operator is not stable; build it with certify=True"
         )
+    if not closed and u.size:  # π is no null vector, and the symmetric part is far from the rest
+        values = np.sort(np.linalg.eigvals(h).real)
     u = u @ q
     if u.size:
         u *= np.sign(u[np.abs(u).argmax(0), np.arange(u.shape[1])])
