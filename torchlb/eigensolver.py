@@ -165,7 +165,7 @@ def _inverted(
     if left is None:
         right = left = np.zeros(size)
     # ARPACK takes what is small in absolute terms for converged; a power of two rounds nothing.
-    unit = 2.0 ** np.round(np.log2(np.median(a.diagonal())))
+    unit = np.ldexp(1.0, np.frexp(np.median(a.diagonal()))[1])
     a = a / unit
     shift = SHIFT * float(np.median(a.diagonal()))
     try:
