@@ -117,7 +117,7 @@ def left_null_vector(
 
     Inverse iteration with the LU of (AL)ᵀ, A the areas, each diagonal entry shifted by its own share. Beyond
     `LARGEST_FACTORED` points GMRES with multigrid of the low-order part. On a component with rows that lose heat
-    (L1 < 0, next to a Dirichlet boundary) π solves πᵀL = −q instead, q from `_lost`, and has the sum of the areas.
+    (L1 < 0, next to a Dirichlet boundary) π solves πᵀL = −q instead, q from `_shared`, and has the sum of the areas.
 
     Returns
     -------
@@ -127,35 +127,33 @@ def left_null_vector(
     """
     area = areas.numpy()
     count, component = csgraph.connected_components(matrix, directed=True, connection="weak")
-    losing = np.abs(matrix.sum(axis=1)) > LOSS * abs(matrix).sum(axis=1)
+    loss = -matrix.sum(axis=1)
+    losing = np.abs(loss) > LOSS * abs(matrix).sum(axis=1)
     lossless = np.bincount(component, losing, minlength=count) == 0
-    lost = _lost(matrix, area, losing)
+    lost = _shared(np.maximum(area * loss, 0), matrix, losing)
     density = None
     if len(area) > LARGEST_FACTORED:
         density = null_density(matrix, area, lost, component, lossless)
     if density is None:
         density = _factored_density(matrix, area, lost, component, lossless)
-    total = np.bincount(component, area * density)
-    scale = np.where(lossless | (total <= 0), 1.0, np.bincount(component, area) / total)[component]
-    mass = scale * area * density
-    error = imbalance(sparse.csr_array(matrix.T), mass, scale * lost)
-    return torch.from_numpy(mass), component, error
+    error = imbalance(sparse.csr_array(matrix.T), area * density, lost)
+    density = rescaled(density, area, component, ~lossless)
+    return torch.from_numpy(area * density), component, error
 
 
-def _lost(
-    matrix: sparse.csr_array, area: Float[np.ndarray, " N"], losing: Bool[np.ndarray, " N"]
+def _shared(
+    heat: Float[np.ndarray, " N"], matrix: sparse.csr_array, losing: Bool[np.ndarray, " N"]
 ) -> Float[np.ndarray, " N"]:
-    """Heat max(0, −a L1) that areas lose, of each losing row in equal parts from those that it shares an entry with.
+    """The heat of each losing row, in equal parts to those of them that it shares an entry with; none of the others.
 
-    Spread so, the rows keep their order: where one would lose next to nothing, π is next to nothing.
+    Where a row loses next to nothing π would be next to nothing, and rows would step down for it.
     """
     rows = np.flatnonzero(losing)
     joined = matrix[rows][:, rows].astype(bool)
     joined = sparse.csr_array((joined + joined.T).astype(float))
-    spread = np.maximum(-area * matrix.sum(axis=1), 0)[rows] / np.maximum(joined.sum(axis=1), 1)
-    lost = np.zeros(len(area))
-    lost[rows] = joined @ spread
-    return lost
+    shared = np.zeros_like(heat)
+    shared[rows] = joined @ (heat[rows] / np.maximum(joined.sum(axis=1), 1))
+    return shared
 
 
 def _factored_density(

@@ -63,7 +63,7 @@ class _Part:
     index: np.ndarray
     matrix: sparse.csr_array
     root: np.ndarray
-    null_left: np.ndarray | None  # None where heat is lost, and there are no constants
+    null_left: np.ndarray | None  # times √mass/|√mass| it is 1; None where heat is lost
     right: tuple[np.ndarray, np.ndarray]
     left: tuple[np.ndarray, np.ndarray]
     symmetric: bool
@@ -122,6 +122,7 @@ def _part(
 ) -> _Part:
     """Scale one component and find its slow eigenvectors, right and left."""
     root = np.sqrt(mass)
+    zero = root / linalg.norm(root)
     scaled = sparse.csr_array(sparse.diags_array(root) @ a @ sparse.diags_array(1 / root))
     skew = scaled - scaled.T
     symmetric = bool(skew.nnz == 0 or abs(skew).max() <= tolerance * abs(scaled).max())
@@ -130,14 +131,14 @@ def _part(
     left_null = None
     if null is not None:
         left_null = root.copy() if symmetric else null / root
-        left_null /= left_null @ root
+        left_null /= left_null @ zero
     size = len(index)
     if wanted == 0 or size <= (left_null is not None):
         right = left = (np.zeros(0), np.zeros((size, 0)))
     elif size <= DENSE or 2 * wanted >= size:
         right, left = _dense(scaled.toarray(), symmetric, left_null is not None)
     else:
-        right, left = _inverted(scaled, root, left_null, wanted, symmetric)
+        right, left = _inverted(scaled, zero, left_null, wanted, symmetric)
     return _Part(index, scaled, root, left_null, right, left, symmetric)
 
 
@@ -243,15 +244,15 @@ def _ritz(part: _Part, cut: float) -> Solved:
             f"eigenbasis: −Δ has the eigenvalue {values.min():.3g} on a component of {len(zero)} points, where it "
             "should be positive: the operator is not stable; build it with certify=True"
         )
-    if not closed and u.size:  # π is no null vector, and the symmetric part is far from the rest
+    if not closed and u.size:
+        # π is no null vector there, and Ritz values would be off by the square of the skew part.
         values = np.sort(np.linalg.eigvals(h).real)
     u = u @ q
     if u.size:
         u *= np.sign(u[np.abs(u).argmax(0), np.arange(u.shape[1])])
     phi, z = u, _real_span(part.left, cut)
     if part.null_left is not None:
-        null_left = part.null_left * linalg.norm(part.root)  # whose product with `zero` is one
-        phi, z = np.column_stack([zero, u]), np.column_stack([null_left, z])
+        phi, z = np.column_stack([zero, u]), np.column_stack([part.null_left, z])
         values = np.append(0.0, values)
     if part.symmetric or phi.shape[1] == 0:
         return values, phi, phi, np.stack([values, 0 * values]), _plain_mixing(len(values))

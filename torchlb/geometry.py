@@ -23,7 +23,6 @@ from torchlb.orientation import consistently_wound, nearest_pairs, orient_normal
 from torchlb.tangent import (
     cloud_frames,
     complete_frames,
-    face_normals,
     mesh_frames,
     normals_of_frames,
     refine_frames,
@@ -115,11 +114,10 @@ def mesh_geometry(
     graph = mesh_graph(faces, len(vertices))
     reference = sides = None
     if faces.shape[1] == vertices.shape[1] and faces.shape[1] < 4:
-        reference = face_normals(vertices, faces)
+        reference = vertex_normals(vertices, faces)
         if consistently_wound(faces):
             candidates = nearest_neighbors(vertices, min(CANDIDATES[2], len(vertices)))
-            oriented = vertex_normals(vertices, faces)
-            sides = thin_sides(vertices, oriented, nearest_pairs(candidates))
+            sides = thin_sides(vertices, reference, nearest_pairs(candidates))
     balls = GraphBalls(vertices, graph, poor, sides)
     frames, order = _refined(balls, normal_order, num_neighbors, progress)
     balls = GraphBalls(vertices, graph, frames, _follow(sides, frames))
