@@ -23,8 +23,8 @@ from scipy import sparse
 from tqdm import tqdm
 
 from torchlb import LaplaceBeltrami, surfaces
+from torchlb.geometry.frames import PROJECTIONS
 from torchlb.surfaces import smooth_function
-from torchlb.tangent import PROJECTIONS
 
 FOUR = {
     "Sphere": surfaces.Sphere(),

@@ -26,6 +26,7 @@ from typing import NamedTuple
 import numpy as np
 import robust_laplacian
 import torch
+import torchlb.certificate
 import trimesh
 from _common import versions
 from scipy import sparse
@@ -33,7 +34,6 @@ from scipy.sparse.linalg import ArpackError, eigs, eigsh
 from torch import Tensor
 from tqdm import tqdm
 
-import torchlb.certificate
 from torchlb import LaplaceBeltrami, clean_mesh
 from torchlb.surfaces import Sphere, Torus
 

@@ -8,9 +8,9 @@ import pytest
 import torch
 
 from torchlb import LaplaceBeltrami
-from torchlb.boundary import boundary_of_mesh
+from torchlb.geometry.boundary import boundary_of_mesh
+from torchlb.geometry.frames import mesh_frames
 from torchlb.surfaces import Hemisphere, Sphere, Torus, UnitDisk
-from torchlb.tangent import mesh_frames
 
 
 def spectrum(lb, count):

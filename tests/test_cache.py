@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 import torch
 
-import torchlb.cache
+import torchlb.io.cache
 from torchlb import (
     CacheWarning,
     LaplaceBeltrami,
@@ -148,7 +148,7 @@ def test_anything_that_changes_the_operator_changes_the_key(monkeypatch):
         operator_key(VERTICES, boundary=mask),
         operator_key(VERTICES, boundary="detect"),
     ]
-    monkeypatch.setattr(torchlb.cache, "__version__", "0.0.1")
+    monkeypatch.setattr(torchlb.io.cache, "__version__", "0.0.1")
     keys.append(operator_key(VERTICES, FACES))
     assert len(set(keys)) == len(keys)
 
@@ -268,7 +268,7 @@ def test_a_failed_write_leaves_nothing(tmp_path, monkeypatch):
     def full(*_, **__):
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr(torchlb.cache.np, "savez", full)
+    monkeypatch.setattr(torchlb.io.cache.np, "savez", full)
     with pytest.raises(OSError, match="No space left"):
         save_operator(LaplaceBeltrami(), tmp_path / "lb.npz")
     assert files_of(tmp_path) == []
@@ -360,7 +360,7 @@ def test_errors(tmp_path):
 
 
 def test_a_newer_format_is_refused_by_name(tmp_path, monkeypatch):
-    monkeypatch.setattr(torchlb.cache, "FORMAT", 2)
+    monkeypatch.setattr(torchlb.io.cache, "FORMAT", 2)
     save_operator(LaplaceBeltrami(), tmp_path / "lb.npz")
     monkeypatch.undo()
     with pytest.raises(OperatorFileError, match="format 2, this torchlb reads 1"):

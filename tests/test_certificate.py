@@ -10,11 +10,13 @@ from scipy import sparse
 from scipy.sparse import csgraph
 
 from torchlb import LaplaceBeltrami, StabilityWarning
-from torchlb.certificate import certify, check_certificate, left_null_vector
-from torchlb.fallback import CloudFallback
-from torchlb.geometry import cloud_geometry
-from torchlb.neighbors import GraphBalls, nearest_graph, nearest_neighbors
-from torchlb.stencil import Ladder, build_stencil
+from torchlb.geometry.neighbors import GraphBalls, nearest_graph, nearest_neighbors
+from torchlb.stability.certificate import check_certificate
+from torchlb.stability.enforce import certify
+from torchlb.stability.null_vector import left_null_vector
+from torchlb.stencils.assemble import Ladder, build_stencil
+from torchlb.stencils.low_order import CloudFallback
+from torchlb.stencils.shape import cloud_geometry
 from torchlb.surfaces import Hemisphere, Sphere, StarShaped, ThreeSphere, Torus, smooth_function
 
 
@@ -321,7 +323,7 @@ def test_uncertified_operator_says_so():
 
 
 def test_a_certificate_that_does_not_hold_is_a_warning_with_names(monkeypatch):
-    monkeypatch.setattr("torchlb.certificate.MAX_ROUNDS", 0)
+    monkeypatch.setattr("torchlb.stability.enforce.MAX_ROUNDS", 0)
     points = Sphere().random_points(500)
     with pytest.warns(StabilityWarning, match=r"does NOT hold.*the worst points: \d+, \d+"):
         lb = LaplaceBeltrami.from_points(points)

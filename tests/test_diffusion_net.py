@@ -12,7 +12,7 @@ from torchlb import (
     LaplaceBeltrami,
     heat_flow,
 )
-from torchlb.diffusion_net import _Dropout
+from torchlb.nn.diffusion_net import _Dropout
 from torchlb.surfaces import Circle, Sphere, Torus
 
 WIDTH, HIDDEN, BLOCKS = 8, [12, 10], 2

@@ -219,7 +219,7 @@ def test_the_cache_hits_where_the_original_missed(tmp_path, monkeypatch):
     verts, faces = SPHERE[0] / 3, SPHERE[1]
     first = get_operators(verts, faces, 8, tmp_path)
     with monkeypatch.context() as patched:
-        patched.setattr("torchlb.cache.build_operator", None)
+        patched.setattr("torchlb.io.cache.build_operator", None)
         again = get_operators(verts, faces.int(), 8, tmp_path)
         fewer = get_operators(verts, faces, k_eig=4, op_cache_dir=str(tmp_path))
     for ours, theirs in zip(first, again, strict=True):

@@ -6,7 +6,8 @@ import torch
 import trimesh
 
 from torchlb import LaplaceBeltrami
-from torchlb.interop.trimesh import SUFFIXES, from_trimesh, read_shape, to_trimesh
+from torchlb.interop.trimesh import from_trimesh, to_trimesh
+from torchlb.io.files import SUFFIXES, read_shape
 from torchlb.surfaces import Sphere
 
 VERTICES, FACES = Sphere().mesh(200)

@@ -104,7 +104,7 @@ def test_a_batch_diffuses_in_blocks_of_shapes(eight, monkeypatch, cached):
         return y, *torch.autograd.grad(y.pow(3).sum(), (x, time))
 
     expected = results()
-    monkeypatch.setattr("torchlb.heat.CACHED", cached)
+    monkeypatch.setattr("torchlb.linalg.exponential.CACHED", cached)
     for a, b in zip(results(), expected, strict=True):
         torch.testing.assert_close(a, b, rtol=1e-5, atol=1e-6 * float(b.abs().max()))
 

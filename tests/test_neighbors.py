@@ -8,7 +8,8 @@ import pytest
 import torch
 from scipy.sparse import csgraph
 
-from torchlb.neighbors import (
+from torchlb.geometry.frames import cloud_frames, mesh_frames
+from torchlb.geometry.neighbors import (
     GraphBalls,
     admissible,
     mesh_graph,
@@ -16,7 +17,6 @@ from torchlb.neighbors import (
     nearest_neighbors,
 )
 from torchlb.surfaces import Ellipsoid, Sphere, Torus
-from torchlb.tangent import cloud_frames, mesh_frames
 
 
 def flat(points):

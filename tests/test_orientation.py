@@ -6,15 +6,15 @@ import pytest
 import torch
 
 from tolerances import TOLERANCE
-from torchlb.neighbors import nearest_neighbors
-from torchlb.orientation import (
+from torchlb.geometry.frames import cloud_frames, complete_frames, face_normals, normals_of_frames
+from torchlb.geometry.neighbors import nearest_neighbors
+from torchlb.geometry.orientation import (
     consistently_wound,
     nearest_pairs,
     orient_normals,
     thin_sides,
 )
 from torchlb.surfaces import Ellipsoid, Sphere, StarShaped, Torus
-from torchlb.tangent import cloud_frames, complete_frames, face_normals, normals_of_frames
 
 
 def close(actual, expected):

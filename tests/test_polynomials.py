@@ -7,7 +7,7 @@ import torch
 from torch.func import hessian, jacrev, vmap
 
 from tolerances import TOLERANCE
-from torchlb.polynomials import (
+from torchlb.fits.polynomials import (
     exponents,
     gradient_functional,
     hessian_functional,

@@ -15,9 +15,9 @@ import pytest
 import torch
 import trimesh
 
-import torchlb.precompute
+import torchlb.io.precompute
 from torchlb import LaplaceBeltrami, load_operator, load_or_build, precompute_operators
-from torchlb.interop.trimesh import read_shape
+from torchlb.io.files import read_shape
 from torchlb.surfaces import Sphere
 
 ROOT = Path(__file__).parents[1]
@@ -128,7 +128,7 @@ def test_arrays_types_and_eigenpairs(tmp_path):
 def test_workers_use_one_thread_and_give_back_what_there_was(tmp_path, monkeypatch):
     seen = []
     monkeypatch.setattr(
-        torchlb.precompute,
+        torchlb.io.precompute,
         "load_or_build",
         lambda *a, **b: (seen.append(torch.get_num_threads()), load_or_build(*a, **b))[1],
     )
@@ -143,7 +143,7 @@ def test_workers_use_one_thread_and_give_back_what_there_was(tmp_path, monkeypat
 
 KILLED = """
 import sys, time
-import torchlb.precompute
+import torchlb.io.precompute
 from torchlb import precompute_operators
 if __name__ == "__main__":
     precompute_operators(sys.argv[1], sys.argv[2], workers=2, order=3, progress=False)
@@ -180,7 +180,7 @@ def test_the_same_call_runs_on_a_dask_cluster(tmp_path, monkeypatch):
     from dask.distributed import Client, LocalCluster
 
     monkeypatch.setenv("PYTHONPATH", str(ROOT))
-    monkeypatch.setattr(torchlb.precompute, "load_or_build", None)
+    monkeypatch.setattr(torchlb.io.precompute, "load_or_build", None)
     folder, out = tmp_path / "shapes", tmp_path / "out"
     write_shapes(folder, 6)
     (folder / "broken.ply").write_text("ply")
@@ -205,7 +205,7 @@ def test_a_warning_of_a_shape_is_in_the_report(tmp_path, monkeypatch):
         warnings.warn("Sparse CSR tensor support is in beta", UserWarning, stacklevel=1)
         return load_or_build(*arguments, **options)
 
-    monkeypatch.setattr(torchlb.precompute, "load_or_build", warned)
+    monkeypatch.setattr(torchlb.io.precompute, "load_or_build", warned)
     report = precompute_operators([(VERTICES, FACES)], tmp_path, workers=1, **OPTIONS)
     assert report.results[0].message == "few points"
     assert str(report).endswith("warned\n  shape 0  few points")

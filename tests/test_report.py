@@ -7,9 +7,9 @@ import torch
 import trimesh
 
 from torchlb import LaplaceBeltrami
-from torchlb.rows import REASONS
+from torchlb.fits.rules import typical_growth
+from torchlb.stencils.rows import REASONS
 from torchlb.surfaces import Sphere, Torus
-from torchlb.weights import typical_growth
 
 
 @cache

@@ -11,7 +11,7 @@ from scipy import sparse
 from torch.autograd import grad, gradcheck, gradgradcheck
 
 from tolerances import TOLERANCE
-from torchlb.sparse import (
+from torchlb.linalg.sparse import (
     _product,
     _values_gradient,
     from_scipy,
@@ -115,7 +115,7 @@ def test_third_derivative_is_that_of_the_dense_matrix():
 def test_gradient_in_x_alone_does_not_compute_that_in_values(monkeypatch):
     product, x = Product(5, 4), features(4, 2)
     product.requires_grad_(False)
-    monkeypatch.setattr("torchlb.sparse._values_gradient", None)
+    monkeypatch.setattr("torchlb.linalg.sparse._values_gradient", None)
     close(grad(product(x).sum(), x)[0], product.dense().sum(0)[:, None].expand(4, 2))
 
 

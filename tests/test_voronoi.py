@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from tolerances import TOLERANCE
-from torchlb.voronoi import cell_laplacian, cell_volume, largest_gap, natural_neighbors
+from torchlb.geometry.voronoi import cell_laplacian, cell_volume, largest_gap, natural_neighbors
 
 
 def lattice(basis, half=3):

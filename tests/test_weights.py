@@ -6,16 +6,10 @@ import torch
 from torch.func import hessian, jacrev
 
 from tolerances import TOLERANCE
-from torchlb.polynomials import monomials, num_monomials
-from torchlb.weights import (
-    WEIGHT_RULES,
-    Weights,
-    least_squares_weights,
-    polyharmonic_weights,
-    positive_weights,
-    typical_growth,
-    window,
-)
+from torchlb.fits.polyharmonic import polyharmonic_weights
+from torchlb.fits.polynomials import monomials, num_monomials
+from torchlb.fits.rules import WEIGHT_RULES, typical_growth
+from torchlb.fits.weights import Weights, least_squares_weights, positive_weights, window
 
 DEGREES = {1: range(1, 7), 2: range(1, 7), 3: range(1, 5), 4: range(1, 4)}
 CASES = [(dim, degree) for dim, degrees in DEGREES.items() for degree in degrees]

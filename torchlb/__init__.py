@@ -1,47 +1,53 @@
 """High-order Laplace–Beltrami operators on meshes and point clouds, for PyTorch.
 
-The walk: points become neighbours (`neighbors`), frames (`tangent`), offsets and weights (`weights`), rows of one
-sparse operator (`stencil`), stored in a module (`laplace_beltrami`). Its eigenpairs (`eigensolver`), what is made of
-them (`spectral`) and the layers that learn (`diffusion`, `diffusion_net`) take that module as an argument. `surfaces`
-has shapes with exact answers.
+The packages, lowest first: `linalg`, matrices without shapes; `fits`, weights from local polynomials; `geometry`,
+neighbours, frames, boundaries; `baseline`, libigl and robust_laplacian; `stencils`, rows of Δ and ∇; `stability`, the
+certificate; `spectral`, eigenpairs and signatures; `operator`, the module that holds it all; `nn`, layers that take it
+as an argument; `io` and `interop`, files and other libraries. `surfaces` are shapes with exact answers.
 """
 
 from torchlb import surfaces
-from torchlb.cache import (
+from torchlb.errors import (
     CacheWarning,
+    DiffusionError,
+    EigenbasisError,
+    InputError,
     OperatorFileError,
-    load_operator,
-    load_or_build,
-    operator_key,
-    save_operator,
+    StabilityWarning,
+    StencilError,
+    TorchlbError,
 )
-from torchlb.certificate import Certificate, StabilityWarning
-from torchlb.checks import clean_mesh
-from torchlb.diffusion import Diffusion, heat_flow
-from torchlb.diffusion_net import DiffusionNet, DiffusionNetBlock, GradientFeatures
-from torchlb.eigenbasis import Eigenbasis
-from torchlb.laplace_beltrami import LaplaceBeltrami
-from torchlb.precompute import PrecomputeReport, ShapeResult, precompute_operators
-from torchlb.report import StencilReport
-from torchlb.spectral import (
-    SpectralConv,
+from torchlb.io.cache import load_operator, load_or_build, operator_key, save_operator
+from torchlb.io.precompute import PrecomputeReport, ShapeResult, precompute_operators
+from torchlb.nn.diffusion import Diffusion, heat_flow
+from torchlb.nn.diffusion_net import DiffusionNet, DiffusionNetBlock
+from torchlb.nn.gradient_features import GradientFeatures
+from torchlb.nn.spectral_conv import SpectralConv
+from torchlb.operator.checks import clean_mesh
+from torchlb.operator.laplace_beltrami import LaplaceBeltrami
+from torchlb.operator.report import StencilReport
+from torchlb.spectral.eigenbasis import Eigenbasis
+from torchlb.spectral.signatures import (
     diffusion_distance,
     diffusion_map,
     heat_kernel_signature,
     spectral_wavelets,
     wave_kernel_signature,
 )
-from torchlb.stencil import StencilError
+from torchlb.stability.certificate import Certificate
 from torchlb.version import __version__
 
 __all__ = [
     "CacheWarning",
     "Certificate",
     "Diffusion",
+    "DiffusionError",
     "DiffusionNet",
     "DiffusionNetBlock",
     "Eigenbasis",
+    "EigenbasisError",
     "GradientFeatures",
+    "InputError",
     "LaplaceBeltrami",
     "OperatorFileError",
     "PrecomputeReport",
@@ -50,6 +56,7 @@ __all__ = [
     "StabilityWarning",
     "StencilError",
     "StencilReport",
+    "TorchlbError",
     "__version__",
     "clean_mesh",
     "diffusion_distance",

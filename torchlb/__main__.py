@@ -16,15 +16,16 @@ from typing import Any
 import click
 from click.core import ParameterSource
 
-from torchlb.build import WEIGHTS
-from torchlb.cache import OperatorFileError, describe_file
-from torchlb.checks import clean_mesh
-from torchlb.comparison import draw_comparison, spectra, spectrum_table
-from torchlb.interop.trimesh import read_shape
-from torchlb.laplace_beltrami import LaplaceBeltrami
-from torchlb.operators import OPERATORS, build_operator
-from torchlb.precompute import concerns_the_shape, precompute_operators
-from torchlb.tangent import PROJECTIONS
+from torchlb.errors import OperatorFileError
+from torchlb.geometry.frames import PROJECTIONS
+from torchlb.io.cache import describe_file
+from torchlb.io.files import read_shape
+from torchlb.io.precompute import concerns_the_shape, precompute_operators
+from torchlb.operator.build import WEIGHTS
+from torchlb.operator.checks import clean_mesh
+from torchlb.operator.dispatch import OPERATORS, build_operator
+from torchlb.operator.laplace_beltrami import LaplaceBeltrami
+from torchlb.plot.comparison import draw_comparison, spectra, spectrum_table
 from torchlb.version import __version__
 
 __all__ = ["main"]

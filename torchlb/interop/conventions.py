@@ -11,7 +11,8 @@ from jaxtyping import Float, Int
 from scipy import sparse
 from torch import Tensor
 
-from torchlb.laplace_beltrami import LaplaceBeltrami
+from torchlb.errors import InputError
+from torchlb.operator.laplace_beltrami import LaplaceBeltrami
 
 __all__ = ["SIGNS", "edge_weights", "weak_matrices"]
 
@@ -48,7 +49,7 @@ def weak_matrices(
     True
     """
     if convention not in SIGNS:
-        raise ValueError(f"convention: expected one of {list(SIGNS)}, got {convention!r}")
+        raise InputError(f"convention: expected one of {list(SIGNS)}, got {convention!r}")
     mass = sparse.csr_array(sparse.diags_array(lb.mass.detach().cpu().numpy()))
     return SIGNS[convention] * sparse.csr_array(mass @ lb.to_scipy()), mass
 
@@ -71,7 +72,7 @@ def edge_weights(
     ValueError : for another normalization.
     """
     if normalization not in (None, "rw"):
-        raise ValueError(f"normalization: expected None or 'rw', got {normalization!r}")
+        raise InputError(f"normalization: expected None or 'rw', got {normalization!r}")
     count = torch.arange(lb.num_points, device=lb.crow.device)
     row = count.repeat_interleave(lb.crow.diff())
     values = lb.values if normalization == "rw" else lb.mass[row] * lb.values

@@ -43,9 +43,10 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from torchlb.cache import load_or_build
-from torchlb.laplace_beltrami import LaplaceBeltrami
-from torchlb.operators import build_operator
+from torchlb.errors import InputError
+from torchlb.io.cache import load_or_build
+from torchlb.operator.dispatch import build_operator
+from torchlb.operator.laplace_beltrami import LaplaceBeltrami
 
 __all__ = ["compute_operators", "get_all_operators", "get_operators"]
 
@@ -90,7 +91,7 @@ def get_operators(
     """
     cloud = faces is None or faces.numel() == 0
     if verts.ndim != 2 or verts.shape[1] != 3:
-        raise ValueError(f"verts: expected shape (V, 3), got {tuple(verts.shape)}")
+        raise InputError(f"verts: expected shape (V, 3), got {tuple(verts.shape)}")
     arguments: dict[str, Any] = {"operator": operator, "progress": False, **options}
     if cloud and normals is not None:
         arguments["normals"] = normals
@@ -123,7 +124,7 @@ def get_all_operators(
     To fill a cache with all cores first: `torchlb.precompute_operators`.
     """
     if len(verts_list) != len(faces_list):
-        raise ValueError(f"{len(verts_list)} verts, but {len(faces_list)} faces")
+        raise InputError(f"{len(verts_list)} verts, but {len(faces_list)} faces")
     given = [None] * len(verts_list) if normals is None else normals
     columns: tuple[list[Tensor], ...] = tuple([] for _ in range(7))
     for verts, faces, direction in zip(verts_list, faces_list, given, strict=True):

@@ -18,12 +18,13 @@ from torch_geometric.data import Batch, Data
 from torch_geometric.data.datapipes import functional_transform
 from torch_geometric.transforms import BaseTransform
 
-from torchlb.batching import join_certificates
-from torchlb.cache import load_or_build
-from torchlb.certificate import Certificate
-from torchlb.eigenbasis import Eigenbasis, stack_eigenbases
-from torchlb.laplace_beltrami import LaplaceBeltrami
-from torchlb.operators import build_operator
+from torchlb.errors import InputError
+from torchlb.io.cache import load_or_build
+from torchlb.operator.batching import join_certificates
+from torchlb.operator.dispatch import build_operator
+from torchlb.operator.laplace_beltrami import LaplaceBeltrami
+from torchlb.spectral.eigenbasis import Eigenbasis, stack_eigenbases
+from torchlb.stability.certificate import Certificate
 
 __all__ = ["LaplaceBeltramiTransform", "to_operator"]
 
@@ -82,7 +83,7 @@ class LaplaceBeltramiTransform(BaseTransform):
     def forward(self, data: Data) -> Data:
         """The data with the keys added; `pos` (N, n) and, for a mesh, `face` (d + 1, F) are read."""
         if data.pos is None:
-            raise ValueError(f"expected data with pos, got {data}")
+            raise InputError(f"expected data with pos, got {data}")
         pos: Tensor = data.pos
         faces = None if data.get("face") is None else data["face"].T
         options: dict[str, Any] = {"operator": self.operator, "progress": False, **self.options}
@@ -136,12 +137,12 @@ def to_operator(data: Any) -> LaplaceBeltrami:
     ValueError : for data without the keys, or whose nodes were changed since.
     """
     if "lb_edge_index" not in data:
-        raise ValueError(f"expected data that went through LaplaceBeltramiTransform, got {data}")
+        raise InputError(f"expected data that went through LaplaceBeltramiTransform, got {data}")
     batched = isinstance(data, Batch)
     infos = [json.loads(text) for text in (data["lb_info"] if batched else [data["lb_info"]])]
     sizes = data["ptr"].diff() if batched else data.lb_mass.new_tensor([len(data.lb_mass)]).long()
     if int(sizes.sum()) != len(data.lb_mass) or len(data.pos) != len(data.lb_mass):
-        raise ValueError(
+        raise InputError(
             f"{len(data.pos)} points, but an operator of {len(data.lb_mass)}: nodes were added or taken away after "
             "LaplaceBeltramiTransform; apply it last"
         )

@@ -1,0 +1,189 @@
+"""Tangent frames of order q, both projections, and orientation."""
+
+from functools import cache
+
+import numpy as np
+import pytest
+import torch
+
+from tolerances import TOLERANCE
+from torchlb.geometry.candidates import ladder_rungs
+from torchlb.geometry.frames import (
+    PROJECTIONS,
+    cloud_frames,
+    complete_frames,
+    face_normals,
+    local_offsets,
+    mesh_frames,
+    normals_of_frames,
+    refine_frames,
+)
+from torchlb.geometry.neighbors import GraphBalls, nearest_graph, nearest_neighbors
+from torchlb.surfaces import (
+    CliffordTorus,
+    Ellipsoid,
+    SpaceCurve,
+    Sphere,
+    StarShaped,
+    ThreeSphere,
+    Torus,
+)
+
+MANIFOLDS = [Sphere(), Torus(), CliffordTorus(), ThreeSphere(), SpaceCurve()]
+HYPERSURFACES = [Sphere(), Ellipsoid(), StarShaped(), Torus()]
+points_of = cache(lambda surface, n: surface.points(n))
+
+
+def each(cases):
+    return pytest.mark.parametrize("surface", cases, ids=lambda case: type(case).__name__)
+
+
+def close(actual, expected):
+    torch.testing.assert_close(actual, expected, **TOLERANCE[torch.float64])
+
+
+def poor_and_balls(surface, points):
+    candidates = nearest_neighbors(points, 64 if surface.dim == 3 else 24)
+    poor = cloud_frames(points, candidates, surface.dim)
+    return poor, GraphBalls(points, nearest_graph(points, poor, candidates), poor)
+
+
+def refined(surface, points, degree):
+    poor, balls = poor_and_balls(surface, points)
+    rungs = ladder_rungs(surface.dim, range(degree, 0, -1))
+    return refine_frames(points, poor, balls, torch.arange(len(points)), rungs)
+
+
+def tilt(frames, exact):
+    """Sine of the largest angle between the planes at every point: ‖(I − E Eᵀ) exact‖₂."""
+    return torch.linalg.matrix_norm(exact - frames @ (frames.mT @ exact), 2)
+
+
+def slope_of(sizes, errors, dim=2):
+    return -dim * np.polyfit(np.log(sizes), np.log(errors), 1)[0]
+
+
+@each(MANIFOLDS)
+def test_frames_are_orthonormal(surface):
+    """EᵀE = I for poor, refined and exact frames in every dimension."""
+    points = points_of(surface, 400)
+    eye = torch.eye(surface.dim, dtype=torch.float64)
+    frames, order = refined(surface, points, 3)
+    for found in (poor_and_balls(surface, points)[0], frames):
+        assert found.shape == (400, surface.ambient_dim, surface.dim)
+        close(found.mT @ found, eye.expand(400, -1, -1))
+    assert (order == 3).double().mean() > 0.95
+
+
+@pytest.mark.parametrize("surface", [Sphere(), Ellipsoid()], ids=["sphere", "ellipsoid"])
+@pytest.mark.parametrize(("q", "bound"), [(1, 4e-2), (2, 5e-3), (3, 1e-3), (4, 2e-4)])
+def test_frames_have_order_q(surface, q, bound):
+    """rms tilt = O(h^q): slope ≥ q − 0.3 over N = 500 … 4000, and a bound at the finest."""
+    sizes, errors = [500, 1000, 2000, 4000], []
+    for n in sizes:
+        points = points_of(surface, n)
+        frames, order = refined(surface, points, q)
+        assert (order == q).double().mean() > 0.98
+        errors.append(float(tilt(frames, surface.frames(points)).square().mean().sqrt()))
+    assert slope_of(sizes, errors) >= q - 0.3
+    assert errors[-1] <= bound
+
+
+@pytest.mark.parametrize(
+    ("surface", "factor"),
+    [(CliffordTorus(), 5), (SpaceCurve(), 5), (ThreeSphere(), 2)],
+    ids=lambda case: type(case).__name__,
+)
+def test_frames_in_other_codimensions_and_dimensions(surface, factor):
+    """Degree 3 fits of 2000 points beat the poor frames: fivefold, on the coarser S³ (h = 0.2) twofold."""
+    points = points_of(surface, 2000)
+    exact = surface.frames(points)
+    poor, _ = poor_and_balls(surface, points)
+    frames, _ = refined(surface, points, 3)
+    assert tilt(frames, exact).norm() < tilt(poor, exact).norm() / factor
+
+
+@each([Sphere(), Torus()])
+def test_frames_of_a_mesh_ignore_the_orientation_of_its_faces(surface):
+    """Flipping every other triangle leaves the projectors E Eᵀ as they were, and they are near the exact planes."""
+    vertices, faces = surface.mesh(500)
+    flipped = faces.clone()
+    flipped[::2] = flipped[::2, [1, 0, 2]]
+    one, other = mesh_frames(vertices, faces), mesh_frames(vertices, flipped)
+    close(one @ one.mT, other @ other.mT)
+    assert tilt(one, surface.frames(vertices)).max() < 0.3
+
+
+def test_frames_of_a_polyline_and_of_a_flat_mesh():
+    """Segments of a circle give its tangents to first order; a flat mesh its plane exactly."""
+    angle = 2 * torch.pi * torch.arange(100, dtype=torch.float64) / 100
+    circle = torch.stack([angle.cos(), angle.sin()], 1)
+    faces = torch.stack([torch.arange(100), (torch.arange(100) + 1) % 100], 1)
+    tangent = torch.stack([-angle.sin(), angle.cos()], 1)[..., None]
+    assert tilt(mesh_frames(circle, faces), tangent).max() < 1e-12  # symmetric: exact
+    plane = torch.cat([torch.rand(4, 2).double(), torch.zeros(4, 1).double()], 1)
+    frames = mesh_frames(plane, torch.tensor([[0, 1, 2], [1, 2, 3]]))
+    assert frames[:, 2].abs().max() < 1e-14
+
+
+@each(HYPERSURFACES)
+def test_face_normals_point_outward(surface):
+    vertices, faces = surface.mesh(1000)
+    normals = face_normals(vertices, faces)
+    exact = surface.normals(vertices)
+    assert ((normals * exact).sum(1) > 0.8 * normals.norm(dim=1)).all()
+
+
+@pytest.mark.parametrize("n", [2, 3, 4])
+def test_frames_of_normals_and_back(n):
+    """[E, ν] is orthogonal and right-handed; `complete_frames` takes normals of any length."""
+    normals = 3 * torch.randn(50, n, dtype=torch.float64)
+    frames = complete_frames(normals)
+    close((frames.mT @ normals[..., None])[..., 0], torch.zeros(50, n - 1).double())
+    back = normals_of_frames(frames)
+    basis = torch.cat([frames, back[..., None]], -1)
+    close(basis.mT @ basis, torch.eye(n).double().expand(50, n, n))
+    close(torch.linalg.det(basis), torch.ones(50).double())
+
+
+@pytest.mark.parametrize("projection", PROJECTIONS)
+@each([Sphere(), Torus(), CliffordTorus(), ThreeSphere(), SpaceCurve()])
+def test_offsets_are_the_vectors_themselves_in_a_flat_space(surface, projection):
+    """With one common frame for all points both projections are Eᵀe."""
+    points = surface.points(60)
+    frames = surface.frames(points)[:1].expand(60, -1, -1)
+    neighbors = nearest_neighbors(points, 8)[:, 1:]
+    centers = torch.arange(60)
+    found = local_offsets(points, frames, centers, neighbors, projection)
+    close(found, (points[neighbors] - points[:, None]) @ frames[0])
+
+
+@each(HYPERSURFACES)
+def test_normal_projection_is_the_formula_of_the_note_with_a_minus(surface):
+    """e − n_k (e·n_i)/(n_k·n_i), in the frame of i, whatever the signs of the two normals."""
+    points = points_of(surface, 500)
+    frames, normals = surface.frames(points), surface.normals(points)
+    normals = normals * torch.randint(0, 2, (500, 1)).mul(2).sub(1)
+    centers, neighbors = torch.arange(500), nearest_neighbors(points, 12)[:, 1:]
+    e, n_k, n_i = points[neighbors] - points[:, None], normals[neighbors], normals[:, None]
+    ratio = (e * n_i).sum(-1, keepdim=True) / (n_k * n_i).sum(-1, keepdim=True)
+    projected = e - n_k * ratio
+    assert (projected * n_i).sum(-1).abs().max() < 1e-12
+    found = local_offsets(points, frames, centers, neighbors, "normal")
+    close(found, projected @ frames)
+
+
+@each([Sphere(), Ellipsoid(), Torus(), SpaceCurve()])
+def test_both_projections_agree_to_third_order(surface):
+    """max |y_t − y_n| = O(h³): slope ≥ 2.7 over four sizes; at the nearest eight neighbours, with exact frames."""
+    sizes, apart, spacing = [500, 1000, 2000, 4000], [], []
+    for n in sizes:
+        points = points_of(surface, n)
+        centers = torch.arange(0, n, 10)
+        neighbors = nearest_neighbors(points, 9)[centers, 1:]
+        frames = surface.frames(points)
+        y_t, y_n = (local_offsets(points, frames, centers, neighbors, p) for p in PROJECTIONS)
+        apart.append(float((y_t - y_n).norm(dim=-1).square().mean().sqrt()))
+        spacing.append(float((points[neighbors] - points[centers, None]).norm(dim=-1).mean()))
+    assert slope_of(sizes, apart, surface.dim) >= 2.7
+    assert apart[-1] <= 5 * spacing[-1] ** 3

@@ -1,0 +1,46 @@
+"""What torchlb raises and warns of. Bad input is an `InputError`; everything raised is a `TorchlbError`."""
+
+from __future__ import annotations
+
+__all__ = [
+    "CacheWarning",
+    "DiffusionError",
+    "EigenbasisError",
+    "InputError",
+    "OperatorFileError",
+    "StabilityWarning",
+    "StencilError",
+    "TorchlbError",
+]
+
+
+class TorchlbError(ValueError):
+    """Base of all errors of torchlb; the message says what was expected, what came, where, and what to do."""
+
+
+class InputError(TorchlbError):
+    """Input that cannot work: shapes, types, values or options."""
+
+
+class StencilError(TorchlbError):
+    """No acceptable stencil exists for some points; the message names them and the remedy."""
+
+
+class EigenbasisError(TorchlbError):
+    """The eigenpairs cannot be had: no convergence, a growing mode, or a cut through a cluster."""
+
+
+class DiffusionError(TorchlbError):
+    """A flow cannot be computed by the method asked for; the message names one that can."""
+
+
+class OperatorFileError(TorchlbError):
+    """A file that is no operator, or a damaged one; the message names it and says what to do."""
+
+
+class StabilityWarning(UserWarning):
+    """The certificate does not hold; the message names what remains."""
+
+
+class CacheWarning(UserWarning):
+    """A file of a cache was damaged, outdated, or could not be written; the message names it."""

@@ -1,0 +1,79 @@
+"""Weights of polyharmonic splines with polynomials (`method.md`, section 2)."""
+
+from __future__ import annotations
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from torchlb.fits.polynomials import monomials
+from torchlb.fits.weights import (
+    Weights,
+    _finish,
+    _functionals,
+    _misfit,
+    _scaled_system,
+)
+
+__all__ = ["polyharmonic_weights"]
+
+
+def polyharmonic_weights(
+    coords: Float[Tensor, "B neighbors d"],
+    degree: int,
+    heights: Float[Tensor, "B neighbors n"] | None = None,
+) -> Weights:
+    r"""Derivatives of the interpolant by the spline :math:`|y|^{2m+3}` plus polynomials of degree m.
+
+    Against least squares on Deserno's sphere with 2,022 nodes the error is 10 times smaller at p = 3 and 80 times at
+    p = 5 (`method.md`, section 2). Same arguments and result as `least_squares_weights`; m ≥ 2.
+    """
+    exponent = 2 * degree + 3
+    radius, scaled, values, root = _scaled_system(coords, degree)
+    batch, _, dim = coords.shape
+    functionals = _functionals(dim, degree).to(coords)
+    system = root[..., None] * values
+    scale = system.norm(dim=1).clamp_min(torch.finfo(coords.dtype).tiny)
+    q, r = torch.linalg.qr(system / scale[:, None])
+
+    nodes = torch.cat([scaled.new_zeros(batch, 1, dim), scaled], dim=1)
+    # Distances from differences: |a|² − 2ab + |b|² would lose half the digits.
+    kernel = (nodes[:, :, None] - nodes[:, None]).square().sum(-1).pow(exponent / 2)
+    polynomials = torch.cat([torch.ones_like(nodes[..., :1]), monomials(nodes, degree)], dim=-1)
+    num_points, num_polynomials = polynomials.shape[1:]
+    zero = kernel.new_zeros(batch, num_polynomials, num_polynomials)
+    matrix = torch.cat(
+        [
+            torch.cat([kernel, polynomials], dim=2),
+            torch.cat([polynomials.mT, zero], dim=2),
+        ],
+        dim=1,
+    )
+    constant = functionals.new_zeros(1, functionals.shape[1])
+    exact = torch.cat([constant, functionals]).expand(batch, -1, -1)
+    right = torch.cat([_kernel_derivatives(nodes, exponent, functionals.shape[1]), exact], dim=1)
+    factors, pivots, _ = torch.linalg.lu_factor_ex(matrix)
+    weights = torch.linalg.lu_solve(factors, pivots, right)[:, :num_points]
+    moments = values.mT @ weights[:, 1:]
+    residual = (moments - functionals).abs().amax((1, 2)) / functionals.abs().max()
+    misfit = torch.zeros_like(radius) if heights is None else _misfit(q, root, coords, heights)
+    return _finish(weights, residual, radius, torch.linalg.svdvals(r), misfit, dim)
+
+
+def _kernel_derivatives(
+    nodes: Float[Tensor, "B K d"], s: int, count: int
+) -> Float[Tensor, "B K F"]:
+    """First, then second derivatives at y = 0 of |y − y_j|^s, s ≥ 5.
+
+    −s r^{s−2} y_c and s r^{s−2} δ_ab + s (s − 2) r^{s−4} y_a y_b.
+    """
+    dim = nodes.shape[-1]
+    r = nodes.norm(dim=-1)
+    columns = [-s * r ** (s - 2) * nodes[..., c] for c in range(dim)]
+    columns += [
+        s * (s - 2) * r ** (s - 4) * nodes[..., a] * nodes[..., b]
+        + (s * r ** (s - 2) if a == b else 0)
+        for a in range(dim)
+        for b in range(a, dim)
+    ]
+    return torch.stack(columns[:count], dim=-1)

@@ -1,0 +1,133 @@
+"""Monomials in local coordinates, and what a differential functional does to them.
+
+A stencil is exact for polynomials. Their basis is the monomials y^α of the d local coordinates, 1 ≤ |α| ≤ m; the
+constant is left out because the centre of a stencil takes care of it (`method.md`, section 2). A derivative at the
+origin sees exactly one monomial: ∂^β y^α (0) = α! if α = β and 0 otherwise, so a differential functional with
+constant coefficients is a short column of factorials.
+"""
+
+from __future__ import annotations
+
+from functools import lru_cache
+from itertools import combinations_with_replacement
+from math import comb
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from torchlb.errors import InputError
+
+__all__ = [
+    "exponents",
+    "gradient_functional",
+    "hessian_functional",
+    "laplacian_functional",
+    "monomial_derivatives",
+    "monomials",
+    "num_monomials",
+]
+
+
+def num_monomials(dim: int, degree: int) -> int:
+    """Number M of monomials of `dim` variables and total degree ≤ `degree`, the constant included.
+
+    >>> [num_monomials(2, m) for m in (2, 4, 6)]
+    [6, 15, 28]
+    """
+    return comb(degree + dim, dim)
+
+
+@lru_cache(maxsize=64)
+def exponents(dim: int, degree: int) -> Int[Tensor, "M d"]:
+    """Multi-indices α with 1 ≤ |α| ≤ `degree`, by ascending |α|; M − 1 of them, one a row.
+
+    >>> exponents(2, 2).tolist()
+    [[1, 0], [0, 1], [2, 0], [1, 1], [0, 2]]
+    """
+    rows = [
+        [variables.count(c) for c in range(dim)]
+        for total in range(1, degree + 1)
+        for variables in combinations_with_replacement(range(dim), total)
+    ]
+    return torch.tensor(rows)
+
+
+def monomials(coords: Float[Tensor, "*batch d"], degree: int) -> Float[Tensor, "*batch M"]:
+    """Values y^α of the monomials 1 ≤ |α| ≤ `degree` at the points y, in the order of `exponents`.
+
+    >>> monomials(torch.tensor([2.0, 3.0]), 2).tolist()
+    [2.0, 3.0, 4.0, 6.0, 9.0]
+    """
+    dim = coords.shape[-1]
+    columns = [coords[..., c] for c in range(dim)]
+    first = list(range(dim))  # where the monomials of the previous degree that start with y_c begin
+    previous = list(columns)
+    for _ in range(degree - 1):
+        current, starts = [], []
+        for c in range(dim):
+            starts.append(len(current))
+            current += [coords[..., c] * monomial for monomial in previous[first[c] :]]
+        columns += current
+        previous, first = current, starts
+    return torch.stack(columns, dim=-1)
+
+
+def monomial_derivatives(
+    coords: Float[Tensor, "*batch d"], degree: int
+) -> Float[Tensor, "*batch M d"]:
+    """Gradients ∂_c y^α of the monomials 1 ≤ |α| ≤ `degree` at the points y.
+
+    >>> monomial_derivatives(torch.tensor([2.0, 3.0]), 2).tolist()
+    [[1.0, 0.0], [0.0, 1.0], [4.0, 0.0], [3.0, 2.0], [0.0, 6.0]]
+    """
+    alpha = exponents(coords.shape[-1], degree).to(coords.device)
+    columns = []
+    for c in range(coords.shape[-1]):
+        lowered = alpha.clone()
+        lowered[:, c] = (alpha[:, c] - 1).clamp_min(0)
+        powers = (coords[..., None, :] ** lowered).prod(-1)
+        columns.append(alpha[:, c].to(coords.dtype) * powers)
+    return torch.stack(columns, dim=-1)
+
+
+def gradient_functional(dim: int, degree: int) -> Float[Tensor, "M d"]:
+    """∂_c y^α (0) for c = 1 … d: 1 where α = e_c.
+
+    >>> gradient_functional(2, 2).T.tolist()
+    [[1.0, 0.0, 0.0, 0.0, 0.0], [0.0, 1.0, 0.0, 0.0, 0.0]]
+    """
+    alpha = exponents(dim, degree)
+    unit = torch.eye(dim, dtype=alpha.dtype)
+    return (alpha[:, None, :] == unit).all(-1).double()
+
+
+def hessian_functional(dim: int, degree: int) -> Float[Tensor, "M pairs"]:
+    """∂_a ∂_b y^α (0) for the d(d+1)/2 pairs a ≤ b, in the order (1,1), (1,2), …, (d,d): α! where α = e_a + e_b.
+
+    Raises ValueError below degree 2, where no second derivative can be exact.
+
+    >>> hessian_functional(2, 2).T.tolist()
+    [[0.0, 0.0, 2.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0, 0.0], [0.0, 0.0, 0.0, 0.0, 2.0]]
+    """
+    if degree < 2:
+        raise InputError(f"second derivatives need polynomials of degree ≥ 2, got degree {degree}")
+    alpha = exponents(dim, degree)
+    unit = torch.eye(dim, dtype=alpha.dtype)
+    pairs = [(a, b) for a in range(dim) for b in range(a, dim)]
+    columns = [
+        (alpha == unit[a] + unit[b]).all(-1).double() * (2.0 if a == b else 1.0) for a, b in pairs
+    ]
+    return torch.stack(columns, dim=-1)
+
+
+def laplacian_functional(dim: int, degree: int) -> Float[Tensor, "M 1"]:
+    """Δ y^α (0): 2 where α = 2 e_c, the corrected second moment of `method.md`, section 1.
+
+    >>> laplacian_functional(2, 2).T.tolist()
+    [[0.0, 0.0, 2.0, 0.0, 2.0]]
+    """
+    hessian = hessian_functional(dim, degree)
+    pairs = [(a, b) for a in range(dim) for b in range(a, dim)]
+    diagonal = [index for index, (a, b) in enumerate(pairs) if a == b]
+    return hessian[:, diagonal].sum(-1, keepdim=True)

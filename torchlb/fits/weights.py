@@ -1,0 +1,225 @@
+"""Stencil weights: the derivatives at the centre of a fit to the neighbours (`method.md`, section 2).
+
+Local coordinates y_j of the K − 1 neighbours, centre at the origin. One factorisation serves every functional.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, fields, replace
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from torchlb.fits.polynomials import (
+    gradient_functional,
+    hessian_functional,
+    monomial_derivatives,
+    monomials,
+)
+
+__all__ = ["Weights", "least_squares_weights", "positive_weights", "window"]
+
+RANK_TOLERANCE = 1e-10
+
+
+@dataclass(frozen=True)
+class Weights:
+    """Weights of the gradient and of the second derivatives at the centre of a batch of stencils.
+
+    Attributes
+    ----------
+    gradient : (B, K, d), 1/ℓ. Entry 0 along K is the centre, as below.
+    hessian : (B, K, pairs), 1/ℓ²: ∂_a∂_b for a ≤ b; no columns below degree 2.
+    radius : (B,), ℓ: distance ρ of the farthest neighbour in local coordinates.
+    condition : (B,): 2-norm condition of the column-scaled √ω V.
+    deficit : (B,): M − 1 less its numerical rank; 0 for a poised stencil.
+    residual : (B,): largest violation of the moment equations, in units of the largest right-hand side.
+    misfit : (B,): what a polynomial leaves of the heights, in units of the distances; 0 where no heights were given.
+    """
+
+    gradient: Float[Tensor, "B K d"]
+    hessian: Float[Tensor, "B K pairs"]
+    radius: Float[Tensor, " B"]
+    condition: Float[Tensor, " B"]
+    deficit: Int[Tensor, " B"]
+    residual: Float[Tensor, " B"]
+    misfit: Float[Tensor, " B"]
+
+    def __getitem__(self, rows: Tensor) -> Weights:
+        """The given stencils."""
+        return Weights(*(getattr(self, f.name)[rows] for f in fields(Weights)))
+
+    @staticmethod
+    def stack(parts: Sequence[Weights]) -> Weights:
+        """Batches of stencils of one size, one after the other."""
+        return Weights(*(torch.cat([getattr(p, f.name) for p in parts]) for f in fields(Weights)))
+
+    @property
+    def laplacian(self) -> Float[Tensor, "B K"]:
+        """Weights of Δ = Σ_c ∂_c², 1/ℓ²."""
+        dim = self.gradient.shape[-1]
+        pairs = [a == b for a in range(dim) for b in range(a, dim)]
+        return self.hessian[..., pairs].sum(-1)
+
+
+def window(radius: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
+    """Weight ω(r) = (1 − (r/1.1)²)⁴ of a neighbour at r = |y|/ρ ∈ [0, 1].
+
+    >>> window(torch.tensor([0.0, 1.1])).tolist()
+    [1.0, 0.0]
+    """
+    return (1 - (radius / 1.1).square()).clamp_min(0).pow(4)
+
+
+def _functionals(dim: int, degree: int) -> Float[Tensor, "M F"]:
+    """Right-hand sides: the d first derivatives, then (from degree 2 on) the second ones."""
+    columns = [gradient_functional(dim, degree)]
+    if degree >= 2:
+        columns.append(hessian_functional(dim, degree))
+    return torch.cat(columns, dim=1)
+
+
+def _finish(
+    weights: Float[Tensor, "B K F"],
+    residual: Float[Tensor, " B"],
+    radius: Float[Tensor, " B"],
+    singular_values: Float[Tensor, "B M"],
+    misfit: Float[Tensor, " B"],
+    dim: int,
+) -> Weights:
+    """Return from scaled coordinates to units of length."""
+    largest = singular_values[:, :1]
+    rho = radius[:, None, None]
+    return Weights(
+        gradient=weights[..., :dim] / rho,
+        hessian=weights[..., dim:] / rho.square(),
+        radius=radius,
+        condition=singular_values[:, 0] / singular_values[:, -1],
+        deficit=(singular_values <= RANK_TOLERANCE * largest).sum(1),
+        residual=residual,
+        misfit=misfit,
+    )
+
+
+def _misfit(
+    basis: Float[Tensor, "B neighbors M"],
+    root: Float[Tensor, "B neighbors"],
+    coords: Float[Tensor, "B neighbors d"],
+    heights: Float[Tensor, "B neighbors n"],
+) -> Float[Tensor, " B"]:
+    """Scatter of the heights about their fit over root mean square distance, both weighted by ω.
+
+    `basis` spans the polynomials, times √ω. The scatter is per degree of freedom, so their number does not matter.
+    """
+    weighted = root[..., None] * heights
+    left = weighted - basis @ (basis.mT @ weighted)
+    freedom = max(basis.shape[1] - basis.shape[2], 1) / basis.shape[1]
+    square = coords.square().sum(-1) + heights.square().sum(-1)
+    distance = (root.square() * square).sum(1)
+    return (left.square().sum((1, 2)) / freedom / distance).sqrt()
+
+
+def _scaled_system(
+    coords: Float[Tensor, "B neighbors d"], degree: int
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """ρ, y/ρ, the monomials V there and √ω."""
+    distance = coords.norm(dim=-1)
+    radius = distance.amax(-1)
+    scaled = coords / radius[:, None, None]
+    root = window(distance / radius[:, None]).sqrt()
+    return radius, scaled, monomials(scaled, degree), root
+
+
+def least_squares_weights(
+    coords: Float[Tensor, "B neighbors d"],
+    degree: int,
+    keep: Bool[Tensor, "B neighbors"] | None = None,
+    flux: Float[Tensor, "B K d"] | None = None,
+    heights: Float[Tensor, "B neighbors n"] | None = None,
+) -> Weights:
+    r"""Centre-constrained moving least squares.
+
+    For every functional D among the first and second derivatives,
+
+    .. math:: \min \sum_{j \ne i} w_j^2 / \omega_j \quad\text{subject to}\quad
+              \sum_{j \ne i} w_j y_j^\alpha = (D y^\alpha)(0), \quad 1 \le |\alpha| \le m, \qquad
+              w_i = -\sum_{j \ne i} w_j .
+
+    The polynomial passes through the centre's value; that is what makes the operator stable (`method.md`, section 2).
+    Solved by QR of √ω V in coordinates scaled by ρ: w = √ω Q R⁻ᵀ b. A stencil without full
+    rank comes out with a positive `deficit` and unusable weights; nothing is raised.
+
+    Parameters
+    ----------
+    coords : (B, K − 1, d), ℓ: the neighbours without the centre, K − 1 ≥ M − 1.
+    degree : m ≥ 1. Second derivatives come with m ≥ 2.
+    keep : (B, K − 1), neighbours that may have a weight; all by default.
+    flux : (B, K, d), the conormal at each point of the stencil that lies on a Neumann boundary (centre first), zero at
+        the others. Adds an unknown v_b for the datum ∂_ν f(x_b) = 0: minimise Σ w²/ω + Σ v²/ω subject to
+        Σ w_j y_j^α + Σ v_b ∂_ν y^α(y_b) = (D y^α)(0) (`method.md`, section 6). Only w is returned.
+    heights : (B, K − 1, n), ℓ, of the neighbours over the tangent plane, for the `misfit`; not together with `flux`.
+
+    >>> line = torch.tensor([[[-1.0], [1.0]]], dtype=torch.float64)
+    >>> least_squares_weights(line, 2).laplacian.round(decimals=12).tolist()
+    [[-2.0, 1.0, 1.0]]
+    """
+    radius, scaled, values, root = _scaled_system(coords, degree)
+    if keep is not None:
+        root = root * keep
+    if flux is not None:
+        values, root = _with_fluxes(scaled, values, root, flux, degree)
+    functionals = _functionals(coords.shape[-1], degree).to(coords)
+    system = root[..., None] * values
+    scale = system.norm(dim=1).clamp_min(torch.finfo(coords.dtype).tiny)
+    q, r = torch.linalg.qr(system / scale[:, None])
+    right = functionals / scale[..., None]
+    solution = root[..., None] * (q @ torch.linalg.solve_triangular(r.mT, right, upper=False))
+    residual = (values.mT @ solution - functionals).abs().amax((1, 2)) / functionals.abs().max()
+    neighbors = solution[:, : coords.shape[1]]
+    weights = torch.cat([-neighbors.sum(1, keepdim=True), neighbors], dim=1)
+    misfit = torch.zeros_like(radius) if heights is None else _misfit(q, root, coords, heights)
+    return _finish(weights, residual, radius, torch.linalg.svdvals(r), misfit, coords.shape[-1])
+
+
+def _with_fluxes(
+    scaled: Float[Tensor, "B neighbors d"],
+    values: Float[Tensor, "B neighbors M"],
+    root: Float[Tensor, "B neighbors"],
+    flux: Float[Tensor, "B K d"],
+    degree: int,
+) -> tuple[Tensor, Tensor]:
+    """The system with a further row ∂_ν y^α (and its √ω) for every point of the stencil; ω = 0 off the boundary."""
+    nodes = torch.cat([torch.zeros_like(scaled[:, :1]), scaled], dim=1)
+    slopes = (monomial_derivatives(nodes, degree) * flux[:, :, None]).sum(-1)
+    on_boundary = flux.square().sum(-1) > 0
+    weight = torch.cat([torch.ones_like(root[:, :1]), root], dim=1) * on_boundary
+    return torch.cat([values, slopes], dim=1), torch.cat([root, weight], dim=1)
+
+
+def positive_weights(
+    coords: Float[Tensor, "B neighbors d"],
+    degree: int,
+    flux: Float[Tensor, "B K d"] | None = None,
+    heights: Float[Tensor, "B neighbors n"] | None = None,
+) -> Weights:
+    """Least squares over as many neighbours as can have weights Δ ≥ 0: a row of an M-matrix, and consistent.
+
+    Neighbours with a negative weight are left out and the rest solved again until none is negative or the rank is
+    lost. This finds a positive stencil nearly wherever one exists (non-negative least squares finds 0–3 % more).
+    Positive weights exist up to degree 3 only, since Σ w |y|⁴ = 0 excludes them beyond (`method.md`, section 10). The
+    misfit is that of all neighbours.
+    """
+    keep = torch.ones(coords.shape[:2], dtype=torch.bool)
+    weights = least_squares_weights(coords, degree, flux=flux, heights=heights)
+    misfit = weights.misfit
+    for _ in range(coords.shape[1]):
+        others = weights.laplacian[:, 1:]
+        rounding = 1e-12 * others.abs().amax(1, keepdim=True)
+        negative = keep & (others < -rounding) & (weights.residual <= 1e-10)[:, None]
+        if not negative.any():
+            break
+        keep &= ~negative
+        weights = least_squares_weights(coords, degree, keep, flux)
+    return replace(weights, misfit=misfit)

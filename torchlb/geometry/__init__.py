@@ -1,0 +1,6 @@
+"""From points to neighbourhoods and tangent frames (`method.md`, sections 3, 4 and 6).
+
+`voronoi`: cells in the tangent plane. `neighbors`: who may enter a stencil, and graph balls. `candidates`: the
+neighbourhoods that a point tries. `frames`: tangent planes, refined by fits, and coordinates in them. `orientation`:
+which way is out, and the two sides of thin shapes. `boundary`: its points and conormals.
+"""

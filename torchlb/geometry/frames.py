@@ -1,0 +1,212 @@
+"""Tangent frames, and the way from space to the tangent plane (`method.md`, section 3).
+
+A frame E_i (n × d, orthonormal) is *poor* at first: principal components of the nearest neighbours, or the faces
+around a vertex. A fit of degree q to the heights over it gives the slope, and [I; ∇H], orthonormalised, is the frame
+of order q.
+"""
+
+from __future__ import annotations
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from torchlb.fits.weights import least_squares_weights, window
+from torchlb.geometry.candidates import Rung, walk_ladder
+from torchlb.geometry.neighbors import MIN_ALIGNMENT, GraphBalls, admissible
+
+__all__ = [
+    "PROJECTIONS",
+    "cloud_frames",
+    "complete_frames",
+    "face_normals",
+    "local_heights",
+    "local_offsets",
+    "mesh_frames",
+    "normals_of_frames",
+    "refine_frames",
+    "vertex_normals",
+]
+
+MAX_GRADIENT_GROWTH = 15.0
+"""A slope is trusted if ρ Σ|w| of its weights stays below this; good stencils have 2 to 8."""
+NO_NORMAL = 1e-12
+"""A sum of normals below this share of the products of the edges is rounding."""
+
+
+def cloud_frames(
+    points: Float[Tensor, "N n"], candidates: Int[Tensor, "N K"], dim: int, rounds: int = 3
+) -> Float[Tensor, "N n d"]:
+    """Poor frames of a cloud: principal components of the nearer half of the candidates, decaying with distance.
+
+    Each further round takes the nearest that the frames before found admissible, so that the other side of a thin
+    sheet drops out. Error O(h) on a smooth surface.
+    """
+    offset = points[candidates] - points[:, None]
+    distance = offset.norm(dim=-1)
+    centers = torch.arange(len(points)).repeat_interleave(candidates.shape[1])
+    good = torch.ones_like(candidates, dtype=torch.bool)
+    half = (candidates.shape[1] + 1) // 2
+    frames = torch.empty(0)
+    for _ in range(rounds):
+        near = good & (good.cumsum(1) <= half)
+        reach = (distance * near).amax(1, keepdim=True).clamp_min(torch.finfo(distance.dtype).tiny)
+        weight = window((distance / reach).clamp_max(1.1)) * near
+        frames = _principal_directions(offset, weight, dim)
+        good = admissible(points, frames, centers, candidates.reshape(-1)).view(candidates.shape)
+    return frames
+
+
+def _principal_directions(
+    offset: Float[Tensor, "N K n"], weight: Float[Tensor, "N K"], dim: int
+) -> Float[Tensor, "N n d"]:
+    """Leading eigenvectors of the weighted covariance."""
+    weight = weight / weight.sum(1, keepdim=True)
+    centered = offset - (weight[..., None] * offset).sum(1, keepdim=True)
+    covariance = centered.mT @ (weight[..., None] * centered)
+    return torch.linalg.eigh(covariance).eigenvectors[..., -dim:]
+
+
+def mesh_frames(
+    vertices: Float[Tensor, "N n"], faces: Int[Tensor, "F v"]
+) -> Float[Tensor, "N n d"]:
+    """Poor frames of a mesh of d-simplices: the plane closest to those of the faces around a vertex.
+
+    Leading eigenvectors of the projectors onto the faces' planes, averaged by area: the orientation of the faces is
+    irrelevant, and so is the codimension. Error O(h) on a smooth surface.
+    """
+    dim = faces.shape[1] - 1
+    edges = vertices[faces[:, 1:]] - vertices[faces[:, :1]]
+    basis, triangle = torch.linalg.qr(edges.mT)
+    area = torch.diagonal(triangle, dim1=-2, dim2=-1).prod(-1).abs()
+    projector = (area[:, None, None] * (basis @ basis.mT)).repeat_interleave(dim + 1, dim=0)
+    total = vertices.new_zeros(len(vertices), *projector.shape[1:])
+    total.index_add_(0, faces.reshape(-1), projector)
+    return torch.linalg.eigh(total).eigenvectors[..., -dim:]
+
+
+def refine_frames(
+    points: Float[Tensor, "N n"],
+    poor: Float[Tensor, "N n d"],
+    balls: GraphBalls,
+    centers: Int[Tensor, " B"],
+    rungs: list[Rung],
+) -> tuple[Float[Tensor, "B n d"], Int[Tensor, " B"]]:
+    """Frames of order q at `centers`, by fits of degree q to the heights over the poor ones.
+
+    Each centre takes the first rung whose fit has full rank, bounded weights and a tilt below 60°.
+
+    Returns
+    -------
+    frames : (B, n, d).
+    order : (B,), the degree that was reached; 0 where the poor frame stayed.
+    """
+
+    def attempt(rows: Tensor, index: Tensor, rung: Rung) -> tuple[Tensor, Tensor]:
+        frame = poor[rows]
+        offset = points[index[:, 1:]] - points[rows, None]
+        coords = offset @ frame
+        weights = least_squares_weights(coords, rung.degree)
+        heights = offset - coords @ frame.mT
+        slope = weights.gradient[:, 1:].mT @ heights  # (b, d, n), in the normal space
+        refined, _ = torch.linalg.qr(frame + slope.mT)
+        growth = weights.radius * weights.gradient.abs().sum(1).amax(-1)
+        passed = (weights.residual <= 1e-10) & (growth <= MAX_GRADIENT_GROWTH)
+        passed &= _cosine_bound(slope) & refined.isfinite().all(-1).all(-1)
+        return passed, refined
+
+    frames = poor[centers]
+    order = torch.zeros(len(centers), dtype=torch.int64)
+    for number, rows, refined in walk_ladder(balls, centers, rungs, attempt):
+        frames[rows] = refined
+        order[rows] = rungs[number].degree
+    return frames, order
+
+
+def _cosine_bound(slope: Float[Tensor, "B d n"]) -> Bool[Tensor, " B"]:
+    """Whether the steepest slope is below 60°: |∇H| ≤ √(1/MIN_ALIGNMENT² − 1), bounded by the Frobenius norm."""
+    return slope.square().sum((1, 2)) <= 1 / MIN_ALIGNMENT**2 - 1
+
+
+def local_offsets(
+    points: Float[Tensor, "N n"],
+    frames: Float[Tensor, "N n d"],
+    centers: Int[Tensor, " B"],
+    neighbors: Int[Tensor, "B K"],
+    projection: str,
+) -> Float[Tensor, "B K d"]:
+    """Coordinates y of the neighbours in the centre's tangent plane, in its frame.
+
+    `"tangent"`: y = E_iᵀ e, straight down. `"normal"`: y = (E_kᵀ E_i)⁻¹ E_kᵀ e, along the neighbour's own normals, as
+    in the note (with its sign corrected). Both give order p; see `method.md`, section 3.
+    """
+    return PROJECTIONS[projection](points, frames, centers, neighbors)
+
+
+def local_heights(
+    points: Float[Tensor, "N n"],
+    frames: Float[Tensor, "N n d"],
+    centers: Int[Tensor, " B"],
+    neighbors: Int[Tensor, "B K"],
+    coords: Float[Tensor, "B K d"],
+) -> Float[Tensor, "B K n"]:
+    """e − E_i y, from the points y of the centre's tangent plane to the neighbours, as vectors of space."""
+    return points[neighbors] - points[centers, None] - coords @ frames[centers].mT
+
+
+def _tangent_offsets(points: Tensor, frames: Tensor, centers: Tensor, neighbors: Tensor) -> Tensor:
+    return (points[neighbors] - points[centers, None]) @ frames[centers]
+
+
+def _normal_offsets(points: Tensor, frames: Tensor, centers: Tensor, neighbors: Tensor) -> Tensor:
+    offset = points[neighbors] - points[centers, None]
+    theirs = frames[neighbors].mT  # (B, K, d, n)
+    return torch.linalg.solve(theirs @ frames[centers, None], theirs @ offset[..., None])[..., 0]
+
+
+PROJECTIONS = {"tangent": _tangent_offsets, "normal": _normal_offsets}
+"""The values of the option `projection`."""
+
+
+def complete_frames(normals: Float[Tensor, "N n"]) -> Float[Tensor, "N n d"]:
+    """Orthonormal frames of the hyperplanes orthogonal to `normals` (of any length but zero)."""
+    basis, _ = torch.linalg.qr(normals[..., None], mode="complete")
+    return basis[..., 1:]
+
+
+def normals_of_frames(frames: Float[Tensor, "N n d"]) -> Float[Tensor, "N n"]:
+    """The unit normal of each frame with d = n − 1, on the side that makes [frame, normal] right-handed."""
+    basis, _ = torch.linalg.qr(frames, mode="complete")
+    normal = basis[..., -1:]
+    return (normal * torch.linalg.det(torch.cat([frames, normal], -1)).sign()[:, None, None])[
+        ..., 0
+    ]
+
+
+def face_normals(vertices: Float[Tensor, "N n"], faces: Int[Tensor, "F n"]) -> Float[Tensor, "N n"]:
+    """Area-weighted sum at every vertex of the normals of its faces (segments in R², triangles in R³).
+
+    Counter-clockwise triangles point at the viewer, counter-clockwise polygons outward.
+    """
+    edges = vertices[faces[:, 1:]] - vertices[faces[:, :1]]
+    if vertices.shape[1] == 3:
+        normal = torch.linalg.cross(edges[:, 0], edges[:, 1])
+    else:
+        normal = torch.stack([edges[:, 0, 1], -edges[:, 0, 0]], dim=-1)
+    total = torch.zeros_like(vertices)
+    for corner in faces.T:
+        total.index_add_(0, corner, normal)
+    return total
+
+
+def vertex_normals(
+    vertices: Float[Tensor, "N n"], faces: Int[Tensor, "F n"]
+) -> Float[Tensor, "N n"]:
+    """`face_normals` of length one; zero where a vertex has none but for the rounding of its faces."""
+    total = face_normals(vertices, faces)
+    edges = vertices[faces[:, 1:]] - vertices[faces[:, :1]]
+    size = torch.zeros_like(vertices[:, 0])
+    for corner in faces.T:
+        size.index_add_(0, corner, edges.norm(dim=-1).prod(1))
+    length = total.norm(dim=1)
+    return torch.where((length > NO_NORMAL * size)[:, None], total / length[:, None], 0.0)

@@ -1,0 +1,217 @@
+"""Neighbourhoods: who may enter a point's stencil, and in which order (`method.md`, section 4).
+
+A plain ball of the nearest points mixes the two sides of a thin sheet, whose tangent planes agree. So a stencil is
+drawn from a *graph ball*: walk the edges of a mesh, or of the graph of each point's few nearest admissible neighbours
+on a cloud, and step only on points that are admissible from the centre. The `size` nearest of what was reached are the
+pool, ordered by distance. A path across a sharp rim is cut at the rim, where the tangent planes turn away.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Int
+from scipy import sparse
+from scipy.spatial import KDTree
+from torch import Tensor
+
+from torchlb.geometry.voronoi import natural_neighbors
+
+__all__ = ["GraphBalls", "admissible", "mesh_graph", "nearest_graph", "nearest_neighbors"]
+
+MIN_ALIGNMENT = 0.5
+"""Admission: smallest singular value of E_kᵀE_i, the cosine of the largest angle between two tangent planes."""
+MAX_SLOPE = 0.5
+"""Admission: largest share of the distance |e| that may be height over the centre's tangent plane. On a sphere the
+two bounds meet, at 60°."""
+VOID = 1.5
+"""A natural neighbour may be this many times farther than the nearest ones; at an open end all else would be."""
+BALL_SURPLUS = 1.5
+"""A graph ball holds this many times the points asked for, so that its round core lies inside the ragged rim."""
+
+
+def nearest_neighbors(points: Float[Tensor, "N n"], size: int) -> Int[Tensor, "N K"]:
+    """The `size` nearest points of each point by distance, the point itself first, also where others coincide with it.
+
+    >>> nearest_neighbors(torch.tensor([[0.0], [1.0], [3.0]]), 2).tolist()
+    [[0, 1], [1, 0], [2, 1]]
+    """
+    tree = KDTree(points.numpy())
+    _, index = tree.query(points.numpy(), k=size, workers=-1)
+    found = torch.from_numpy(np.asarray(index, dtype=np.int64).reshape(len(points), size))
+    own = torch.arange(len(points))[:, None]
+    others = found != own
+    others[:, -1] &= ~others.all(1)  # it was crowded out by points at the same place
+    return torch.cat([own, found[others].view(len(points), size - 1)], 1)
+
+
+def _smallest_singular_value(
+    a: Float[Tensor, "P n d"], b: Float[Tensor, "P n d"]
+) -> Float[Tensor, " P"]:
+    """σ_min(AᵀB) of pairs of orthonormal frames."""
+    product = a.mT @ b
+    dim = product.shape[-1]
+    if dim == 1:
+        return product[:, 0, 0].abs()
+    if dim == 2:  # σ² are the roots of s² − |A|²s + det² = 0
+        frobenius = product.square().sum((-1, -2))
+        discriminant = (frobenius.square() - 4 * torch.linalg.det(product).square()).clamp_min(0)
+        return ((frobenius - discriminant.sqrt()) / 2).clamp_min(0).sqrt()
+    return torch.linalg.svdvals(product)[:, -1]
+
+
+def admissible(
+    points: Float[Tensor, "N n"],
+    frames: Float[Tensor, "N n d"],
+    centers: Int[Tensor, " P"],
+    others: Int[Tensor, " P"],
+) -> Bool[Tensor, " P"]:
+    """Whether `others[j]` may enter the stencil of `centers[j]`.
+
+    It may if their tangent planes are less than 60° apart (σ_min(E_kᵀE_i) ≥ 0.5) and it does not stand above or
+    below the centre's plane (height ≤ 0.5 of the distance). Orientation of the frames is irrelevant.
+    """
+    offset = points[others] - points[centers]
+    along = torch.einsum("pn,pnd->pd", offset, frames[centers]).square().sum(-1)
+    total = offset.square().sum(-1)
+    flat = total - along <= MAX_SLOPE**2 * total
+    aligned = _smallest_singular_value(frames[others], frames[centers]) >= MIN_ALIGNMENT
+    return flat & aligned
+
+
+def _graph(i: np.ndarray, j: np.ndarray, num_points: int) -> sparse.csr_array:
+    """Symmetric 0/1 adjacency with the pairs (i, j), without loops."""
+    keep = i != j
+    ones = np.ones(int(keep.sum()), dtype=np.float32)
+    graph = sparse.csr_array((ones, (i[keep], j[keep])), shape=(num_points, num_points))
+    graph = sparse.csr_array(graph + graph.T)
+    graph.data[:] = 1
+    return graph
+
+
+def mesh_graph(faces: Int[Tensor, "F v"], num_points: int) -> sparse.csr_array:
+    """Edges of a mesh of simplices as a symmetric (N, N) adjacency.
+
+    >>> mesh_graph(torch.tensor([[0, 1, 2]]), 4).toarray().astype(int).tolist()
+    [[0, 1, 1, 0], [1, 0, 1, 0], [1, 1, 0, 0], [0, 0, 0, 0]]
+    """
+    corners = faces.numpy()
+    pairs = [(a, b) for a in range(corners.shape[1]) for b in range(a)]
+    i = np.concatenate([corners[:, a] for a, _ in pairs])
+    j = np.concatenate([corners[:, b] for _, b in pairs])
+    return _graph(i, j, num_points)
+
+
+def nearest_graph(
+    points: Float[Tensor, "N n"],
+    frames: Float[Tensor, "N n d"],
+    candidates: Int[Tensor, "N K"],
+) -> sparse.csr_array:
+    """A cloud's stand-in for the edges of a mesh, symmetric (N, N).
+
+    Each point is joined to its 2^(d+1) nearest admissible neighbours (4, 8, 16 for curves, surfaces, solids) and to
+    its natural neighbours in the tangent plane, which bridge the voids of an uneven cloud. `candidates`
+    come from `nearest_neighbors`; an edge must be admissible from both its ends.
+    """
+    wanted = 2 ** (frames.shape[-1] + 1)
+    others = candidates[:, 1:]
+    num_rows, size = others.shape
+    if size == 0:  # a single point
+        return sparse.csr_array((num_rows, num_rows), dtype=np.float32)
+    centers = torch.arange(num_rows).repeat_interleave(size)
+    flat = others.reshape(-1)
+    good = admissible(points, frames, centers, flat) & admissible(points, frames, flat, centers)
+    good = good.view(num_rows, size)
+    chosen = good & (good.cumsum(1) <= wanted)
+    for rows in torch.arange(num_rows).split(2**24 // (size * 128)):
+        offset = points[others[rows]] - points[rows, None]
+        distance = offset.norm(dim=-1)
+        reach = VOID * (distance * chosen[rows]).amax(1, keepdim=True)
+        near = good[rows] & (distance <= reach)
+        chosen[rows] |= natural_neighbors(offset @ frames[rows], near)
+    pick = chosen.reshape(-1).numpy()
+    return _graph(centers.numpy()[pick], flat.numpy()[pick], num_rows)
+
+
+class GraphBalls:
+    """The nearest points of a graph ball, for any chunk of centres.
+
+    Parameters
+    ----------
+    points : (N, n), length ℓ.
+    graph : (N, N) symmetric adjacency, from `mesh_graph` or `nearest_graph`.
+    frames : (N, n, d) tangent frames that decide admission.
+    sides : (N, n) from `thin_sides`: also refused is a point on the other side of a thin shape. None if not known.
+    """
+
+    def __init__(
+        self,
+        points: Float[Tensor, "N n"],
+        graph: sparse.csr_array,
+        frames: Float[Tensor, "N n d"],
+        sides: Float[Tensor, "N n"] | None = None,
+    ) -> None:
+        self.points = points
+        self.graph = graph
+        self.frames = frames
+        self.sides = sides
+
+    def __call__(
+        self, centers: Int[Tensor, " B"], size: int
+    ) -> tuple[Int[Tensor, "B K"], Int[Tensor, " B"]]:
+        """The `size` nearest admissible points of each centre, itself first.
+
+        Returns
+        -------
+        index : (B, size), padded by the centre itself where the ball holds fewer.
+        count : (B,), how many are real.
+        """
+        local, others = self._reach(centers, size)
+        offset = self.points[others] - self.points[centers[local]]
+        distance = offset.square().sum(-1)
+        distance[others == centers[local]] = -1.0  # before all that coincide with it
+        order = np.lexsort((others.numpy(), distance.numpy(), local.numpy()))
+        local, others = local[order], others[order]
+        total = torch.bincount(local, minlength=len(centers))
+        rank = torch.arange(len(local)) - (total.cumsum(0) - total)[local]
+        kept = rank < size
+        index = centers[:, None].repeat(1, size)
+        index[local[kept], rank[kept]] = others[kept]
+        return index, total.clamp_max(size)
+
+    def _admissible(
+        self, centers: Int[Tensor, " P"], others: Int[Tensor, " P"]
+    ) -> Bool[Tensor, " P"]:
+        good = admissible(self.points, self.frames, centers, others)
+        if self.sides is not None:
+            good &= (self.sides[centers] * self.sides[others]).sum(1) >= 0
+        return good
+
+    def _reach(
+        self, centers: Int[Tensor, " B"], size: int
+    ) -> tuple[Int[Tensor, " P"], Int[Tensor, " P"]]:
+        """Pairs (row of `centers`, point) of the graph balls, grown ring by ring until they are large enough."""
+        num_rows, num_points = len(centers), len(self.points)
+        shape = (num_rows, num_points)
+        start = (np.ones(num_rows, np.float32), centers.numpy(), np.arange(num_rows + 1))
+        visited = sparse.csr_array(start, shape=shape)
+        frontier = visited
+        while frontier.nnz:
+            ring = frontier @ self.graph + visited * np.float32(2**20)  # marks what is known
+            ring = sparse.coo_array(ring)
+            new = ring.data < 2**20
+            local = torch.from_numpy(ring.coords[0][new].astype(np.int64))
+            others = torch.from_numpy(ring.coords[1][new].astype(np.int64))
+            good = self._admissible(centers[local], others).numpy()
+            row, col = ring.coords[0][new][good], ring.coords[1][new][good]
+            ones = np.ones(len(row), np.float32)
+            frontier = sparse.csr_array((ones, (row, col)), shape=shape)
+            visited = sparse.csr_array(visited + frontier)
+            wanting = np.diff(visited.indptr) < BALL_SURPLUS * size
+            frontier = sparse.csr_array(sparse.diags_array(wanting.astype(np.float32)) @ frontier)
+            frontier.eliminate_zeros()
+        pairs = sparse.coo_array(visited)
+        return (
+            torch.from_numpy(pairs.coords[0].astype(np.int64)),
+            torch.from_numpy(pairs.coords[1].astype(np.int64)),
+        )

@@ -1,0 +1,239 @@
+"""Operators on disk: one file each, found by what it was computed from.
+
+The file is a NumPy archive (.npz) of the `state_dict`, opened with ``allow_pickle=False``: no code is ever run from it,
+nothing but NumPy is needed to look inside, and the archive's checksums notice a single flipped bit, which neither
+safetensors nor `torch.load` do. It is written beside its place and renamed, so that a file is there whole or not at
+all, whoever else writes the same.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import uuid
+import warnings
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from torchlb.errors import CacheWarning, InputError, OperatorFileError
+from torchlb.operator.dispatch import build_operator, builder_of, complete_options
+from torchlb.operator.laplace_beltrami import LaplaceBeltrami
+from torchlb.version import __version__
+
+__all__ = ["describe_file", "load_operator", "load_or_build", "operator_key", "save_operator"]
+
+FORMAT = 1
+"""Of the file. It changes when an older torchlb could not read it."""
+Options = dict[str, Any]
+
+
+def load_or_build(
+    vertices: Any,
+    faces: Any = None,
+    *,
+    cache: str | Path,
+    operator: str = "stencil",
+    k: int = 0,
+    overwrite: bool = False,
+    progress: bool = True,
+    **options: Any,
+) -> LaplaceBeltrami:
+    """The operator of a mesh or cloud out of the folder `cache`; built and stored there if it is not in it yet.
+
+    What is stored is float64 whatever the input's type, and it is found by its content (`operator_key`): by positions,
+    faces, every option, and the version of torchlb. Float32 positions and their float64 copy, int32 and int64 faces,
+    arrays and tensors share an entry. Any number of processes may use one folder at the same time.
+
+    Parameters
+    ----------
+    vertices : (N, n) tensor or array, ℓ.
+    faces : (F, 3) indices; None or empty for a point cloud.
+    cache : folder; made if missing.
+    operator : "stencil" (`from_mesh` or `from_points`) or "cotangent" (`from_cotangent`).
+    k : number of eigenpairs to have in the file. A file with fewer is completed; one with more serves.
+    overwrite : whether to build it anew even so.
+    progress : as for `LaplaceBeltrami.from_points`.
+    **options : of the builder, such as ``order=5``.
+
+    Returns what the builder returns, in the floating type of `vertices`, on the CPU, and raises what it raises; an
+    OSError if the folder cannot be read or written. A `CacheWarning` tells of a damaged file, which is replaced.
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> from torchlb.surfaces import Sphere
+    >>> vertices, faces = Sphere().mesh(100)
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     first = load_or_build(vertices, faces, cache=folder, order=2)
+    ...     again = load_or_build(vertices, faces, cache=folder, order=2)  # from the file
+    >>> torch.equal(first.values, again.values)
+    True
+    """
+    builder, points, corners = builder_of(vertices, faces, operator)
+    options = complete_options(builder, options)
+    key = _key(operator, points, corners, options)
+    path = Path(cache) / f"{key}.npz"
+    lb = None if overwrite else _cached(path, key)
+    if lb is None or _num_eigenpairs(lb) < min(k, lb.num_points):
+        if lb is None:
+            lb = build_operator(points, corners, operator=operator, progress=progress, **options)
+        if k > 0:
+            lb.eigenbasis(k, store=True)
+        save_operator(lb, path, key=key)
+    dtype = torch.as_tensor(vertices).dtype
+    return lb.to(dtype if dtype.is_floating_point else torch.get_default_dtype())
+
+
+def operator_key(
+    vertices: Any, faces: Any = None, *, operator: str = "stencil", **options: Any
+) -> str:
+    """Name of an operator in a cache: SHA-256 over positions, faces, options and version, 64 hexadecimal digits.
+
+    Parameters are those of `load_or_build`; defaults and the same values spelt out give the same key, as do integers
+    and floats of any width. Faces that repeat a corner, which no operator uses, do not count.
+
+    Examples
+    --------
+    >>> operator_key(torch.eye(3), order=3) == operator_key(np.eye(3), weights="least_squares")
+    True
+    """
+    builder, points, corners = builder_of(vertices, faces, operator)
+    return _key(operator, points, corners, complete_options(builder, options))
+
+
+def _key(operator: str, points: Tensor, faces: Tensor | None, options: Options) -> str:
+    """SHA-256 of a canonical form: JSON for what is small, little-endian bytes for arrays."""
+    digest = hashlib.sha256()
+    arrays = {"points": points, "faces": faces}
+    plain: Options = {"operator": operator, "version": __version__}
+    for name, value in options.items():
+        if isinstance(value, Tensor | np.ndarray | list | tuple):
+            arrays[f"option {name}"] = torch.as_tensor(value)
+        else:
+            plain[f"option {name}"] = value.item() if isinstance(value, np.generic) else value
+    digest.update(json.dumps(plain, sort_keys=True).encode())
+    for name, array in arrays.items():
+        if array is not None:
+            values = array.detach().cpu()
+            kind = "<f8" if values.is_floating_point() else "<i8"
+            data = values.numpy().astype(kind) + 0  # −0.0 becomes 0.0
+            digest.update(f"\n{name} {kind} {data.shape}\n".encode())
+            digest.update(np.ascontiguousarray(data).tobytes())
+    return digest.hexdigest()
+
+
+def _num_eigenpairs(lb: LaplaceBeltrami) -> int:
+    return lb.basis_eigenvectors.shape[-1] if len(lb.basis_left) else 0
+
+
+def _cached(path: Path, key: str) -> LaplaceBeltrami | None:
+    """The operator in a file, None if there is no file or a damaged one, which a warning names."""
+    try:
+        lb, header = _read(path)
+        if header["key"] != key:
+            raise OperatorFileError(f"{path}: holds another operator than its name says")
+    except FileNotFoundError:
+        return None
+    except OperatorFileError as error:
+        warnings.warn(f"{error}. It is computed again and replaced", CacheWarning, stacklevel=3)
+        return None
+    return lb
+
+
+def save_operator(lb: LaplaceBeltrami, path: str | Path, *, key: str = "") -> None:
+    """Write an operator to one file, with its certificate, its report, and the eigenbasis if it is in `state_dict`.
+
+    Parameters
+    ----------
+    lb : any operator, also a batch.
+    path : of the file, best with the ending .npz. Its folder is made if missing; a file that is there is replaced at
+        once and as a whole, also if the program is killed or several write it.
+    key : what `operator_key` calls it, for a file of a cache.
+
+    Raises
+    ------
+    OSError : where the file cannot be written; nothing is left of it then.
+    """
+    path = Path(path)
+    state = lb.state_dict()
+    header = {"format": FORMAT, "version": __version__, "key": key}
+    header |= {"state": state.pop("_extra_state"), "types": {}}
+    arrays = {}
+    for name, tensor in state.items():
+        header["types"][name] = str(tensor.dtype).removeprefix("torch.")
+        arrays[name] = _compact(tensor.detach().cpu()).numpy()
+    arrays["header"] = np.array(json.dumps(header))
+    path.parent.mkdir(parents=True, exist_ok=True)
+    # Not tempfile: its files are readable by their owner alone, and a cache is shared.
+    beside = path.with_name(f".{path.name}.{uuid.uuid4().hex}.tmp")
+    try:
+        with open(beside, "xb") as file:
+            np.savez(file, **arrays)
+            file.flush()
+            os.fsync(file.fileno())
+        os.replace(beside, path)
+    except BaseException:
+        beside.unlink(missing_ok=True)
+        raise
+    if os.name == "posix":  # the name, too, is on the disk then
+        folder = os.open(path.parent, os.O_RDONLY)
+        os.fsync(folder)
+        os.close(folder)
+
+
+def _compact(tensor: Tensor) -> Tensor:
+    """Indices in half the bytes where they fit, and the half types, which NumPy lacks in part, as float32."""
+    if tensor.dtype == torch.int64 and (len(tensor) == 0 or int(tensor.max()) < 2**31):
+        return tensor.to(torch.int32)
+    return tensor.float() if tensor.dtype in (torch.bfloat16, torch.float16) else tensor
+
+
+def load_operator(path: str | Path) -> LaplaceBeltrami:
+    """Read an operator that `save_operator` or a cache wrote, bit for bit, on the CPU.
+
+    Raises
+    ------
+    FileNotFoundError : if there is none.
+    OperatorFileError : if it is something else, or damaged.
+    """
+    return _read(Path(path))[0]
+
+
+def describe_file(path: str | Path) -> dict[str, Any]:
+    """What a file of `save_operator` holds: "version" of torchlb, "key", and "operator", read and checked in full.
+
+    Raises as `load_operator`.
+    """
+    lb, header = _read(Path(path))
+    return {"version": header["version"], "key": header["key"], "operator": lb}
+
+
+def _read(path: Path) -> tuple[LaplaceBeltrami, dict[str, Any]]:
+    """Operator and header of a file, in full: every checksum is looked at."""
+    try:
+        with np.load(path, allow_pickle=False) as archive:
+            header = json.loads(str(archive["header"]))
+            if header["format"] != FORMAT:
+                raise InputError(f"format {header['format']}, this torchlb reads {FORMAT}")
+            names = set(archive.files) - {"header"}
+            if names != header["types"].keys():
+                raise InputError("its parts are not those that it lists")
+            state: dict[str, Any] = {
+                name: torch.from_numpy(archive[name]).to(getattr(torch, header["types"][name]))
+                for name in names
+            }
+        state["_extra_state"] = header["state"]
+        lb = LaplaceBeltrami()
+        lb.load_state_dict(state)
+    except (FileNotFoundError, PermissionError, IsADirectoryError):
+        raise
+    except Exception as error:  # a damaged archive fails in a dozen ways
+        raise OperatorFileError(
+            f"{path}: not an operator of torchlb, or damaged ({type(error).__name__}: {error})"
+        ) from error
+    return lb, header

@@ -1,0 +1,301 @@
+"""A data set at once: every shape's operator into one cache, in parallel, over and over until all is there.
+
+What is there already is not computed again, so that a run that was killed goes on by the same call; a shape that fails
+does not stop the others. The workers are joblib's: the cores of this machine, or within ``joblib.parallel_config`` the
+machines of a Dask or Ray cluster (`docs/precompute.md`).
+"""
+
+from __future__ import annotations
+
+import csv
+import io
+import os
+import time
+import uuid
+import warnings
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import asdict, dataclass, fields
+from pathlib import Path
+from typing import Any
+
+import joblib
+import torch
+from tqdm import tqdm
+
+from torchlb.errors import InputError
+from torchlb.io.cache import load_or_build, operator_key
+from torchlb.io.files import SUFFIXES, read_shape
+from torchlb.operator.checks import clean_mesh
+from torchlb.operator.dispatch import check_options_of
+
+__all__ = ["PrecomputeReport", "ShapeResult", "concerns_the_shape", "precompute_operators"]
+
+TABLE = "precompute.csv"
+"""File in the cache that lists what became of every shape in the last run."""
+STALE = 24 * 3600
+"""Age, s, at which what a killed writer left is removed. Nobody writes one file for a day."""
+
+
+@dataclass(frozen=True)
+class ShapeResult:
+    """What became of one shape.
+
+    Attributes
+    ----------
+    name : file, relative to the folder, or "shape 7" for arrays.
+    status : "built", "cached" (it was there) or "failed".
+    points : number of points; 0 if failed.
+    seconds : that it took.
+    file : its operator, for `load_operator`; empty if failed.
+    message : why it failed, or what it was warned of.
+    """
+
+    name: str
+    status: str
+    points: int
+    seconds: float
+    file: str
+    message: str
+
+
+@dataclass(frozen=True)
+class PrecomputeReport:
+    """What became of every shape, in the order given. `print` it for the counts and a table of failures."""
+
+    results: tuple[ShapeResult, ...]
+
+    @property
+    def failed(self) -> tuple[ShapeResult, ...]:
+        """Those that failed."""
+        return tuple(result for result in self.results if result.status == "failed")
+
+    @property
+    def files(self) -> dict[str, Path]:
+        """File of each shape's operator by its name, those that failed left out."""
+        return {result.name: Path(result.file) for result in self.results if result.file}
+
+    def __str__(self) -> str:
+        """Counts, then a line for each shape that failed or was warned of."""
+        counts = {
+            s: sum(r.status == s for r in self.results) for s in ("built", "cached", "failed")
+        }
+        lines = [
+            ", ".join([f"{len(self.results)} shapes"] + [f"{n} {s}" for s, n in counts.items()])
+        ]
+        for title, chosen in (
+            ("failed", self.failed),
+            ("warned", [r for r in self.results if r.message and r.status != "failed"]),
+        ):
+            width = max((len(result.name) for result in chosen), default=0)
+            lines += [title] if chosen else []
+            lines += [f"  {r.name:<{width}}  {' '.join(r.message.split())}" for r in chosen]
+        return "\n".join(lines)
+
+
+@dataclass(frozen=True)
+class _Task:
+    """One shape, and all that a worker has to know."""
+
+    name: str
+    source: Any
+    cache: str
+    operator: str
+    k: int
+    clean: bool
+    options: dict[str, Any]
+
+
+def precompute_operators(
+    shapes: str | Path | Iterable[Any],
+    out: str | Path,
+    *,
+    operator: str = "stencil",
+    k: int = 0,
+    workers: int = -1,
+    clean: bool = False,
+    progress: bool = True,
+    **options: Any,
+) -> PrecomputeReport:
+    """Build and store the operators of a data set; a training script then has each from `load_or_build` at once.
+
+    Parameters
+    ----------
+    shapes : a folder, searched in depth for files that `torchlb.interop.trimesh.read_shape` takes; or a list of files
+        or of (vertices, faces) pairs, faces None for a cloud.
+    out : folder of the cache. ``load_or_build(vertices, faces, cache=out, …)`` with the same options finds the entries.
+    operator, k : as for `load_or_build`.
+    workers : processes, each with one thread; −1 for one per core. Within ``joblib.parallel_config(backend="dask")``
+        the workers are those of the Dask client.
+    clean : whether meshes go through `clean_mesh` first; the data set then has to do the same.
+    progress : whether to show a bar.
+    **options : of `LaplaceBeltrami.from_mesh` or `from_points`.
+
+    Returns
+    -------
+    What became of each shape; also in `out`/precompute.csv. No exception of a shape gets out.
+
+    Raises
+    ------
+    ValueError, TypeError : for options that are none, a folder that is missing or has no shapes, before any work.
+    """
+    check_options_of(operator, options)
+    cache = Path(out)
+    tasks = [
+        _Task(name, source, str(cache.resolve()), operator, k, clean, options)
+        for name, source in _sources(shapes, cache)
+    ]
+    cache.mkdir(parents=True, exist_ok=True)
+    _remove_stale(cache)
+    results: dict[int, ShapeResult] = {}
+    try:
+        with tqdm(total=len(tasks), unit="shape", disable=not progress) as bar:
+            for index, result in _run(tasks, workers):
+                results[index] = result
+                bar.set_postfix(failed=sum(r.status == "failed" for r in results.values()))
+                bar.update()
+    finally:
+        report = PrecomputeReport(tuple(results[i] for i in sorted(results)))
+        _write_table(report, cache / TABLE)
+    return report
+
+
+def _sources(shapes: str | Path | Iterable[Any], cache: Path) -> list[tuple[str, Any]]:
+    """Name and file, or arrays, of every shape."""
+    if isinstance(shapes, str | Path):
+        folder = Path(shapes)
+        if not folder.is_dir():
+            raise InputError(
+                f"{folder}: no such folder; give a folder, or a list of files or of arrays"
+            )
+        found = [
+            path
+            for path in sorted(folder.rglob("*"))
+            if path.suffix.lower() in SUFFIXES
+            and path.is_file()
+            and not path.name.startswith(".")
+            and cache.resolve() not in path.resolve().parents
+        ]
+        if not found:
+            raise InputError(f"{folder}: no shapes in it; they end in {', '.join(SUFFIXES)}")
+        return [(str(path.relative_to(folder)), path.resolve()) for path in found]
+    named = []
+    for i, shape in enumerate(shapes):
+        if isinstance(shape, str | Path):
+            named.append((str(shape), Path(shape).resolve()))
+        elif isinstance(shape, tuple | list) and len(shape) == 2:
+            named.append((f"shape {i}", tuple(shape)))
+        else:
+            raise InputError(f"shape {i}: expected a file or (vertices, faces), got {type(shape)}")
+    if not named:
+        raise InputError("shapes: got none")
+    return named
+
+
+def _run(tasks: Sequence[_Task], workers: int) -> Iterator[tuple[int, ShapeResult]]:
+    """Results as they come. Where a worker dies, those that may have killed it run again, each by itself."""
+    pending = dict(enumerate(tasks))
+    while pending:
+        try:
+            for index, result in _parallel(workers, pending):
+                del pending[index]
+                yield index, result
+        except Exception:  # not of a shape, which the worker catches: the worker itself is gone
+            in_flight = 2 * joblib.effective_n_jobs(workers)
+            for index in list(pending)[:in_flight]:
+                task = pending.pop(index)
+                try:
+                    [(_, result)] = _parallel(max(2, joblib.effective_n_jobs(workers)), {0: task})
+                except Exception as error:
+                    reason = f"its process died: {type(error).__name__}: {error}".partition("\n")[0]
+                    result = ShapeResult(task.name, "failed", 0, 0.0, "", reason)
+                yield index, result
+
+
+def _parallel(workers: int, tasks: dict[int, _Task]) -> Iterable[tuple[int, ShapeResult]]:
+    backend, _ = joblib.parallel.get_active_backend()
+    lazy = getattr(backend, "supports_return_generator", False)
+    settings: dict[str, Any] = {
+        "n_jobs": workers,
+        "batch_size": 1,
+        "return_as": "generator_unordered" if lazy else "list",
+    }
+    calls = [joblib.delayed(_solve)(index, task) for index, task in tasks.items()]
+    found: Any = joblib.Parallel(**settings)(calls)
+    return found
+
+
+def _solve(index: int, task: _Task) -> tuple[int, ShapeResult]:
+    """One shape on one thread; whatever goes wrong with it becomes its result."""
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    start = time.perf_counter()
+    try:
+        with warnings.catch_warnings(record=True) as caught:
+            warnings.simplefilter("always", UserWarning)
+            vertices, faces = (
+                read_shape(task.source) if isinstance(task.source, Path) else task.source
+            )
+            status, points, file = _stored(task, vertices, faces)
+        notes = {str(w.message) for w in caught if concerns_the_shape(w.message)}
+        seconds = time.perf_counter() - start
+        result = ShapeResult(task.name, status, points, seconds, file, "; ".join(sorted(notes)))
+    except Exception as error:
+        seconds = time.perf_counter() - start
+        reason = f"{type(error).__name__}: {error}"
+        result = ShapeResult(task.name, "failed", 0, seconds, "", reason)
+    finally:
+        torch.set_num_threads(threads)
+    return index, result
+
+
+def concerns_the_shape(warning: Warning | str) -> bool:
+    """Whether a warning tells the user of a shape something; torch's about its own sparse tensors does not."""
+    return isinstance(warning, UserWarning) and not str(warning).startswith("Sparse ")
+
+
+def _stored(task: _Task, vertices: Any, faces: Any) -> tuple[str, int, str]:
+    """Status, number of points and file of one shape, whose operator is in the cache then."""
+    if task.clean and faces is not None:
+        vertices, faces, _ = clean_mesh(vertices, faces)
+    key = operator_key(vertices, faces, operator=task.operator, **task.options)
+    path = Path(task.cache) / f"{key}.npz"
+    before = _identity(path)
+    lb = load_or_build(
+        vertices,
+        faces,
+        cache=task.cache,
+        operator=task.operator,
+        k=task.k,
+        progress=False,
+        **task.options,
+    )
+    return "cached" if _identity(path) == before else "built", lb.num_points, str(path)
+
+
+def _identity(path: Path) -> tuple[int, int] | None:
+    """What changes when a file is replaced."""
+    try:
+        found = path.stat()
+    except FileNotFoundError:
+        return None
+    return found.st_ino, found.st_mtime_ns
+
+
+def _remove_stale(cache: Path) -> None:
+    """Remove what writers that were killed left long ago."""
+    for path in cache.glob(".*.tmp"):
+        try:
+            if time.time() - path.stat().st_mtime > STALE:
+                path.unlink()
+        except FileNotFoundError:
+            continue  # another run was faster
+
+
+def _write_table(report: PrecomputeReport, path: Path) -> None:
+    text = io.StringIO()
+    writer = csv.DictWriter(text, [field.name for field in fields(ShapeResult)])
+    writer.writeheader()
+    writer.writerows(asdict(result) for result in report.results)
+    beside = path.with_name(f".{path.name}.{uuid.uuid4().hex}.tmp")
+    beside.write_text(text.getvalue(), encoding="utf-8")
+    os.replace(beside, path)

@@ -1,0 +1,219 @@
+"""The sparse product that layers differentiate through, on plain tensors.
+
+A sparse CSR tensor as a buffer breaks `deepcopy`, autocast and second derivatives, and its native backward is slow.
+Here the matrix is `crow, col, values`, the transpose's pattern is computed once, and two custom operations, whose
+derivatives are each other, give derivatives of any order in values and features, under `torch.compile` and export.
+"""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Float, Int
+from scipy import sparse
+from torch import Tensor
+from torch.nn.functional import embedding_bag
+
+__all__ = [
+    "csr_product",
+    "from_scipy",
+    "matmul",
+    "multiply",
+    "to_scipy",
+    "transpose_pattern",
+    "with_diagonal",
+]
+
+with warnings.catch_warnings():  # torch says once, at the first CSR tensor, that they are in beta
+    warnings.simplefilter("ignore")
+    torch.sparse_csr_tensor([0, 1], [0], [1.0], (1, 1))
+
+
+def transpose_pattern(
+    crow: Int[Tensor, " rows_plus_1"], col: Int[Tensor, " nnz"], num_cols: int
+) -> tuple[Int[Tensor, " cols_plus_1"], Int[Tensor, " nnz"], Int[Tensor, " nnz"]]:
+    """Pattern of the transpose: (crow_t, col_t, order_t) with values_t = values[order_t].
+
+    >>> crow, col = torch.tensor([0, 2, 3]), torch.tensor([0, 1, 1])
+    >>> [part.tolist() for part in transpose_pattern(crow, col, 2)]
+    [[0, 1, 3], [0, 0, 1], [0, 1, 2]]
+    """
+    order = torch.sort(col, stable=True).indices
+    row = torch.repeat_interleave(torch.arange(len(crow) - 1, device=crow.device), crow.diff())
+    count = torch.bincount(col, minlength=num_cols)
+    crow_t = torch.cat([count.new_zeros(1), count.cumsum(0)])
+    return crow_t.to(crow.dtype), row[order].to(col.dtype), order.to(col.dtype)
+
+
+def matmul(
+    crow: Int[Tensor, " rows_plus_1"],
+    col: Int[Tensor, " nnz"],
+    values: Float[Tensor, " nnz"],
+    pattern_t: tuple[Tensor, Tensor, Tensor],
+    x: Float[Tensor, "cols C"],
+) -> Float[Tensor, "rows C"]:
+    """Product A x of a CSR matrix, differentiable any number of times in `values` and in `x`.
+
+    Parameters
+    ----------
+    crow, col, values : A; int32 or int64 indices.
+    pattern_t : of its transpose, from `transpose_pattern`.
+    x : dense. The product is computed in the wider of the types of `values` and `x`, and at least in float32, also
+        under autocast; the result has that type, but for a half-precision x, which gives its own.
+
+    >>> crow, col, values = torch.tensor([0, 2, 3]), torch.tensor([0, 1, 1]), torch.tensor([1.0, 2.0, 3.0])
+    >>> matmul(crow, col, values, transpose_pattern(crow, col, 2), torch.tensor([[1.0], [10.0]])).tolist()
+    [[21.0], [30.0]]
+    """
+    return _product([crow, col, *pattern_t], values, x, False)
+
+
+def csr_product(
+    pattern: Sequence[Tensor],
+    values: Float[Tensor, " nnz"],
+    x: Float[Tensor, "M C"],
+    transposed: bool,
+) -> Float[Tensor, "K C"]:
+    """A x, or Aᵀ x, for the pattern [crow, col, crow_t, col_t, order_t]; otherwise as `matmul`."""
+    return _product(list(pattern), values, x, transposed)
+
+
+def _compute_dtype(left: Tensor, right: Tensor) -> torch.dtype:
+    wider = torch.promote_types(left.dtype, right.dtype)
+    return torch.promote_types(wider, torch.float32)
+
+
+def _result_dtype(values: Tensor, x: Tensor) -> torch.dtype:
+    half = x.dtype in (torch.float16, torch.bfloat16)
+    return x.dtype if half else _compute_dtype(values, x)
+
+
+def _csr(crow: Tensor, col: Tensor, values: Tensor, num_cols: int) -> Tensor:
+    shape = (len(crow) - 1, num_cols)
+    return torch.sparse_csr_tensor(crow, col, values, shape, check_invariants=False)
+
+
+def multiply(
+    crow: Int[Tensor, " rows_plus_1"],
+    col: Int[Tensor, " nnz"],
+    values: Float[Tensor, " nnz"],
+    x: Float[Tensor, "cols C"],
+) -> Float[Tensor, "rows C"]:
+    """A x alone, for operations with derivatives of their own; values and x of one type, at least float32."""
+    x = x.contiguous()
+    if x.device.type == "cpu" and x.dtype == torch.float32 and x.numel():
+        # A row of the result is a weighted sum of rows of x; in this type bags beat MKL twofold.
+        return embedding_bag(
+            col, x, crow, mode="sum", per_sample_weights=values, include_last_offset=True
+        )
+    with torch.autocast(x.device.type, enabled=False):
+        return _csr(crow, col, values, len(x)) @ x
+
+
+@torch.library.custom_op(
+    "torchlb::csr_product",
+    mutates_args=(),
+    schema="(Tensor[] pattern, Tensor values, Tensor x, bool transposed) -> Tensor",
+)
+def _product(pattern: Sequence[Tensor], values: Tensor, x: Tensor, transposed: bool) -> Tensor:
+    """A x, or Aᵀ x, for the pattern [crow, col, crow_t, col_t, order_t]."""
+    crow, col, crow_t, col_t, order_t = pattern
+    if transposed:
+        crow, col, values = crow_t, col_t, values.index_select(0, order_t)
+    dtype = _compute_dtype(values, x)
+    return multiply(crow, col, values.to(dtype), x.to(dtype)).to(_result_dtype(values, x))
+
+
+@torch.library.custom_op(
+    "torchlb::csr_values_gradient",
+    mutates_args=(),
+    schema="(Tensor[] pattern, Tensor left, Tensor right) -> Tensor",
+)
+def _values_gradient(pattern: Sequence[Tensor], left: Tensor, right: Tensor) -> Tensor:
+    """Σ_c left[row, c] right[col, c] at every entry (row, col), without the (nnz, C) of its terms."""
+    crow, col, *_ = pattern
+    dtype = _compute_dtype(left, right)
+    matrix = _csr(crow, col, torch.zeros(len(col), dtype=dtype, device=left.device), len(right))
+    with torch.autocast(left.device.type, enabled=False):
+        return torch.sparse.sampled_addmm(matrix, left.to(dtype), right.to(dtype).T).values()
+
+
+@_product.register_fake
+def _(pattern: Sequence[Tensor], values: Tensor, x: Tensor, transposed: bool) -> Tensor:
+    num_rows = pattern[2 if transposed else 0].shape[0] - 1
+    return x.new_empty(num_rows, x.shape[1], dtype=_result_dtype(values, x))
+
+
+@_values_gradient.register_fake
+def _(pattern: Sequence[Tensor], left: Tensor, right: Tensor) -> Tensor:
+    return left.new_empty(pattern[1].shape[0], dtype=_compute_dtype(left, right))
+
+
+def _save(ctx: Any, inputs: tuple[Any, ...], output: Tensor) -> None:
+    pattern, first, second, *transposed = inputs
+    ctx.save_for_backward(*pattern, first, second)
+    ctx.transposed = transposed == [True]
+
+
+def _product_backward(ctx: Any, grad: Tensor) -> tuple[Any, ...]:
+    *pattern, values, x = ctx.saved_tensors
+    grad_values = grad_x = None
+    if ctx.needs_input_grad[1]:
+        left, right = (x, grad) if ctx.transposed else (grad, x)
+        grad_values = _values_gradient(pattern, left, right).to(values.dtype)
+    if ctx.needs_input_grad[2]:
+        grad_x = _product(pattern, values, grad, not ctx.transposed).to(x.dtype)
+    return [None] * 5, grad_values, grad_x, None
+
+
+def _values_gradient_backward(ctx: Any, grad: Tensor) -> tuple[Any, ...]:
+    *pattern, left, right = ctx.saved_tensors
+    grad_left = grad_right = None
+    if ctx.needs_input_grad[1]:
+        grad_left = _product(pattern, grad, right, False).to(left.dtype)
+    if ctx.needs_input_grad[2]:
+        grad_right = _product(pattern, grad, left, True).to(right.dtype)
+    return [None] * 5, grad_left, grad_right
+
+
+_product.register_autograd(_product_backward, setup_context=_save)
+_values_gradient.register_autograd(_values_gradient_backward, setup_context=_save)
+
+
+def to_scipy(
+    crow: Int[Tensor, " rows_plus_1"],
+    col: Int[Tensor, " nnz"],
+    values: Float[Tensor, " nnz"],
+    shape: tuple[int, int],
+) -> sparse.csr_array:
+    """As a scipy CSR matrix on the CPU, without a copy where there is none needed."""
+    data, indices, indptr = (t.detach().cpu().numpy() for t in (values, col, crow))
+    return sparse.csr_array((data, indices, indptr), shape=shape)
+
+
+def from_scipy(matrix: Any) -> tuple[Tensor, Tensor, Tensor]:
+    """(crow, col, values) of a scipy matrix: columns ascending, duplicates summed, int64 indices.
+
+    >>> from_scipy(sparse.eye_array(2))[1].tolist()
+    [0, 1]
+    """
+    matrix = sparse.csr_array(matrix, copy=True)
+    matrix.sum_duplicates()
+    crow, col = (
+        torch.from_numpy(part.astype(np.int64)) for part in (matrix.indptr, matrix.indices)
+    )
+    return crow, col, torch.from_numpy(matrix.data)
+
+
+def with_diagonal(matrix: sparse.csr_array) -> sparse.csr_array:
+    """CSR with every diagonal entry stored, even where it is zero."""
+    row, col = sparse.coo_array(matrix).coords
+    size = len(matrix.indptr) - 1
+    diagonal = np.arange(size)
+    data = np.concatenate([sparse.coo_array(matrix).data, np.zeros(size)])
+    where = (np.concatenate([row, diagonal]), np.concatenate([col, diagonal]))
+    return sparse.csr_array((data, where), shape=(size, size))

@@ -1,0 +1,53 @@
+"""Features of gradients that no choice of tangent frames changes."""
+
+from __future__ import annotations
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+from torch.nn.functional import linear
+
+from torchlb.errors import InputError
+from torchlb.operator.laplace_beltrami import LaplaceBeltrami
+
+__all__ = ["GradientFeatures"]
+
+
+class GradientFeatures(nn.Module):
+    """Features tanh(Re⟨∇x_c, Σ_j A_cj ∇x_j⟩) of the gradients, the same in any tangent frame.
+
+    Parameters
+    ----------
+    channels : C.
+    rotations : whether A is complex, so that it also turns gradients in the tangent plane; that needs a surface whose
+        normals are oriented consistently (a mesh, or a cloud with oriented normals). Without it, any dimension.
+
+    Examples
+    --------
+    >>> theta = torch.arange(36) * torch.pi / 18
+    >>> lb = LaplaceBeltrami.from_points(torch.stack([theta.cos(), theta.sin()], dim=1))
+    >>> GradientFeatures(3, rotations=False)(torch.ones(36, 3), lb).abs().max() < 1e-5
+    tensor(True)
+    """
+
+    def __init__(self, channels: int, rotations: bool = True) -> None:
+        super().__init__()
+        self.channels, self.rotations = channels, rotations
+        if rotations:
+            self.A_re = nn.Linear(channels, channels, bias=False)
+            self.A_im = nn.Linear(channels, channels, bias=False)
+        else:
+            self.A = nn.Linear(channels, channels, bias=False)
+
+    def forward(self, x: Float[Tensor, "*B N C"], lb: LaplaceBeltrami) -> Float[Tensor, "*B N C"]:
+        """The features of x, (N, C) or (B, N, C), in its shape."""
+        if self.rotations and lb.dim != 2:
+            raise InputError(f"rotations need a surface, got dim={lb.dim}; use rotations=False")
+        gradient = lb.local_gradient(x)  # (…, N, d, C)
+        if self.rotations:  # z ↦ Az of complex numbers is a real map of both parts side by side
+            upper = torch.cat([self.A_re.weight, -self.A_im.weight], dim=1)
+            lower = torch.cat([self.A_im.weight, self.A_re.weight], dim=1)
+            mapped = linear(gradient.flatten(-2), torch.cat([upper, lower])).view_as(gradient)
+        else:
+            mapped = self.A(gradient)
+        return torch.tanh((gradient * mapped).sum(-2))

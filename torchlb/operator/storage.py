@@ -1,0 +1,142 @@
+"""The tensors of an operator, and how they travel: copies, types, files, and the eigenbasis once it is known."""
+
+from __future__ import annotations
+
+from dataclasses import asdict
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from torchlb.linalg.sparse import transpose_pattern
+from torchlb.spectral.eigenbasis import Eigenbasis
+from torchlb.stability.certificate import Certificate
+
+__all__ = ["REPORT_FIELDS", "OperatorStorage"]
+
+REPORT_FIELDS = (
+    "order",
+    "normal_order",
+    "num_neighbors",
+    "growth",
+    "condition",
+    "dominance",
+    "reason",
+)
+BUFFERS = ("crow", "col", "values", "gradient_values", "mass", "points", "frames", "normals")
+BASIS = ("eigenvalues", "eigenvectors", "left", "rates", "mixing")
+
+
+class OperatorStorage(nn.Module):
+    """Plain buffers of any size, which an empty instance takes from any `state_dict`.
+
+    Attributes are those of `LaplaceBeltrami`; the transpose's pattern and, unless asked for, the basis are left out of
+    `state_dict`.
+    """
+
+    crow: Tensor
+    col: Tensor
+    values: Tensor
+    gradient_values: Tensor
+    mass: Tensor
+    points: Tensor
+    frames: Tensor
+    normals: Tensor
+    basis_eigenvalues: Tensor
+    basis_eigenvectors: Tensor
+    basis_left: Tensor
+    basis_rates: Tensor
+    basis_mixing: Tensor
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.kind = "empty"
+        self.options: dict[str, Any] = {}
+        self.certificate: Certificate | None = None
+        self.sizes: tuple[int, ...] | None = None
+        self.spectral_extent: tuple[float, float] | None = None  # found by the layers that need it
+        for name in BUFFERS:
+            self.register_buffer(name, torch.zeros(0))
+        self.crow, self.col = torch.zeros(1, dtype=torch.int64), torch.zeros(0, dtype=torch.int64)
+        for name in REPORT_FIELDS:
+            real = name in ("growth", "condition", "dominance")
+            empty = torch.zeros(0, dtype=torch.get_default_dtype() if real else torch.int64)
+            self.register_buffer(f"report_{name}", empty)
+        for name in ("crow_t", "col_t", "order_t"):  # of the transpose, for the backward pass
+            self.register_buffer(name, torch.zeros(0, dtype=torch.int64), persistent=False)
+        for name in BASIS:
+            self.register_buffer(f"basis_{name}", torch.zeros(0), persistent=False)
+
+    @property
+    def num_points(self) -> int:
+        """Number of points N."""
+        return self.crow.shape[0] - 1
+
+    @property
+    def offsets(self) -> tuple[int, ...]:
+        """Where the points of each shape of a batch start, and N at the end; (0, N) for a single shape."""
+        sizes = self.sizes or (self.num_points,)
+        return tuple(sum(sizes[:i]) for i in range(len(sizes) + 1))
+
+    def _transpose(self) -> None:
+        self.crow_t, self.col_t, self.order_t = transpose_pattern(
+            self.crow, self.col, self.num_points
+        )
+
+    def _keep(self, basis: Eigenbasis | None, *, store: bool | None = None) -> None:
+        """Hold a basis (None: the one there is) in buffers, in `state_dict` or not (None: as it was)."""
+        for name in BASIS:
+            key = f"basis_{name}"
+            value = getattr(self, key) if basis is None else getattr(basis, name)
+            value = self.values.new_zeros(0) if value is None else value.to(self.values)
+            outside = key in self._non_persistent_buffers_set
+            self.register_buffer(key, value, persistent=not outside if store is None else store)
+
+    def get_extra_state(self) -> dict[str, Any]:
+        """Kind, options and certificate, plain types only."""
+        certificate = None if self.certificate is None else asdict(self.certificate)
+        sizes = None if self.sizes is None else list(self.sizes)
+        return {
+            "kind": self.kind,
+            "options": self.options,
+            "certificate": certificate,
+            "sizes": sizes,
+        }
+
+    def set_extra_state(self, state: dict[str, Any]) -> None:
+        """Inverse of `get_extra_state`."""
+        self.kind, self.options = state["kind"], dict(state["options"])
+        found = state["certificate"]
+        self.certificate = None if found is None else Certificate(**found)
+        sizes = state.get("sizes")
+        self.sizes = None if sizes is None else tuple(sizes)
+
+    def _load_from_state_dict(
+        self,
+        state_dict: Any,
+        prefix: str,
+        local_metadata: Any,
+        strict: bool,
+        missing_keys: Any,
+        unexpected_keys: Any,
+        error_msgs: Any,
+    ) -> None:
+        """Take buffers of any size: an operator is data, not parameters of a fixed shape."""
+        for name in BASIS:
+            stored = f"{prefix}basis_{name}" in state_dict
+            self.register_buffer(f"basis_{name}", self.values.new_zeros(0), persistent=stored)
+        self.spectral_extent = None
+        for name, buffer in list(self.named_buffers()):
+            incoming = state_dict.get(prefix + name)
+            if incoming is not None:
+                setattr(self, name, torch.empty_like(incoming, device=buffer.device))
+        super()._load_from_state_dict(
+            state_dict,
+            prefix,
+            local_metadata,
+            strict,
+            missing_keys,
+            unexpected_keys,
+            error_msgs,
+        )
+        self._transpose()

@@ -1,0 +1,15 @@
+"""Pictures with matplotlib (`pip install torchlb[plot]`).
+
+`figures`: scalars, vectors, orders on a surface or cloud; convergence. `drawing`: the painter's algorithm behind them.
+`comparison`: an operator beside the cotangent one, as a table and a picture.
+"""
+
+from torchlb.plot.figures import (
+    plot_convergence,
+    plot_orders,
+    plot_points,
+    plot_surface,
+    plot_vectors,
+)
+
+__all__ = ["plot_convergence", "plot_orders", "plot_points", "plot_surface", "plot_vectors"]

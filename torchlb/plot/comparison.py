@@ -1,0 +1,92 @@
+"""The operator beside libigl's cotangent on one shape: spectra as a table and a picture, with the map of orders."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from torchlb.operator.laplace_beltrami import LaplaceBeltrami
+from torchlb.plot.figures import LINE_COLORS, MARKERS, plot_orders
+
+__all__ = ["draw_comparison", "plot_spectrum", "spectra", "spectrum_table"]
+
+SIDES = [(20.0, -55.0), (20.0, 125.0)]
+
+
+def spectra(operators: Mapping[str, LaplaceBeltrami], k: int) -> dict[str, Float[Tensor, " k"]]:
+    """The k smallest eigenvalues of −Δ of each operator, 1/ℓ²."""
+    return {name: lb.eigenbasis(k).eigenvalues.double() for name, lb in operators.items()}
+
+
+def spectrum_table(values: Mapping[str, Float[Tensor, " k"]]) -> str:
+    """Eigenvalues side by side; from the second column on with the difference from the first, in per cent of it.
+
+    >>> print(spectrum_table({"a": torch.tensor([0.0, 2.0]), "b": torch.tensor([0.0, 2.1])}))
+       k           a           b
+       0           0           0
+       1           2         2.1  +5.00 %
+    """
+    lines = ["   k" + "".join(f"{name:>12}" for name in values)]
+    first, *others = values.values()
+    for i in range(len(first)):
+        line = f"{i:4}{first[i]:12.5g}"
+        for other in others:
+            change = 100 * float(other[i] / first[i] - 1) if first[i] > 0 else None
+            line += f"{other[i]:12.5g}" + ("" if change is None else f"{change:+7.2f} %")
+        lines.append(line)
+    return "\n".join(lines)
+
+
+def plot_spectrum(values: Mapping[str, Float[Tensor, " k"]], ax: Any) -> Any:
+    """Eigenvalues against their number, a line for each operator, on given matplotlib axes, which are returned."""
+    for i, (name, line) in enumerate(values.items()):
+        style = {"color": LINE_COLORS[2 - 2 * i], "marker": MARKERS[i], "markersize": 4}
+        ax.plot(range(len(line)), line.numpy(), label=name, linewidth=1, **style)
+    ax.set(xlabel="number k", ylabel="eigenvalue of −Δ, 1/length²", title="spectrum")
+    ax.spines[["top", "right"]].set_visible(False)
+    ax.legend(frameon=False)
+    return ax
+
+
+def draw_comparison(
+    lb: LaplaceBeltrami,
+    faces: Tensor | None,
+    values: Mapping[str, Float[Tensor, " k"]],
+    path: str | Path,
+    title: str,
+    view: Sequence[tuple[float, float]] = SIDES,
+) -> None:
+    """Write a picture (PNG, or what the ending says): the order that each point reached, and the spectra.
+
+    Parameters
+    ----------
+    lb : operator; of points in more than three dimensions the spectra alone are drawn.
+    faces : (F, 3), or None for a cloud.
+    values : of `spectra`.
+    path, title : of the picture.
+    view : elevations and azimuths, degrees.
+
+    Raises ImportError without matplotlib, OSError where the file cannot be written.
+    """
+    import matplotlib as mpl
+
+    mpl.use("Agg")
+    import matplotlib.pyplot as plt
+
+    seen = lb.points.shape[1] == 3 and lb.dim == 2
+    size = (11, 5.5) if seen else (6, 4.5)
+    figure, axes = plt.subplots(
+        1, 2 if seen else 1, figsize=size, layout="constrained", squeeze=False
+    )
+    plot_spectrum(values, axes[0, -1])
+    if seen:
+        order = lb.report.order.to(torch.int64)
+        plot_orders(lb.points.double(), faces, order, ax=axes[0, 0], view=view)
+    figure.suptitle(title)
+    figure.savefig(path, dpi=130)
+    plt.close(figure)

@@ -1,0 +1,305 @@
+"""Drawing in three dimensions with matplotlib, for `plot`: projection, the painter's algorithm, colours, axes.
+
+What the functions take has been read by `cloud_of`, `mesh_of` and `values_of`: NumPy arrays of float64 that fit.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import torch
+
+from torchlb.errors import InputError
+
+__all__ = [
+    "INK",
+    "VIEW",
+    "Eye",
+    "axes_of",
+    "cloud_of",
+    "color_map",
+    "draw_arrows",
+    "draw_dots",
+    "finish",
+    "isolines_of",
+    "mesh_of",
+    "paint",
+    "plain",
+    "values_of",
+]
+
+Eye = tuple[float, float]
+"""Elevation above the plane of x and y, and azimuth from x, of the eye, in degrees."""
+
+VIEW: Eye = (25.0, -55.0)
+LIGHT = (-0.35, 0.45, 0.82)
+"""Direction of the light as the picture has it: right, up, towards the eye."""
+MISSING = "0.6"
+"""Colour of values that are NaN or infinite: grey."""
+INK = "0.1"
+"""Colour of isolines, and of arrows on a coloured shape."""
+
+
+def axes_of(ax: Any) -> Any:
+    """The given axes, or new ones."""
+    try:
+        import matplotlib.pyplot as plt
+    except ImportError as error:
+        raise ImportError("pictures need matplotlib: pip install torchlb[plot]") from error
+    return plt.subplots(figsize=(6.4, 4.8), layout="constrained")[1] if ax is None else ax
+
+
+def _numpy(values: Any) -> np.ndarray:
+    return torch.as_tensor(values).detach().cpu().double().numpy()
+
+
+def cloud_of(points: Any, name: str = "points") -> np.ndarray:
+    """As (N, 3), the plane as z = 0."""
+    places = _numpy(points)
+    if places.ndim != 2 or places.shape[1] not in (2, 3):
+        raise InputError(
+            f"{name}: expected (N, 2) or (N, 3), got {places.shape}; choose the coordinates to draw, "
+            "for example points[:, :3]"
+        )
+    return np.pad(places, ((0, 0), (0, 3 - places.shape[1])))
+
+
+def mesh_of(vertices: Any, faces: Any) -> tuple[np.ndarray, np.ndarray]:
+    """Vertices (N, 3) and the indices of their triangles (F, 3); ValueError if they are no mesh."""
+    points = _numpy(vertices)
+    corners = torch.as_tensor(faces).detach().cpu().numpy()
+    if points.ndim != 2 or points.shape[1] != 3:
+        raise InputError(f"vertices: expected (N, 3), got {points.shape}")
+    if corners.ndim != 2 or corners.shape[1] != 3 or len(corners) == 0:
+        raise InputError(f"faces: expected (F, 3), at least one, got {corners.shape}")
+    if corners.min() < 0 or corners.max() >= len(points):
+        raise InputError(
+            f"faces: expected indices 0 … {len(points) - 1}, got {corners.min()} … {corners.max()}"
+        )
+    return points, corners
+
+
+def values_of(values: Any, points: np.ndarray) -> np.ndarray:
+    """One number for each point, (N,); ValueError for another count."""
+    numbers = _numpy(values)
+    if numbers.shape != points.shape[:1]:
+        raise InputError(f"values: expected {points.shape[:1]}, one a point, got {numbers.shape}")
+    return numbers
+
+
+def color_map(
+    values: np.ndarray,
+    cmap: str | None,
+    symmetric: bool | None,
+    limits: tuple[float, float] | None = None,
+    diverging: str = "RdBu_r",
+) -> tuple[Any, str]:
+    """The map from values to colours, and at which ends values lie beyond it."""
+    from matplotlib import cm, colormaps, colors
+
+    finite = values[np.isfinite(values)]
+    if len(finite) == 0:
+        finite = np.zeros(1)
+    low, high = np.percentile(finite, [1, 99])
+    if symmetric is None:
+        symmetric = bool(low < 0 < high)
+    if symmetric:
+        high = max(abs(low), abs(high))
+        low = -high
+    if high <= low:
+        low, high = low - 1, high + 1
+    if limits is not None:
+        low, high = limits
+    slack = 0.02 * (high - low)  # an end is pointed only where the colours hide something
+    beyond = finite.min() < low - slack, finite.max() > high + slack
+    extend = {(0, 0): "neither", (1, 0): "min", (0, 1): "max", (1, 1): "both"}[beyond]
+    table = colormaps[cmap or (diverging if symmetric else "viridis")].with_extremes(bad=MISSING)
+    return cm.ScalarMappable(colors.Normalize(low, high), table), extend
+
+
+def plain(color: str, count: int) -> np.ndarray:
+    """One colour, (count, 4)."""
+    from matplotlib.colors import to_rgba
+
+    return np.tile(to_rgba(color), (count, 1))
+
+
+def _project(points: np.ndarray, view: Eye) -> np.ndarray:
+    """Coordinates (N, 3) as the picture has them: right, up, towards the eye."""
+    elevation, azimuth = np.radians(view)
+    right = np.array([-np.sin(azimuth), np.cos(azimuth), 0.0])
+    ahead = np.array([np.cos(azimuth), np.sin(azimuth), 0.0])
+    eye = np.cos(elevation) * ahead + np.sin(elevation) * np.array([0.0, 0.0, 1.0])
+    return points @ np.stack([right, np.cross(eye, right), eye], axis=1)
+
+
+def _stacked(points: np.ndarray, view: Eye | Sequence[Eye]) -> list[tuple[np.ndarray, Eye]]:
+    """The projections for all eyes, each below the one before. A shape in the plane z = 0 is seen from above."""
+    if not points[:, 2].any():
+        view = (90.0, -90.0)
+    views = [view] if isinstance(view[0], int | float) else view
+    seen, floor = [], 0.0
+    for eye in views:
+        flat = _project(points - points.mean(axis=0), eye)  # type: ignore[arg-type]
+        height = np.ptp(flat[:, 1])
+        flat[:, 1] += floor - flat[:, 1].max()
+        flat[:, 0] -= (flat[:, 0].max() + flat[:, 0].min()) / 2
+        floor -= 1.08 * height
+        seen.append((flat, eye))
+    return seen
+
+
+def paint(
+    ax: Any,
+    points: np.ndarray,
+    faces: np.ndarray,
+    colors: np.ndarray,
+    view: Eye | Sequence[Eye],
+    isolines: tuple[np.ndarray, np.ndarray] | None = None,
+) -> None:
+    """Shaded triangles, and segments on them as `isolines_of` gives them, back to front."""
+    from matplotlib.collections import PolyCollection
+
+    light = np.array(LIGHT) / np.linalg.norm(LIGHT)
+    for flat, _ in _stacked(points, view):
+        corners = flat[faces]  # (F, 3, 3)
+        normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+        normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-300)
+        normal *= np.where(normal[:, 2:] < 0, -1, 1)  # either side is lit
+        shaded = colors.copy()
+        shaded[:, :3] *= (0.45 + 0.55 * np.clip(normal @ light, 0, 1))[:, None]
+        polygons, depth = list(corners[..., :2]), corners[..., 2].mean(axis=1)
+        width = np.full(len(faces), 0.5)  # closes the seams between triangles
+        if isolines is not None:
+            edges, share = isolines
+            ends = flat[edges[..., 0]] * (1 - share) + flat[edges[..., 1]] * share  # (S, 2, 3)
+            # Above the triangles beside.
+            above = np.linalg.norm(corners[:, 1] - corners[:, 0], axis=1).mean()
+            polygons += list(ends[..., :2])
+            depth = np.append(depth, ends[..., 2].mean(axis=1) + above)
+            shaded = np.append(shaded, plain(INK, len(ends)), axis=0)
+            width = np.append(width, np.full(len(ends), 0.8))
+        order = depth.argsort()
+        collection = PolyCollection(
+            [polygons[i] for i in order],
+            facecolors=shaded[order],
+            edgecolors=shaded[order],
+            linewidths=width[order],
+            rasterized=True,
+        )
+        ax.add_collection(collection)
+
+
+def isolines_of(
+    values: np.ndarray, faces: np.ndarray, levels: Sequence[float] | np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Segments on which the linear interpolant has one of the levels.
+
+    Their ends as the edge (S, 2, 2) that each lies on, and how far along it, (S, 2, 1) in 0 … 1. Triangles with a
+    corner that is not finite have none.
+    """
+    finite = faces[np.isfinite(values[faces]).all(axis=1)]
+    edges = np.stack([finite, np.roll(finite, -1, axis=1)], axis=-1)  # (F, 3, 2)
+    start, end = values[edges[..., 0]], values[edges[..., 1]]
+    found, shares = [], []
+    for level in levels:
+        crossed = (start > level) != (end > level)  # two edges of a triangle, or none
+        found.append(edges[crossed].reshape(-1, 2, 2))
+        share = (level - start[crossed]) / (end[crossed] - start[crossed])
+        shares.append(share.reshape(-1, 2, 1))
+    return np.concatenate(found), np.concatenate(shares)
+
+
+def _faded(colors: np.ndarray, flat: np.ndarray) -> np.ndarray:
+    """Colours paler with the distance from the eye; as they are where all are equally far, but for rounding."""
+    height = flat[:, 2]
+    depth = (height.max() - height) / max(np.ptp(height), 1e-9 * np.ptp(flat), 1e-300)
+    pale = colors.copy()
+    pale[:, :3] += (1 - pale[:, :3]) * 0.5 * depth[:, None]
+    return pale
+
+
+def draw_dots(
+    ax: Any, points: np.ndarray, colors: np.ndarray, view: Eye | Sequence[Eye], size: float | None
+) -> None:
+    """A disk for each point, back to front, paler with distance."""
+    area = float(np.clip(60000 / len(points), 2, 60)) if size is None else size
+    for flat, _ in _stacked(points, view):
+        order = flat[:, 2].argsort()
+        x, y = flat[order, :2].T
+        pale = _faded(colors, flat)[order]
+        ax.scatter(x, y, s=area, c=pale, linewidths=0, rasterized=True)
+
+
+def _evenly_spread(points: np.ndarray, count: int) -> tuple[np.ndarray, float]:
+    """Indices of `count` of the points, each the farthest from those before, and the least distance between any two."""
+    chosen = [int(np.linalg.norm(points - points.mean(axis=0), axis=1).argmax())]
+    distance = np.linalg.norm(points - points[chosen[0]], axis=1)
+    spacing = float(distance.max())
+    while len(chosen) < min(count, len(points)):
+        spacing = float(distance.max())
+        chosen.append(int(distance.argmax()))
+        distance = np.minimum(distance, np.linalg.norm(points - points[chosen[-1]], axis=1))
+    return np.array(chosen), spacing
+
+
+def draw_arrows(
+    ax: Any,
+    points: np.ndarray,
+    faces: np.ndarray | None,
+    field: np.ndarray,
+    colors: np.ndarray,
+    view: Eye | Sequence[Eye],
+    count: int,
+) -> None:
+    """Arrows at `count` points, back to front: those that no triangle hides, or paler with distance on a cloud."""
+    tails, spacing = _evenly_spread(points, count)
+    lengths = np.linalg.norm(field[tails], axis=1)
+    drawn = np.isfinite(lengths) & (lengths > 0)
+    if not drawn.any():
+        return
+    tails, scale = tails[drawn], 2 * spacing / lengths[drawn].max()
+    options = {"angles": "xy", "scale_units": "xy", "scale": 1, "units": "dots", "width": 1.6}
+    for flat, eye in _stacked(points, view):
+        seen = tails if faces is None else tails[_visible(flat, faces, tails)]
+        seen = seen[flat[seen, 2].argsort()]
+        inks = (_faded(colors, flat) if faces is None else colors)[seen]
+        x, y = flat[seen, :2].T
+        u, v = scale * _project(field[seen], eye)[:, :2].T
+        ax.quiver(x, y, u, v, color=inks, minlength=0.5, zorder=2, **options)
+        ax.update_datalim(np.stack([x + u, y + v], axis=1))
+
+
+def _visible(flat: np.ndarray, faces: np.ndarray, chosen: np.ndarray) -> np.ndarray:
+    """Which of the chosen points no triangle hides: none covers it in the picture and is nearer to the eye."""
+    a, b, c = (flat[faces[:, i]] for i in range(3))
+    normal = np.cross(b - a, c - a)
+    # A triangle seen from the side hides nothing.
+    area = np.where(normal[:, 2] == 0, np.nan, normal[:, 2])
+    slack = 1e-6 * np.ptp(flat[:, 2])  # its own triangles cover a point, too
+    visible = np.ones(len(chosen), dtype=bool)
+    for i, point in enumerate(flat[chosen]):
+        weights = [np.cross(q - p, point - p)[:, 2] / area for p, q in ((a, b), (b, c), (c, a))]
+        covered = np.flatnonzero(np.minimum.reduce(weights) >= 0)
+        fall = (normal[covered, :2] * (point - a[covered])[:, :2]).sum(axis=1) / area[covered]
+        visible[i] = not (a[covered, 2] - fall > point[2] + slack).any()
+    return visible
+
+
+def finish(
+    ax: Any,
+    title: str | None,
+    shades: Any = None,
+    extend: str = "neither",
+    label: str | None = None,
+) -> None:
+    """Equal aspect, no frame, a title and a colour bar."""
+    ax.autoscale_view()
+    ax.set_aspect("equal")
+    ax.set_axis_off()
+    if shades is not None:
+        ax.figure.colorbar(shades, ax=ax, shrink=0.6, pad=0.03, extend=extend, label=label or "")
+    if title:
+        ax.set_title(title)

@@ -1,0 +1,329 @@
+"""Pictures with matplotlib (`pip install torchlb[plot]`): scalars, vectors, orders on a surface or cloud; convergence.
+
+Surfaces are drawn by the painter's algorithm: triangles projected, shaded and filled from back to front. That takes a
+second for 20,000 of them, and no graphics card.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float, Int, Num
+from torch import Tensor
+
+from torchlb.errors import InputError
+from torchlb.plot.drawing import (
+    INK,
+    VIEW,
+    Eye,
+    axes_of,
+    cloud_of,
+    color_map,
+    draw_arrows,
+    draw_dots,
+    finish,
+    isolines_of,
+    mesh_of,
+    paint,
+    plain,
+    values_of,
+)
+
+__all__ = ["plot_convergence", "plot_orders", "plot_points", "plot_surface", "plot_vectors"]
+
+Vertices = Float[Tensor, "N 3"] | Float[np.ndarray, "N 3"]
+Faces = Int[Tensor, "F 3"] | Int[np.ndarray, "F 3"]
+Cloud = Float[Tensor, "N n"] | Float[np.ndarray, "N n"]
+Scalar = Num[Tensor, " N"] | Num[np.ndarray, " N"]
+Vectors = Float[Tensor, "N n"] | Float[np.ndarray, "N n"]
+ORDER_COLORS = ("#d55e00", "#e69f00", "#f0e442", "#56b4e9", "#009e73", "#0072b2", "#cc79a7")
+"""By order reached, fallback first, the last for all beyond. Okabe and Ito's, distinct for the colour-blind too."""
+LINE_COLORS = ("#d55e00", "#56b4e9", "#0072b2", "#000000", "#e69f00", "#009e73", "#cc79a7")
+MARKERS = "osD^vP*"
+PALE = "0.88"
+"""Colour of a shape on which only arrows have one."""
+
+
+def plot_surface(
+    vertices: Vertices,
+    faces: Faces,
+    values: Scalar,
+    *,
+    ax: Any = None,
+    title: str | None = None,
+    cmap: str | None = None,
+    symmetric: bool | None = None,
+    limits: tuple[float, float] | None = None,
+    levels: Sequence[float] | Float[np.ndarray, " L"] = (),
+    view: Eye | Sequence[Eye] = VIEW,
+    label: str | None = None,
+) -> Any:
+    """A scalar on a triangulated surface, shaded, with a colour bar.
+
+    Parameters
+    ----------
+    vertices : (N, 3) tensor or array.
+    faces : (F, 3) indices.
+    values : (N,); a triangle has the mean of its corners. Grey where not finite.
+    ax : matplotlib axes; new ones by default.
+    title : above the axes.
+    cmap : matplotlib's name; by default "RdBu_r" around zero, "viridis" otherwise, which the colour-blind can read.
+    symmetric : whether zero is in the middle of the colours; by default if the values have both signs. The colours
+        span the values but for the outer 1 % at either end, which a pointed end of the bar stands for.
+    limits : least and greatest value that the colours tell apart, instead of those.
+    levels : values at which isolines are drawn.
+    view : elevation and azimuth of the eye, degrees; several are drawn below one another. A shape in the plane z = 0
+        is seen from above.
+    label : of the colour bar, such as the unit.
+
+    Returns
+    -------
+    The axes.
+
+    Raises
+    ------
+    ImportError : without matplotlib.
+    ValueError : for values or faces that do not fit the vertices.
+    """
+    ax = axes_of(ax)
+    points, corners = mesh_of(vertices, faces)
+    numbers = values_of(values, points)
+    shades, extend = color_map(numbers, cmap, symmetric, limits)
+    isolines = isolines_of(numbers, corners, levels) if len(levels) else None
+    paint(ax, points, corners, shades.to_rgba(numbers[corners].mean(axis=1)), view, isolines)
+    finish(ax, title, shades, extend, label)
+    return ax
+
+
+def plot_points(
+    points: Cloud,
+    values: Scalar,
+    *,
+    ax: Any = None,
+    title: str | None = None,
+    cmap: str | None = None,
+    symmetric: bool | None = None,
+    limits: tuple[float, float] | None = None,
+    view: Eye | Sequence[Eye] = VIEW,
+    label: str | None = None,
+    size: float | None = None,
+) -> Any:
+    """A scalar on a cloud in the plane or in space: a disk for each point, the near ones on top, the far ones paler.
+
+    Parameters
+    ----------
+    points : (N, 2) or (N, 3) tensor or array.
+    values : (N,).
+    size : area of a disk, in square points (1/72 inch); by default smaller the more there are.
+    ax, title, cmap, symmetric, limits, view, label : as for `plot_surface`.
+
+    Returns
+    -------
+    The axes.
+
+    Raises
+    ------
+    ImportError : without matplotlib.
+    ValueError : for points of another dimension, or values that do not fit them.
+    """
+    ax = axes_of(ax)
+    places = cloud_of(points)
+    numbers = values_of(values, places)
+    # The middle of "coolwarm" is no white.
+    shades, extend = color_map(numbers, cmap, symmetric, limits, "coolwarm")
+    draw_dots(ax, places, shades.to_rgba(numbers), view, size)
+    finish(ax, title, shades, extend, label)
+    return ax
+
+
+def plot_vectors(
+    vertices: Cloud,
+    faces: Faces | None,
+    vectors: Vectors,
+    values: Scalar | None = None,
+    *,
+    ax: Any = None,
+    title: str | None = None,
+    cmap: str | None = None,
+    symmetric: bool | None = None,
+    limits: tuple[float, float] | None = None,
+    view: Eye | Sequence[Eye] = VIEW,
+    label: str | None = None,
+    count: int = 400,
+) -> Any:
+    """A field of vectors as arrows at evenly spread points of a surface or cloud, such as ``lb.gradient(f)``.
+
+    Those that the surface hides are left out. The longest is twice as long as the distance between two of them.
+
+    Parameters
+    ----------
+    vertices : (N, 3); also (N, 2) for a cloud.
+    faces : (F, 3), or None for a cloud.
+    vectors : (N, 3), or (N, 2) in the plane. None is drawn where one is zero or not finite.
+    values : (N,), a scalar beneath black arrows. Without it the arrows are coloured, by their lengths.
+    count : number of arrows, on all sides of the shape.
+    ax, title, cmap, symmetric, limits, view, label : as for `plot_surface`.
+
+    Returns
+    -------
+    The axes.
+
+    Raises
+    ------
+    ImportError : without matplotlib.
+    ValueError : for vectors, values or faces that do not fit the vertices.
+    """
+    ax = axes_of(ax)
+    places, field = cloud_of(vertices), cloud_of(vectors, "vectors")
+    if field.shape != places.shape:
+        raise InputError(f"vectors: expected {places.shape}, one a point, got {field.shape}")
+    corners = None if faces is None else mesh_of(places, faces)[1]
+    lengths = np.linalg.norm(field, axis=1)
+    numbers = lengths if values is None else values_of(values, places)
+    shades, extend = color_map(numbers, cmap, symmetric, limits)
+    painted = numbers if corners is None else numbers[corners].mean(axis=1)  # by dot or triangle
+    ground = plain(PALE, len(painted)) if values is None else shades.to_rgba(painted)
+    _fill(ax, places, corners, ground, view)
+    inks = shades.to_rgba(lengths) if values is None else plain(INK, len(places))
+    draw_arrows(ax, places, corners, field, inks, view, count)
+    finish(ax, title, shades, extend, label)
+    return ax
+
+
+def plot_orders(
+    vertices: Cloud,
+    faces: Faces | None,
+    order: Int[Tensor, " N"] | Int[np.ndarray, " N"],
+    *,
+    ax: Any = None,
+    title: str | None = "order reached",
+    view: Eye | Sequence[Eye] = VIEW,
+) -> Any:
+    """Map of the order that each point reached (`lb.report.order`), with the number of points in the legend.
+
+    Parameters
+    ----------
+    vertices : (N, 3); also (N, 2) for a cloud.
+    faces : (F, 3), or None for a cloud. A triangle takes the lowest order of its corners.
+    order : (N,), 0 for a fallback row.
+    ax, title, view : as for `plot_surface`.
+
+    Returns
+    -------
+    The axes.
+
+    Raises
+    ------
+    ImportError : without matplotlib.
+    ValueError : for orders or faces that do not fit the vertices.
+    """
+    ax = axes_of(ax)
+    from matplotlib import colors
+    from matplotlib.patches import Patch
+
+    palette = colors.to_rgba_array(ORDER_COLORS)
+    last = len(palette) - 1
+    places = cloud_of(vertices)
+    reached = values_of(order, places).astype(int)
+    corners = None if faces is None else mesh_of(vertices, faces)[1]
+    shown = reached if corners is None else reached[corners].min(axis=1)  # by dot or triangle
+    _fill(ax, places, corners, palette[shown.clip(0, last)], view)
+    counts = np.bincount(reached)
+    handles = [
+        Patch(color=palette[min(p, last)], label=f"{f'order {p}' if p else 'fallback'}: {count:,}")
+        for p, count in reversed(list(enumerate(counts)))
+        if count
+    ]
+    ax.legend(handles=handles, loc="center left", bbox_to_anchor=(1.0, 0.5), frameon=False)
+    finish(ax, title)
+    return ax
+
+
+def _fill(
+    ax: Any,
+    points: np.ndarray,
+    faces: np.ndarray | None,
+    colors: np.ndarray,
+    view: Eye | Sequence[Eye],
+) -> None:
+    """A surface by the colours of its triangles, or a cloud by those of its points."""
+    if faces is None:
+        draw_dots(ax, points, colors, view, None)
+    else:
+        paint(ax, points, faces, colors, view)
+
+
+def plot_convergence(
+    sizes: Sequence[int],
+    errors: Mapping[str, Sequence[float]],
+    *,
+    dim: int = 2,
+    ax: Any = None,
+    title: str | None = None,
+    ylabel: str = "relative error of Δf",
+) -> Any:
+    """Error against the number of points, doubly logarithmic, with the measured order of each line in the legend.
+
+    Grey lines fall like whole powers of the spacing h ~ N^(−1/d), to compare with.
+
+    Parameters
+    ----------
+    sizes : numbers of points N, ascending.
+    errors : for each method its errors at these sizes; zeros and NaN are left out.
+    dim : d of the manifold. The measured order is the slope against h over the three finest sizes.
+    ax, title : as for `plot_surface`.
+    ylabel : of the vertical axis.
+
+    Returns
+    -------
+    The axes.
+
+    Raises
+    ------
+    ImportError : without matplotlib.
+    ValueError : for no errors that are positive, or another number of them than of sizes.
+    """
+    ax = axes_of(ax)
+    orders = []
+    for i, (name, line) in enumerate(errors.items()):
+        n, error = np.asarray(sizes, dtype=float), np.asarray(line, dtype=float)
+        if n.shape != error.shape:
+            raise InputError(
+                f"errors[{name!r}]: expected {len(n)}, one for a size, got {len(error)}"
+            )
+        good = np.isfinite(error) & (error > 0)
+        n, error = n[good], error[good]
+        label = name
+        if len(n) > 1:
+            orders.append(-dim * np.polyfit(np.log(n[-3:]), np.log(error[-3:]), 1)[0])
+            label = f"{name}:  $h^{{{orders[-1]:.1f}}}$"
+        color, marker = LINE_COLORS[i % len(LINE_COLORS)], MARKERS[i % len(MARKERS)]
+        ax.loglog(n, error, color=color, marker=marker, markersize=5, label=label)
+    _references(ax, sizes, orders, dim)
+    ax.set_xticks(list(sizes), [f"{n:,}" for n in sizes])
+    ax.minorticks_off()
+    ax.set(xlabel="number of points N", ylabel=ylabel)
+    ax.spines[["top", "right"]].set_visible(False)
+    ax.legend(loc="lower left", frameon=False)
+    if title:
+        ax.set_title(title)
+    return ax
+
+
+def _references(ax: Any, sizes: Sequence[int], orders: list[float], dim: int) -> None:
+    """A grey fan of the whole powers of h near the measured ones, from the largest error on, named at its ends."""
+    drawn = [y for line in ax.lines for y in line.get_ydata()]
+    if not drawn:
+        raise InputError("errors: expected some that are positive, got none")
+    low, high = min(drawn) / 2, max(drawn) * 1.5
+    first, last = min(sizes), max(sizes)
+    for power in sorted({max(round(order), 1) for order in orders}):
+        end = min(last, first * (high / low) ** (dim / power))  # where it leaves the axes
+        fall = (end / first) ** (-power / dim)
+        ax.loglog([first, end], [high, high * fall], color="0.75", lw=1, ls="--", zorder=0)
+        name = "$h$" if power == 1 else f"$h^{{{power}}}$"
+        place = {"xytext": (4, 0), "textcoords": "offset points", "va": "center"}
+        ax.annotate(name, (end, high * fall), color="0.45", annotation_clip=False, **place)
+    ax.set_ylim(low, 1.2 * high)

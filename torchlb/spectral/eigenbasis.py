@@ -1,0 +1,133 @@
+"""An eigenbasis of −Δ: real functions, orthonormal in the mass, and the way there and back (`method.md`, section 7)."""
+
+from __future__ import annotations
+
+from typing import Protocol, runtime_checkable
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+__all__ = ["Eigenbasis", "Spectral", "stack_eigenbases"]
+
+
+@runtime_checkable
+class Spectral(Protocol):
+    """What has an eigenbasis: an operator of one shape or of a batch."""
+
+    sizes: tuple[int, ...] | None
+
+    @property
+    def num_points(self) -> int:
+        """Number of points N."""
+        ...
+
+    def eigenbasis(self, k: int) -> Eigenbasis:
+        """The k smallest eigenpairs of −Δ."""
+        ...
+
+
+class Eigenbasis:
+    """Eigenpairs of −Δ: real, ascending, orthonormal in the mass.
+
+    Attributes
+    ----------
+    eigenvalues : (k,), 1/ℓ², ≥ 0 and ascending, exactly 0 once for every connected component (but one with a Dirichlet
+        boundary); (S, k) for a batch of S shapes, each with its own.
+    eigenvectors : Φ, (N, k), ΦᵀΠΦ = I; the first is constant. For a batch, those of each shape on its own rows; a
+        shape of fewer than k points has zero columns at the end.
+    mass : π, (N,), ℓ^d.
+    left : W, (N, k), WᵀΦ = I: left eigenvectors of Δ, for the oblique projector ΦWᵀ. Equal to ΠΦ if ΠΔ is symmetric.
+    sizes : numbers of points of the shapes of a batch; None for a single shape.
+    rates : (2, k) or (S, 2, k): real and imaginary parts of the eigenvalues of B = −WᵀΔΦ, in 1/ℓ².
+    mixing : (3, k, k) or (S, 3, k, k): V, V⁻¹ and JV⁻¹ with BV = V(rates[0] − rates[1] J), J a quarter turn in each
+        conjugate pair. Both are there only in a closed basis, whose span is invariant: see `is_closed`.
+    """
+
+    def __init__(
+        self,
+        eigenvalues: Float[Tensor, "*S k"],
+        eigenvectors: Float[Tensor, "N k"],
+        mass: Float[Tensor, " N"],
+        left: Float[Tensor, "N k"],
+        sizes: tuple[int, ...] | None = None,
+        rates: Float[Tensor, "*S 2 k"] | None = None,
+        mixing: Float[Tensor, "*S 3 k k"] | None = None,
+    ) -> None:
+        self.eigenvalues, self.eigenvectors = eigenvalues, eigenvectors
+        self.mass, self.left, self.sizes = mass, left, sizes
+        self.rates, self.mixing = rates, mixing
+
+    def __repr__(self) -> str:
+        n, k = self.eigenvectors.shape
+        shapes = "" if self.sizes is None else f", {len(self.sizes)} shapes"
+        last = float(self.eigenvalues.max()) if k else 0.0
+        return f"Eigenbasis({k} pairs of {n} points{shapes}, eigenvalues 0 to {last:.4g})"
+
+    @property
+    def is_closed(self) -> bool:
+        """Whether the span is invariant under Δ, and the exact e^{tΔ} on it is at hand."""
+        return self.mixing is not None
+
+    def truncate(self, k: int) -> Eigenbasis:
+        """The first k of the pairs; itself if there are no more."""
+        if k >= self.eigenvectors.shape[1]:
+            return self
+        cut = (self.eigenvalues[..., :k], self.eigenvectors[:, :k], self.mass, self.left[:, :k])
+        return Eigenbasis(*cut, sizes=self.sizes)
+
+    def to_basis(self, f: Float[Tensor, "*B N C"]) -> Float[Tensor, "*S k C"]:
+        """Coefficients Φᵀ(πf), (…, k, C), or (…, S, k, C) for a batch of shapes."""
+        return self._analyse(self.eigenvectors, self.mass.to(f.dtype)[:, None] * f)
+
+    def to_basis_obliquely(self, f: Float[Tensor, "*B N C"]) -> Float[Tensor, "*S k C"]:
+        """Coefficients Wᵀf: zero on every left-over eigenvector of Δ, which Φᵀ(πf) is not."""
+        return self._analyse(self.left, f)
+
+    def from_basis(self, coefficients: Float[Tensor, "*S k C"]) -> Float[Tensor, "*B N C"]:
+        """The function Φc with the given coefficients, (…, N, C)."""
+        return self.synthesise(self.eigenvectors, coefficients)
+
+    def synthesise(
+        self, functions: Float[Tensor, "N k"], coefficients: Float[Tensor, "*S k C"]
+    ) -> Float[Tensor, "*B N C"]:
+        """Σ_k functions[:, k] c_k, with the coefficients of its own shape at every point."""
+        functions = functions.to(coefficients.dtype)
+        if self.sizes is None:
+            return functions @ coefficients
+        parts = zip(functions.split(self.sizes), coefficients.unbind(-3), strict=True)
+        return torch.cat([block @ c for block, c in parts], dim=-2)
+
+    def _analyse(self, functionals: Tensor, f: Tensor) -> Tensor:
+        functionals = functionals.to(f.dtype)
+        if self.sizes is None:
+            return functionals.mT @ f
+        parts = zip(functionals.split(self.sizes), f.split(self.sizes, dim=-2), strict=True)
+        return torch.stack([block.mT @ g for block, g in parts], dim=-3)
+
+
+def stack_eigenbases(bases: list[Eigenbasis]) -> Eigenbasis:
+    """One basis of a batch from those of its shapes, padded to the longest by zero columns."""
+    k = max(basis.eigenvectors.shape[1] for basis in bases)
+
+    def padded(t: Tensor, sides: int) -> Tensor:
+        return torch.nn.functional.pad(t, (0, k - t.shape[-1]) * sides)
+
+    rates = mixing = None
+    if all(basis.is_closed for basis in bases):
+        rates = torch.stack([padded(b.rates, 1) for b in bases if b.rates is not None])
+        mixing = torch.stack([padded(b.mixing, 2) for b in bases if b.mixing is not None])
+    return Eigenbasis(
+        torch.stack(
+            [
+                torch.cat([b.eigenvalues, b.eigenvalues[-1:].expand(k - len(b.eigenvalues))])
+                for b in bases
+            ]
+        ),
+        torch.cat([padded(b.eigenvectors, 1) for b in bases]),
+        torch.cat([b.mass for b in bases]),
+        torch.cat([padded(b.left, 1) for b in bases]),
+        tuple(len(b.mass) for b in bases),
+        rates,
+        mixing,
+    )

@@ -1,0 +1,335 @@
+r"""Eigenpairs of −Δ from an operator that is not symmetric (`method.md`, section 7).
+
+Let A = −L in the inner product of the mass π. The span of its k slowest right eigenvectors is orthonormalised in π, and
+Rayleigh–Ritz is done there: the eigenvectors of the symmetric part of ΦᵀΠAΦ give a real basis of functions, ascending,
+ΦᵀΠΦ = I, which keeps the order of L. (Symmetrising L itself would lose it.) Beside it stand the left eigenvectors W of
+the same eigenvalues, WᵀΦ = I: the oblique projector ΦWᵀ commutes with L, so that e^{tL} acts on the span and on the
+rest apart; and the exact action on the span, e^{−tB} with B = WᵀAΦ, through the eigenvectors of the small matrix B.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from scipy import linalg, sparse
+from scipy.sparse import csgraph
+from scipy.sparse.linalg import ArpackError, LinearOperator, eigs, eigsh
+from torch import Tensor
+
+from torchlb.errors import EigenbasisError
+from torchlb.linalg.factor import factorized
+from torchlb.linalg.krylov import imbalance
+from torchlb.spectral.eigenbasis import Eigenbasis, stack_eigenbases
+from torchlb.stability.null_vector import CONSERVED, LOSS, left_null_vector
+
+__all__ = ["blockwise_eigenbasis", "solve_eigenbasis"]
+
+DENSE = 400
+"""Up to this many points a dense solve is as fast, and never fails."""
+SHIFT = 1e-9
+"""Of the inverted operator, in units of its diagonal; the constants are projected out, so that it may be tiny."""
+GAP = 1e-7
+"""Eigenvalues closer than this, relatively, are not separated: conjugate pairs and exact multiplicities stay whole."""
+SYMMETRY = 1e-12
+CONDITION = 1e8
+"""Of the eigenvectors of B; beyond it e^{−tB} through them has no digits left in float32."""
+
+
+def blockwise_eigenbasis(
+    matrix: sparse.csr_array,
+    mass: Float[Tensor, " N"],
+    k: int,
+    sizes: tuple[int, ...] | None,
+    *,
+    rounding: float = 0.0,
+) -> Eigenbasis:
+    """As `solve_eigenbasis`, of every diagonal block of the given sizes by itself; None: of the whole."""
+    if sizes is None:
+        return solve_eigenbasis(matrix, mass, k, rounding=rounding)
+    ends = np.cumsum(sizes)
+    blocks = [slice(end - size, end) for end, size in zip(ends, sizes, strict=True)]
+    return stack_eigenbases(
+        [solve_eigenbasis(matrix[b, b], mass[b], k, rounding=rounding) for b in blocks]
+    )
+
+
+@dataclass
+class _Part:
+    """One connected component: A scaled to the inner product of the mass, and its slow eigenvectors as found."""
+
+    index: np.ndarray
+    matrix: sparse.csr_array
+    root: np.ndarray
+    null_left: np.ndarray | None  # times √mass/|√mass| it is 1; None where heat is lost
+    right: tuple[np.ndarray, np.ndarray]
+    left: tuple[np.ndarray, np.ndarray]
+    symmetric: bool
+
+    @property
+    def complete(self) -> bool:
+        return len(self.right[0]) == len(self.index) - (self.null_left is not None)
+
+
+def solve_eigenbasis(
+    matrix: sparse.csr_array, mass: Float[Tensor, " N"], k: int, *, rounding: float = 0.0
+) -> Eigenbasis:
+    """The k smallest eigenpairs of −Δ, and a few more where pairs would be split: a closed basis, in float64.
+
+    Parameters
+    ----------
+    matrix : Δ, (N, N), of either kind. Its rows sum to zero up to `rounding`, relative, which is removed, or lose heat
+        (next to a Dirichlet boundary).
+    mass : inner product; π of the certificate, or the mass of a symmetric operator.
+    k : number of pairs; all N if there are fewer.
+
+    Raises
+    ------
+    EigenbasisError : where the iteration does not converge, or the operator has a mode that grows.
+    """
+    a = -sparse.csr_array(matrix, dtype=np.float64, copy=True)
+    a.eliminate_zeros()
+    total = a.sum(axis=1)
+    losing = np.abs(total) > max(LOSS, 64 * rounding) * abs(a).sum(axis=1)
+    a = sparse.csr_array(a - sparse.diags_array(np.where(losing, 0.0, total)))
+    pi = mass.detach().cpu().double().numpy()
+    count, component = csgraph.connected_components(a, directed=True, connection="weak")
+    lossy = np.bincount(component, losing, minlength=count) > 0
+    null_left = pi.copy()
+    if imbalance(sparse.csr_array(a.T), np.where(lossy[component], 0.0, pi)) > CONSERVED:
+        null_left = left_null_vector(sparse.csr_array(-a), torch.from_numpy(pi.copy()))[0].numpy()
+    wanted = max(min(k, len(pi)) - int((~lossy).sum()), 0)
+    tolerance = max(SYMMETRY, 8 * rounding)
+    parts = []
+    for c in range(count):
+        index = np.flatnonzero(component == c)
+        null = None if lossy[c] else null_left[index]
+        parts.append(_part(a[index][:, index], index, pi[index], null, wanted, tolerance))
+    cut = _cut(parts, wanted)
+    solved = [_ritz(part, cut) for part in parts]
+    return _merged(parts, solved, pi, min(k, len(pi)))
+
+
+def _part(
+    a: Any,
+    index: np.ndarray,
+    mass: np.ndarray,
+    null: np.ndarray | None,
+    wanted: int,
+    tolerance: float,
+) -> _Part:
+    """Scale one component and find its slow eigenvectors, right and left."""
+    root = np.sqrt(mass)
+    zero = root / linalg.norm(root)
+    scaled = sparse.csr_array(sparse.diags_array(root) @ a @ sparse.diags_array(1 / root))
+    skew = scaled - scaled.T
+    symmetric = bool(skew.nnz == 0 or abs(skew).max() <= tolerance * abs(scaled).max())
+    if symmetric:
+        scaled = sparse.csr_array((scaled + scaled.T) / 2)
+    left_null = None
+    if null is not None:
+        left_null = root.copy() if symmetric else null / root
+        left_null /= left_null @ zero
+    size = len(index)
+    if wanted == 0 or size <= (left_null is not None):
+        right = left = (np.zeros(0), np.zeros((size, 0)))
+    elif size <= DENSE or 2 * wanted >= size:
+        right, left = _dense(scaled.toarray(), symmetric, left_null is not None)
+    else:
+        right, left = _inverted(scaled, zero, left_null, wanted, symmetric)
+    return _Part(index, scaled, root, left_null, right, left, symmetric)
+
+
+Pairs = tuple[np.ndarray, np.ndarray]
+
+
+def _dense(a: np.ndarray, symmetric: bool, singular: bool) -> tuple[Pairs, Pairs]:
+    """All eigenpairs but a null vector, slowest first, of A and of its transpose."""
+
+    def ordered(values: np.ndarray, vectors: np.ndarray) -> Pairs:
+        order = np.argsort(np.abs(values), kind="stable")[int(singular) :]
+        return values[order], vectors[:, order]
+
+    if symmetric:
+        pairs = ordered(*linalg.eigh(a))
+        return pairs, pairs
+    return ordered(*np.linalg.eig(a)), ordered(*np.linalg.eig(a.T))
+
+
+def _inverted(
+    a: sparse.csr_array, right: np.ndarray, left: np.ndarray | None, wanted: int, symmetric: bool
+) -> tuple[Pairs, Pairs]:
+    """Slow eigenpairs by Arnoldi on the inverse; null vectors, if `left` is one, are projected out on both sides."""
+    size = len(right)
+    if left is None:
+        right = left = np.zeros(size)
+    # ARPACK takes what is small in absolute terms for converged; a power of two rounds nothing.
+    unit = np.ldexp(1.0, np.frexp(np.median(a.diagonal()))[1])
+    a = a / unit
+    shift = SHIFT * float(np.median(a.diagonal()))
+    try:
+        lu = factorized(sparse.csc_array(a + shift * sparse.eye_array(size)), 1e-2)
+    except RuntimeError as error:
+        raise EigenbasisError(
+            f"eigenbasis: the operator on {size} points is singular beyond its constants; build it with certify=True"
+        ) from error
+    count = min(wanted + max(6, wanted // 16), size - 3)
+    start = np.random.default_rng(0).standard_normal(size)
+    found = []
+    for mode, u, w in [("N", right, left), ("T", left, right)][: 1 if symmetric else 2]:
+
+        def apply(x: np.ndarray, mode: str = mode, u: np.ndarray = u, w: np.ndarray = w) -> Any:
+            y = lu.solve(x - u * (w @ x), mode)
+            return y - u * (w @ y)
+
+        operator = LinearOperator((size, size), matvec=apply, dtype=np.float64)  # pyright: ignore[reportCallIssue]
+        try:
+            solve: Any = eigsh if symmetric else eigs
+            values, vectors = solve(operator, count, which="LM", v0=start)
+        except ArpackError as error:
+            raise EigenbasisError(
+                f"eigenbasis: the iteration for {count} eigenvectors of {size} points did not converge ({error}); "
+                "ask for fewer, or for more, so that the cut does not fall into a cluster"
+            ) from error
+        values = (1 / values - shift) * unit
+        order = np.argsort(np.abs(values), kind="stable")
+        found.append((values[order], vectors[:, order]))
+    return found[0], found[-1]
+
+
+def _cut(parts: list[_Part], wanted: int) -> float:
+    """A modulus with at least `wanted` eigenvalues below it, between two that differ, for right and left alike."""
+    if wanted == 0:
+        return 0.0
+    moduli = np.sort(np.concatenate([np.abs(part.right[0]) for part in parts]))
+    # What a component has beyond its largest eigenvalue found is not known.
+    known = min((np.abs(p.right[0]).max() for p in parts if not p.complete), default=np.inf)
+    above = np.append(moduli[1:], np.inf)
+    gaps = (above > moduli * (1 + GAP)) & (moduli < known)
+    gaps[: wanted - 1] = False
+    if not gaps.any():
+        raise EigenbasisError(
+            f"eigenbasis: no gap after {wanted} eigenvalues (a multiplicity of {len(moduli) - wanted} or more); "
+            "ask for a few more or fewer eigenvectors"
+        )
+    place = int(gaps.argmax())
+    return float(np.sqrt(moduli[place] * min(above[place], 4 * moduli[place])))
+
+
+def _real_span(pairs: Pairs, cut: float) -> np.ndarray:
+    """Orthonormal basis of the real span of the eigenvectors below the cut."""
+    values, vectors = pairs
+    keep = np.abs(values) <= cut
+    values, vectors = values[keep], vectors[:, keep]
+    # Of a conjugate pair the first gives the real part and the second the imaginary part.
+    columns = np.where(np.imag(values) < 0, np.imag(vectors), np.real(vectors))
+    return np.linalg.qr(columns)[0]
+
+
+Solved = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]
+
+
+def _ritz(part: _Part, cut: float) -> Solved:
+    """Rayleigh–Ritz on one component: (eigenvalues, Φ, W, rates, mixing) in its scaled coordinates, zero first."""
+    zero = part.root / linalg.norm(part.root)
+    u = _real_span(part.right, cut)
+    closed = part.null_left is not None
+    u = np.linalg.qr(u - zero[:, None] * (zero @ u))[0] if closed else u
+    h = u.T @ (part.matrix @ u)
+    values, q = linalg.eigh((h + h.T) / 2) if u.shape[1] else (np.zeros(0), np.zeros((0, 0)))
+    if (values <= 0).any():
+        raise EigenbasisError(
+            f"eigenbasis: −Δ has the eigenvalue {values.min():.3g} on a component of {len(zero)} points, where it "
+            "should be positive: the operator is not stable; build it with certify=True"
+        )
+    if not closed and u.size:
+        # π is no null vector there, and Ritz values would be off by the square of the skew part.
+        values = np.sort(np.linalg.eigvals(h).real)
+    u = u @ q
+    if u.size:
+        u *= np.sign(u[np.abs(u).argmax(0), np.arange(u.shape[1])])
+    phi, z = u, _real_span(part.left, cut)
+    if part.null_left is not None:
+        phi, z = np.column_stack([zero, u]), np.column_stack([part.null_left, z])
+        values = np.append(0.0, values)
+    if part.symmetric or phi.shape[1] == 0:
+        return values, phi, phi, np.stack([values, 0 * values]), _plain_mixing(len(values))
+    overlap = phi.T @ z if z.shape == phi.shape else np.zeros((1, 1))
+    if linalg.svdvals(overlap)[-1] < 1e-8 * linalg.svdvals(overlap)[0]:
+        raise EigenbasisError(
+            f"eigenbasis: left and right eigenvectors do not match after {phi.shape[1]} of a component of {len(zero)} "
+            "points: the cut falls into a cluster; ask for a few more or fewer"
+        )
+    w = z @ linalg.inv(overlap)
+    b = w.T @ (part.matrix @ phi)
+    if closed:
+        b[:, 0] = 0.0  # constants, exactly
+    rates, mixing = _exact_modes(b)
+    return values, phi, w, rates, mixing
+
+
+def _plain_mixing(k: int) -> np.ndarray:
+    return np.stack([np.eye(k), np.eye(k), np.zeros((k, k))])
+
+
+def _exact_modes(b: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Rates and mixing of `Eigenbasis` for a matrix B; NaN where its eigenvectors are too close to dependent.
+
+    For a pair α ± iβ with p ± iq: B[p q] = [p q](α + βJ'), so e^{−tB} turns [p q] by βt while it shrinks by e^{−αt}.
+    """
+    values, vectors = np.linalg.eig(b)
+    real, imag = np.real(values), np.imag(values)
+    first, second = np.flatnonzero(imag > 0), np.flatnonzero(imag < 0)
+    v = np.real(vectors).copy()
+    v[:, second] = np.imag(vectors)[:, first]
+    turn = np.zeros_like(b)
+    turn[first, second], turn[second, first] = -1.0, 1.0
+    if np.linalg.cond(v) > CONDITION:
+        return np.full((2, len(b)), np.nan), np.full((3, *b.shape), np.nan)
+    inverse = linalg.inv(v)
+    rates = np.stack([real, np.abs(imag)])
+    rates[0, np.abs(values) <= 1e-12 * np.abs(values).max()] = 0.0
+    return rates, np.stack([v, inverse, turn @ inverse])
+
+
+def _merged(parts: list[_Part], solved: list[Solved], pi: np.ndarray, k: int) -> Eigenbasis:
+    """The components side by side: their constants recombined so that the first is global, the rest ascending."""
+    closed_parts = np.array([part.null_left is not None for part in parts])
+    count = int(closed_parts.sum())
+    sizes = [len(s[0]) for s in solved]
+    start = np.cumsum([0, *sizes])
+    total = int(start[-1])
+    values, rates = (np.concatenate([s[i] for s in solved], axis=-1) for i in (0, 3))
+    phi, left = np.zeros((len(pi), total)), np.zeros((len(pi), total))
+    mixing = np.zeros((3, total, total))
+    for part, (_, f, w, _, m), at in zip(parts, solved, start[:-1], strict=True):
+        place = slice(at, at + f.shape[1])
+        phi[part.index, place] = f / part.root[:, None]
+        left[part.index, place] = w * part.root[:, None]
+        mixing[:, place, place] = m
+    zeros = start[:-1][closed_parts]
+    order = np.concatenate([zeros, np.setdiff1d(np.arange(total), zeros)])
+    order[count:] = order[count:][np.argsort(values[order[count:]], kind="stable")]
+    values, phi, left = values[order], phi[:, order], left[:, order]
+    v, others = mixing[0][order], mixing[1:, :, order]
+    if count:
+        closed_index = [part.index for part in parts if part.null_left is not None]
+        root = np.sqrt(np.array([pi[index].sum() for index in closed_index]))
+        t = np.linalg.qr(np.column_stack([root, np.eye(count)[:, : count - 1]]))[0]
+        t *= np.sign(t[0, 0])
+        phi[:, :count], left[:, :count] = phi[:, :count] @ t, left[:, :count] @ t
+        v[:count], others[:, :, :count] = t.T @ v[:count], others[:, :, :count] @ t
+        phi[np.concatenate(closed_index), 0] = 1 / linalg.norm(root)
+    closed: dict[str, Any] = {}
+    if count <= k and np.isfinite(mixing).all():
+        closed = {
+            "rates": torch.from_numpy(rates),
+            "mixing": torch.from_numpy(np.stack([v, *others])),
+        }
+    keep = slice(None) if count <= k else slice(k)
+    arrays = (values[keep], phi[:, keep], pi, left[:, keep])
+    tensors: Any = [torch.from_numpy(np.ascontiguousarray(x)) for x in arrays]
+    return Eigenbasis(*tensors, **closed)

@@ -1,0 +1,177 @@
+r"""What is computed from the eigenbasis: signatures, wavelets, diffusion maps, and a learned convolution.
+
+Every function takes the operator, whose basis is solved once and kept, and `k`, the number of pairs to use. A batch of
+shapes gives what its shapes give one by one.
+"""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from torchlb.errors import InputError
+from torchlb.spectral.eigenbasis import Eigenbasis, Spectral
+
+__all__ = [
+    "diffusion_distance",
+    "diffusion_map",
+    "heat_kernel_signature",
+    "spectral_wavelets",
+    "wave_kernel_signature",
+]
+
+
+def _present(basis: Eigenbasis) -> Tensor:
+    """Which pairs are those of a shape, and not padding: (k,) or (S, k)."""
+    k = torch.arange(basis.eigenvectors.shape[1], device=basis.mass.device)
+    if basis.sizes is None:
+        return k >= 0
+    return k < torch.tensor(basis.sizes, device=k.device)[:, None]
+
+
+def _first_positive(basis: Eigenbasis) -> Tensor:
+    """λ_1, the smallest eigenvalue that is not zero, (1,) or (S, 1); that of the last pair if there is none."""
+    values = basis.eigenvalues
+    positive = torch.where(values > 0, values, torch.inf).amin(-1, keepdim=True)
+    return torch.where(positive.isfinite(), positive, values.new_ones(()))
+
+
+def _log_space(start: Tensor, end: Tensor, count: int) -> Tensor:
+    """`count` points from start to end, equally spaced in the logarithm, along a new last axis."""
+    fraction = torch.linspace(0, 1, count, dtype=start.dtype, device=start.device)
+    return torch.exp(start.log() * (1 - fraction) + end.log() * fraction)
+
+
+def heat_kernel_signature(
+    lb: Spectral,
+    times: Float[Tensor, " T"] | None = None,
+    *,
+    count: int = 16,
+    k: int = 128,
+) -> Float[Tensor, "N T"]:
+    """The heat that remains where it was put: Σ_k e^{−λ_k t} φ_k(x)², 1/ℓ^d (Sun, Ovsjanikov, Guibas 2009).
+
+    Parameters
+    ----------
+    lb : operator of one shape or of a batch.
+    times : ℓ². By default `count` of them, from 4 ln 10/λ_k to 4 ln 10/λ_1 of each shape, equally spaced in log t.
+    k : number of eigenpairs.
+
+    Examples
+    --------
+    >>> from torchlb import LaplaceBeltrami
+    >>> theta = torch.arange(36, dtype=torch.float64) * torch.pi / 18
+    >>> lb = LaplaceBeltrami.from_points(torch.stack([theta.cos(), theta.sin()], dim=1))
+    >>> bool((heat_kernel_signature(lb, torch.tensor([50.0])) * lb.mass.sum()).allclose(torch.tensor(1.0).double()))
+    True
+    """
+    basis = lb.eigenbasis(k)
+    values = basis.eigenvalues
+    if times is None:
+        largest = torch.maximum(values[..., -1:], _first_positive(basis))
+        bound = 4 * math.log(10)
+        times = _log_space(bound / largest, bound / _first_positive(basis), count)
+    decay = torch.exp(-values[..., :, None] * times.to(values)[..., None, :])
+    return basis.synthesise(basis.eigenvectors**2, decay)
+
+
+def wave_kernel_signature(
+    lb: Spectral,
+    energies: Float[Tensor, " T"] | None = None,
+    *,
+    count: int = 16,
+    k: int = 128,
+    width: float = 7.0,
+) -> Float[Tensor, "N T"]:
+    """How likely a quantum particle of energy e is met at x: a band-pass signature (Aubry, Schlickewei, Cremers 2011).
+
+    Σ_k φ_k(x)² exp(−(e − ln λ_k)²/2σ²), divided by Σ_k exp(…), over λ_k > 0; 1/ℓ^d.
+
+    Parameters
+    ----------
+    energies : e, logarithms of eigenvalues in 1/ℓ². By default `count`, equally spaced from ln λ_1 + 2σ to
+        ln λ_k − 2σ of each shape, where σ is `width` times their spacing in the original: (ln λ_k − ln λ_1)/100.
+    width : of the Gaussians, in such hundredths.
+    """
+    basis = lb.eigenbasis(k)
+    values = basis.eigenvalues
+    low = _first_positive(basis).log()
+    high = torch.maximum(values[..., -1:].clamp_min(torch.finfo(values.dtype).tiny).log(), low)
+    sigma = width * (high - low) / 100 + torch.finfo(values.dtype).eps
+    if energies is None:
+        fraction = torch.linspace(0, 1, count, dtype=values.dtype, device=values.device)
+        start, end = low + 2 * sigma, high - 2 * sigma
+        energies = start * (1 - fraction) + end * fraction
+    positive = (values > 0) & _present(basis)
+    logs = torch.where(positive, values, values.new_ones(())).log()
+    exponent = (
+        -(((energies.to(values)[..., None, :] - logs[..., :, None]) / sigma[..., None]) ** 2) / 2
+    )
+    weights = torch.where(positive[..., :, None], exponent, -torch.inf).softmax(dim=-2)
+    return basis.synthesise(basis.eigenvectors**2, torch.nan_to_num(weights))
+
+
+def spectral_wavelets(
+    lb: Spectral,
+    f: Float[Tensor, "N C"],
+    scales: Float[Tensor, " T"],
+    *,
+    k: int = 128,
+) -> Float[Tensor, "N T_plus_1 C"]:
+    """Wavelet coefficients of f: one low-pass and T band-pass copies (Hammond, Vandergheynst, Gribonval 2011).
+
+    The bands are g(sλ) with g(z) = z e^{1−z}, the low-pass e^{−λ s_max}, all divided by the root of the sum of their
+    squares, so that the frame is tight: applying them again and summing gives f's part in the span of the k
+    eigenvectors, and Σ |coefficients|²_π is its energy.
+
+    Parameters
+    ----------
+    scales : s, ℓ²; a band sits at the eigenvalue 1/s.
+    """
+    basis = lb.eigenbasis(k)
+    gains = _wavelet_gains(basis.eigenvalues, scales.to(basis.eigenvalues))
+    coefficients = basis.to_basis(f)
+    parts = [basis.from_basis(g[..., None] * coefficients) for g in gains.to(f.dtype).unbind(-1)]
+    return torch.stack(parts, dim=-2)
+
+
+def _wavelet_gains(values: Tensor, scales: Tensor) -> Tensor:
+    """Gains (…, k, T + 1) of the low-pass and the bands, with Σ gain² = 1 at each eigenvalue."""
+    z = values[..., None] * scales
+    low = torch.exp(-values[..., None] * scales.max())
+    bands = torch.cat([low, z * torch.exp(1 - z)], dim=-1)
+    norm = bands.square().sum(-1, keepdim=True).sqrt()
+    # Far above all bands every gain underflows; what is there belongs to the finest band.
+    finest = torch.nn.functional.one_hot(scales.argmin() + 1, len(scales) + 1).to(values)
+    return torch.where(norm > 1e-30, bands / norm.clamp_min(1e-30), finest)
+
+
+def diffusion_map(
+    lb: Spectral, time: float, *, dim: int = 2, k: int | None = None
+) -> Float[Tensor, "N dim"]:
+    """Coordinates e^{−λ_k t} φ_k(x) in which distances are diffusion distances (Coifman, Lafon 2006); ℓ^{−d/2}.
+
+    The constants are left out: the coordinates are those of k = 1, …, dim. `k` at least dim + 1 may be given to share
+    a basis. The time is in ℓ². On a cloud of any ambient dimension this is its diffusion map.
+    """
+    basis = lb.eigenbasis(max(dim + 1, k or 0)).truncate(dim + 1)
+    decay = torch.exp(-basis.eigenvalues * time)
+    columns = torch.diag_embed(decay)[..., 1:]
+    return basis.from_basis(columns)
+
+
+def diffusion_distance(
+    lb: Spectral, sources: Int[Tensor, " S"], time: float, *, k: int = 128
+) -> Float[Tensor, "N S"]:
+    """Diffusion distance of every point to each source: (Σ_k e^{−2λ_k t}(φ_k(x) − φ_k(y))²)^{1/2}, ℓ^{−d/2}.
+
+    The distance in L² between the heat that spreads from x and from y in the time t, ℓ². Raises ValueError for a
+    batch, whose shapes have no distance from each other.
+    """
+    if lb.sizes is not None:
+        raise InputError("diffusion_distance: got a batch; ask each shape by itself")
+    coordinates = diffusion_map(lb, time, dim=min(k, lb.num_points) - 1, k=k)
+    return torch.cdist(coordinates, coordinates[sources])

@@ -1,0 +1,155 @@
+"""Rows of a sparse operator, with what is known of the stencil behind each."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass, fields
+
+import torch
+from jaxtyping import Float, Int
+from scipy import sparse
+from torch import Tensor
+
+from torchlb.fits.weights import Weights
+from torchlb.linalg.sparse import from_scipy
+
+__all__ = ["REASONS", "Rows", "matrix_rows", "stencil_rows"]
+
+REASONS = (
+    "requested order reached",
+    "too few admissible neighbours",
+    "rank below the number of polynomials",
+    "moment equations not met",
+    "weight of the centre not negative",
+    "neighbours outweigh the centre",
+    "growth beyond that of good stencils",
+    "stepped down by the certificate",
+    "points do not resolve the surface",
+)
+"""Why a row is below the requested order; its last failure there. `Rows.reason` counts in this list."""
+
+
+@dataclass(frozen=True)
+class Rows:
+    """Consecutive rows of the operator in CSR, with what is known of each.
+
+    Attributes
+    ----------
+    length : (B,), entries of each row.
+    col : (nnz,), points, ascending within a row.
+    laplacian : (nnz,), 1/ℓ².
+    gradient : (nnz, d), 1/ℓ, in the frame of the row's point.
+    hessian : (nnz, d(d+1)/2), 1/ℓ², ∂_a∂_b for a ≤ b at the origin of the tangent plane; zero in fallback rows.
+    rung : (B,), place in the ladder; the number of rungs for a fallback row.
+    order : (B,), order of accuracy p; 0 for a fallback row.
+    growth : (B,), ρ² Σ|w|, the factor of the a-priori error bound.
+    condition : (B,), of the scaled weighted Vandermonde matrix.
+    dominance : (B,), Σ_{j≠i}|w_ij| / |w_ii|; 1 for an M-matrix row.
+    reason : (B,), index into `REASONS`.
+    """
+
+    length: Int[Tensor, " B"]
+    col: Int[Tensor, " nnz"]
+    laplacian: Float[Tensor, " nnz"]
+    gradient: Float[Tensor, "nnz d"]
+    hessian: Float[Tensor, "nnz pairs"]
+    rung: Int[Tensor, " B"]
+    order: Int[Tensor, " B"]
+    growth: Float[Tensor, " B"]
+    condition: Float[Tensor, " B"]
+    dominance: Float[Tensor, " B"]
+    reason: Int[Tensor, " B"]
+
+    @property
+    def crow(self) -> Int[Tensor, " B_plus_1"]:
+        """Row pointers."""
+        return torch.cat([self.length.new_zeros(1), self.length.cumsum(0)])
+
+    def __getitem__(self, rows: Tensor) -> Rows:
+        """The given rows (a mask, or positions in any order)."""
+        rows = rows.nonzero()[:, 0] if rows.dtype == torch.bool else rows
+        length = self.length[rows]
+        first = (self.length.cumsum(0) - self.length)[rows] - (length.cumsum(0) - length)
+        entry = first.repeat_interleave(length) + torch.arange(int(length.sum()))
+        return Rows(
+            *(getattr(self, f.name)[entry if f.name in ENTRIES else rows] for f in fields(Rows))
+        )
+
+    @staticmethod
+    def stack(blocks: Iterable[Rows]) -> Rows:
+        """Blocks of rows one after the other."""
+        blocks = list(blocks)
+        return Rows(*(torch.cat([getattr(b, f.name) for b in blocks]) for f in fields(Rows)))
+
+
+ENTRIES = {"col", "laplacian", "gradient", "hessian"}
+"""The fields of `Rows` that have one value an entry; the others have one a row."""
+
+
+def stencil_rows(index: Int[Tensor, "B K"], weights: Weights, degree: int) -> Rows:
+    """A batch of stencils of one size as rows, columns ascending."""
+    batch, size = index.shape
+    col, order = index.sort(dim=1)
+    laplacian = weights.laplacian
+    center, total = laplacian[:, 0].abs(), laplacian.abs().sum(1)
+
+    def entries(values: Tensor) -> Tensor:
+        return values.take_along_dim(order[..., None], dim=1).flatten(0, 1)
+
+    return Rows(
+        length=torch.full((batch,), size),
+        col=col.flatten(),
+        laplacian=laplacian.take_along_dim(order, dim=1).flatten(),
+        gradient=entries(weights.gradient),
+        hessian=entries(weights.hessian),
+        rung=torch.zeros(batch, dtype=torch.int64),
+        order=torch.full((batch,), degree - 1),
+        growth=weights.radius.square() * total,
+        condition=weights.condition,
+        dominance=(total - center) / center,
+        reason=torch.zeros(batch, dtype=torch.int64),
+    )
+
+
+def matrix_rows(
+    matrix: sparse.csr_array,
+    points: Float[Tensor, "N n"],
+    frames: Float[Tensor, "N n d"],
+    centers: Int[Tensor, " B"],
+) -> Rows:
+    """Rows of a given strong-form matrix (B, N), with the least-squares gradient over the points of each row.
+
+    Where those all lie on a line the derivative across it is zero; the second derivatives are not estimated.
+    """
+    crow, col, laplacian = from_scipy(matrix)
+    length = crow.diff()
+    local = torch.arange(len(centers)).repeat_interleave(length)
+    offset = points[col] - points[centers[local]]
+    coords = torch.einsum("en,end->ed", offset, frames[centers[local]])
+
+    def summed(values: Tensor) -> Tensor:
+        return values.new_zeros(len(centers), *values.shape[1:]).index_add_(0, local, values)
+
+    square = summed(coords.square().sum(-1))
+    scale = square.clamp_min(torch.finfo(square.dtype).tiny)[:, None, None]
+    moment = summed(coords[:, :, None] * coords[:, None, :]) / scale
+    inverse = torch.linalg.pinv(moment, rtol=1e-9, hermitian=True) / scale
+    gradient = torch.einsum("ecd,ed->ec", inverse[local], coords)
+    on_diagonal = col == centers[local]
+    gradient[on_diagonal] -= summed(gradient)[local[on_diagonal]]
+    total = summed(laplacian.abs())
+    center = summed(laplacian.abs() * on_diagonal)
+    radius = torch.zeros_like(total).scatter_reduce_(0, local, offset.norm(dim=-1), "amax")
+    return Rows(
+        length=length,
+        col=col,
+        laplacian=laplacian,
+        gradient=gradient,
+        hessian=gradient.new_zeros(len(col), coords.shape[1] * (coords.shape[1] + 1) // 2),
+        rung=torch.zeros_like(length),
+        order=torch.zeros_like(length),
+        growth=radius.square() * total,
+        condition=torch.full_like(total, torch.nan),
+        dominance=(total - center) / center,
+        reason=torch.zeros_like(length),
+    )
