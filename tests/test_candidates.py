@@ -9,9 +9,9 @@ from torchlb.fits.polynomials import num_monomials
 from torchlb.geometry.candidates import (
     CHUNK_BYTES,
     SIZE_FACTORS,
-    Rung,
+    Candidate,
     chunks,
-    ladder_rungs,
+    list_candidates,
     walk_ladder,
 )
 from torchlb.geometry.neighbors import GraphBalls, nearest_graph, nearest_neighbors
@@ -21,9 +21,9 @@ from torchlb.surfaces import Sphere
 @pytest.mark.parametrize("dim", [1, 2, 3])
 def test_rungs_go_by_degree_then_rule_then_size(dim):
     """K = ⌈factor · M⌉ with M = C(m + d, d), for the factors of the rule."""
-    rungs = ladder_rungs(dim, [4, 3, 2], ["polyharmonic", "least_squares"])
+    rungs = list_candidates(dim, [4, 3, 2], ["polyharmonic", "least_squares"])
     expected = [
-        Rung(degree, ceil(factor * num_monomials(dim, degree) - 1e-9), rule)
+        Candidate(degree, ceil(factor * num_monomials(dim, degree) - 1e-9), rule)
         for degree in (4, 3, 2)
         for rule in ("polyharmonic", "least_squares")
         for factor in SIZE_FACTORS[rule]
@@ -33,14 +33,14 @@ def test_rungs_go_by_degree_then_rule_then_size(dim):
 
 
 def test_a_given_size_replaces_those_of_the_ladder():
-    rungs = ladder_rungs(2, [4, 3], ["polyharmonic", "least_squares"], num_neighbors=31)
+    rungs = list_candidates(2, [4, 3], ["polyharmonic", "least_squares"], num_neighbors=31)
     assert [rung.size for rung in rungs] == [31] * 4
     assert [rung.degree for rung in rungs] == [4, 4, 3, 3]
 
 
 @pytest.mark.parametrize("degree", [2, 9])
 def test_chunks_cover_all_points_within_the_bound(degree):
-    rungs = ladder_rungs(2, [degree])
+    rungs = list_candidates(2, [degree])
     parts = chunks(100_000, rungs, 2)
     assert torch.equal(torch.cat(parts), torch.arange(100_000))
     entry = 8 * max(rung.size for rung in rungs) * num_monomials(2, degree)
@@ -54,7 +54,7 @@ def balls():
     return GraphBalls(points, nearest_graph(points, frames, nearest_neighbors(points, 24)), frames)
 
 
-RUNGS = ladder_rungs(2, [2], ["least_squares"])
+RUNGS = list_candidates(2, [2], ["least_squares"])
 
 
 def walk(balls, centers, willing, start=None, rungs=RUNGS):
@@ -108,7 +108,7 @@ def test_rungs_larger_than_the_ball_are_not_tried():
     frames = Sphere().frames(points[:150]).repeat(2, 1, 1)
     graph = nearest_graph(points, frames, nearest_neighbors(points, 24))
     balls = GraphBalls(points, graph, frames)
-    rungs = [Rung(2, 200, "least_squares"), Rung(2, 12, "least_squares")]
+    rungs = [Candidate(2, 200, "least_squares"), Candidate(2, 12, "least_squares")]
     taken, tried = walk(balls, torch.arange(300), torch.zeros(300), rungs=rungs)
     assert (taken == 1).all()
     assert {number for number, _ in tried} == {1}

@@ -15,8 +15,8 @@ from torchlb.stability.certificate import check_certificate
 from torchlb.stability.enforce import certify
 from torchlb.stability.null_vector import left_null_vector
 from torchlb.stencils.assemble import Ladder, build_stencil
-from torchlb.stencils.low_order import CloudFallback
-from torchlb.stencils.shape import cloud_geometry
+from torchlb.stencils.low_order import CloudLowOrder
+from torchlb.stencils.shape import cloud_shape
 from torchlb.surfaces import Hemisphere, Sphere, StarShaped, ThreeSphere, Torus, smooth_function
 
 
@@ -191,7 +191,7 @@ def test_rows_of_last_resort_leave_no_pocket_behind():
     sides = torch.tensor([0.0, 0.0, 1.0]).double().repeat(144, 1)
     pocket = ((x - 5.5).abs() < 1) & ((y - 5.5).abs() < 3.1)
     sides[pocket.flatten()] *= -1
-    fallback = CloudFallback(GraphBalls(points, graph, frames, sides), None, surface=False)
+    fallback = CloudLowOrder(GraphBalls(points, graph, frames, sides), None, surface=False)
     count, _ = csgraph.connected_components(fallback.rows(torch.arange(144)), directed=False)
     assert int(pocket.sum()) == 12
     assert count == 1
@@ -235,7 +235,7 @@ def test_an_unstable_operator_is_told_from_a_stable_one():
 def test_only_the_rows_that_lead_into_a_sink_step_down():
     """Twelve points refer to each other alone and take all of π: everywhere else it is zero, which says nothing."""
     points = Sphere().points(800)
-    geometry = cloud_geometry(points, 2, 4)
+    geometry = cloud_shape(points, 2, 4)
     ladder = Ladder(geometry, 3)
     rows = build_stencil(ladder, progress=False)
     cap = points[:, 2].topk(12).indices

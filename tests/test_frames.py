@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from tolerances import TOLERANCE
-from torchlb.geometry.candidates import ladder_rungs
+from torchlb.geometry.candidates import list_candidates
 from torchlb.geometry.frames import (
     PROJECTIONS,
     cloud_frames,
@@ -50,7 +50,7 @@ def poor_and_balls(surface, points):
 
 def refined(surface, points, degree):
     poor, balls = poor_and_balls(surface, points)
-    rungs = ladder_rungs(surface.dim, range(degree, 0, -1))
+    rungs = list_candidates(surface.dim, range(degree, 0, -1))
     return refine_frames(points, poor, balls, torch.arange(len(points)), rungs)
 
 

@@ -13,7 +13,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from torchlb.errors import InputError
-from torchlb.geometry.candidates import ladder_rungs
+from torchlb.geometry.candidates import list_candidates
 from torchlb.geometry.frames import cloud_frames, mesh_frames, normals_of_frames, refine_frames
 from torchlb.geometry.neighbors import GraphBalls, mesh_graph, nearest_graph, nearest_neighbors
 from torchlb.geometry.voronoi import largest_gap
@@ -33,12 +33,10 @@ class Boundary:
     ----------
     mask : (N,), which points lie on the boundary.
     conormals : (N, n), unit and outward there, zero elsewhere.
-    condition : "neumann" for ∂_ν f = 0 there, "dirichlet" for f = 0.
     """
 
     mask: Bool[Tensor, " N"]
     conormals: Float[Tensor, "N n"]
-    condition: str = "neumann"
 
 
 def boundary_faces(faces: Int[Tensor, "F v"]) -> Int[Tensor, "G w"]:
@@ -119,7 +117,7 @@ def detect_boundary(
 
 
 def _refined_tangents(own: Tensor, poor: Tensor, balls: GraphBalls, degree: int) -> Tensor:
-    rungs = ladder_rungs(poor.shape[-1], range(degree, 0, -1))
+    rungs = list_candidates(poor.shape[-1], range(degree, 0, -1))
     return refine_frames(own, poor, balls, torch.arange(len(own)), rungs)[0]
 
 

@@ -13,7 +13,7 @@ from torch import Tensor
 from torchlb.fits.polynomials import num_monomials
 from torchlb.geometry.neighbors import GraphBalls
 
-__all__ = ["CHUNK_BYTES", "SIZE_FACTORS", "Rung", "chunks", "ladder_rungs", "walk_ladder"]
+__all__ = ["CHUNK_BYTES", "SIZE_FACTORS", "Candidate", "chunks", "list_candidates", "walk_ladder"]
 
 SIZE_FACTORS = {
     "least_squares": (1.6, 2.0, 2.5, 3.0, 4.0, 5.0, 7.0, 10.0),
@@ -26,7 +26,7 @@ CHUNK_BYTES = 2**28
 """Bound on one array of a chunk of points: about four of them live at once."""
 
 
-class Rung(NamedTuple):
+class Candidate(NamedTuple):
     """A candidate neighbourhood and what to do with it.
 
     Attributes
@@ -41,18 +41,18 @@ class Rung(NamedTuple):
     rule: str
 
 
-def ladder_rungs(
+def list_candidates(
     dim: int,
     degrees: Sequence[int],
     rules: Sequence[str] = ("least_squares",),
     num_neighbors: int | None = None,
-) -> list[Rung]:
+) -> list[Candidate]:
     """Candidates, best first: for each degree every rule, for each rule every size. `num_neighbors` fixes the size.
 
-    >>> [rung.size for rung in ladder_rungs(2, [2])]
+    >>> [rung.size for rung in list_candidates(2, [2])]
     [10, 12, 15, 18, 24, 30, 42, 60]
-    >>> ladder_rungs(2, [3, 2], num_neighbors=20)[1]
-    Rung(degree=2, size=20, rule='least_squares')
+    >>> list_candidates(2, [3, 2], num_neighbors=20)[1]
+    Candidate(degree=2, size=20, rule='least_squares')
     """
     rungs = []
     for degree in degrees:
@@ -60,11 +60,11 @@ def ladder_rungs(
         for rule in rules:
             sizes = [ceil(factor * count - 1e-9) for factor in SIZE_FACTORS[rule]]
             fixed = sizes if num_neighbors is None else [num_neighbors]
-            rungs += [Rung(degree, size, rule) for size in fixed]
+            rungs += [Candidate(degree, size, rule) for size in fixed]
     return rungs
 
 
-def chunks(num_points: int, rungs: Sequence[Rung], dim: int) -> tuple[Int[Tensor, " B"], ...]:
+def chunks(num_points: int, rungs: Sequence[Candidate], dim: int) -> tuple[Int[Tensor, " B"], ...]:
     """Consecutive centres, so many at a time that one (B, K, M) array stays below `CHUNK_BYTES`."""
     size = max(rung.size for rung in rungs)
     columns = num_monomials(dim, rungs[0].degree)
@@ -74,8 +74,8 @@ def chunks(num_points: int, rungs: Sequence[Rung], dim: int) -> tuple[Int[Tensor
 def walk_ladder(
     balls: GraphBalls,
     centers: Int[Tensor, " B"],
-    rungs: Sequence[Rung],
-    attempt: Callable[[Tensor, Tensor, Rung], tuple[Tensor, Any]],
+    rungs: Sequence[Candidate],
+    attempt: Callable[[Tensor, Tensor, Candidate], tuple[Tensor, Any]],
     start: Int[Tensor, " B"] | None = None,
 ) -> Iterator[tuple[int, Tensor, Any]]:
     """Let every centre take the first rung that passes.

@@ -12,7 +12,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from torchlb.fits.weights import least_squares_weights, window
-from torchlb.geometry.candidates import Rung, walk_ladder
+from torchlb.geometry.candidates import Candidate, walk_ladder
 from torchlb.geometry.neighbors import MIN_ALIGNMENT, GraphBalls, admissible
 
 __all__ = [
@@ -90,7 +90,7 @@ def refine_frames(
     poor: Float[Tensor, "N n d"],
     balls: GraphBalls,
     centers: Int[Tensor, " B"],
-    rungs: list[Rung],
+    rungs: list[Candidate],
 ) -> tuple[Float[Tensor, "B n d"], Int[Tensor, " B"]]:
     """Frames of order q at `centers`, by fits of degree q to the heights over the poor ones.
 
@@ -102,7 +102,7 @@ def refine_frames(
     order : (B,), the degree that was reached; 0 where the poor frame stayed.
     """
 
-    def attempt(rows: Tensor, index: Tensor, rung: Rung) -> tuple[Tensor, Tensor]:
+    def attempt(rows: Tensor, index: Tensor, rung: Candidate) -> tuple[Tensor, Tensor]:
         frame = poor[rows]
         offset = points[index[:, 1:]] - points[rows, None]
         coords = offset @ frame

@@ -25,12 +25,12 @@ from torchlb.operator.checks import (
 from torchlb.stability.certificate import Certificate
 from torchlb.stability.enforce import certify
 from torchlb.stencils.assemble import Ladder, build_stencil
+from torchlb.stencils.conditions import CONDITIONS
 from torchlb.stencils.rows import Rows, matrix_rows
-from torchlb.stencils.shape import Geometry, cloud_geometry, mesh_geometry
+from torchlb.stencils.shape import Shape, cloud_shape, mesh_shape
 
 __all__ = ["Built", "Options", "build_cloud", "build_cotangent", "build_mesh"]
 
-CONDITIONS = ["neumann", "dirichlet"]
 WEIGHTS = ["least_squares", "polyharmonic"]
 
 
@@ -69,7 +69,7 @@ class Built:
     """A finished operator; `geometry.areas` is its mass, and `certificate` is None where none was asked for."""
 
     rows: Rows
-    geometry: Geometry
+    geometry: Shape
     kind: str
     options: dict[str, Any]
     certificate: Certificate | None
@@ -93,19 +93,19 @@ def build_cloud(
     options.check(len(points), ambient, d)
     check_distinct(points)
     if condition not in CONDITIONS:
-        raise InputError(f"condition: expected one of {CONDITIONS}, got {condition!r}")
+        raise InputError(f"condition: expected one of {list(CONDITIONS)}, got {condition!r}")
     if normals is not None:
         if d != ambient - 1:
             raise InputError(f"normals: only hypersurfaces have them, not dim={d} in R^{ambient}")
         normals = check_normals(normals, points)
-    geometry = cloud_geometry(
+    geometry = cloud_shape(
         points,
         d,
         options.q,
         num_neighbors=options.num_neighbors,
         normals=normals,
         boundary=check_boundary(boundary, len(points)),
-        condition=condition,
+        condition=CONDITIONS[condition],
         progress=progress,
     )
     built = _finished(geometry, "points", options, progress)
@@ -128,13 +128,13 @@ def build_mesh(
     options.check(len(vertices), vertices.shape[1], faces.shape[1] - 1)
     warn_of_coincident(vertices)
     if boundary not in (*CONDITIONS, None):
-        raise InputError(f"boundary: expected one of {CONDITIONS} or None, got {boundary!r}")
-    geometry = mesh_geometry(
+        raise InputError(f"boundary: expected one of {list(CONDITIONS)} or None, got {boundary!r}")
+    geometry = mesh_shape(
         vertices,
         faces,
         options.q,
         num_neighbors=options.num_neighbors,
-        boundary=boundary,
+        condition=None if boundary is None else CONDITIONS[boundary],
         progress=progress,
     )
     return _finished(geometry, "mesh", options, progress)
@@ -148,13 +148,13 @@ def build_cotangent(vertices: Any, faces: Any) -> Built:
     if faces.shape[1] != 3:
         raise InputError(f"faces: the cotangent operator needs triangles, got {tuple(faces.shape)}")
     matrix, mass = cotangent_laplacian(vertices, faces)
-    geometry = mesh_geometry(vertices, faces, 0, boundary=None)
+    geometry = mesh_shape(vertices, faces, 0, condition=None, areas=mass)
     everything: Tensor = torch.arange(len(vertices))
     rows = matrix_rows(matrix, geometry.points, geometry.frames, everything)
-    return Built(rows, replace(geometry, areas=mass), "cotangent", {}, None)
+    return Built(rows, geometry, "cotangent", {}, None)
 
 
-def _finished(geometry: Geometry, kind: str, options: Options, progress: bool) -> Built:
+def _finished(geometry: Shape, kind: str, options: Options, progress: bool) -> Built:
     """Rows from the ladder, certified if asked for."""
     ladder = Ladder(
         geometry,

@@ -9,7 +9,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from torchlb.fits.rules import typical_growth
-from torchlb.stencils.rows import REASONS, Rows
+from torchlb.stencils.rows import Reason, Rows
 
 __all__ = ["StencilReport"]
 
@@ -27,8 +27,9 @@ class StencilReport:
     num_neighbors : (N,), points of the stencil, itself included.
     growth : (N,), ρ² Σ|w|: the factor of the a-priori error bound.
     condition : (N,), of the scaled weighted Vandermonde matrix; NaN in a fallback row.
-    dominance : (N,), Σ_{j≠i}|w_ij| / |w_ii|; 1 for an M-matrix row.
-    reason : (N,), why the row is below the requested order, an index into `REASONS`.
+    off_diagonal_ratio : (N,), Σ_{j≠i}|w_ij| / |w_ii|; 1 for an M-matrix row.
+    rule : (N,), place of the rule for the weights in `WEIGHT_RULES`; their number for a low-order row.
+    reason : (N,), why the row is below the requested order, a `Reason`.
     """
 
     requested_order: int
@@ -38,7 +39,8 @@ class StencilReport:
     num_neighbors: Int[Tensor, " N"]
     growth: Float[Tensor, " N"]
     condition: Float[Tensor, " N"]
-    dominance: Float[Tensor, " N"]
+    off_diagonal_ratio: Float[Tensor, " N"]
+    rule: Int[Tensor, " N"]
     reason: Int[Tensor, " N"]
 
     @staticmethod
@@ -52,7 +54,8 @@ class StencilReport:
             rows.length,
             rows.growth,
             rows.condition,
-            rows.dominance,
+            rows.off_diagonal_ratio,
+            rows.rule,
             rows.reason,
         )
 
@@ -65,8 +68,8 @@ class StencilReport:
     @property
     def reason_counts(self) -> dict[str, int]:
         """Number of points below the requested order, by reason."""
-        counts = torch.bincount(self.reason, minlength=len(REASONS)).tolist()
-        return {text: count for text, count in zip(REASONS[1:], counts[1:], strict=True) if count}
+        counts = torch.bincount(self.reason, minlength=len(Reason)).tolist()
+        return {reason.text: counts[reason] for reason in Reason if reason and counts[reason]}
 
     def __str__(self) -> str:
         """Summary of a screenful."""
@@ -82,7 +85,7 @@ class StencilReport:
         stencil = self.order > 0
         if stencil.any():
             lines.append("stencils                      median      95 %       max")
-            for name in ("num_neighbors", "growth", "condition", "dominance"):
+            for name in ("num_neighbors", "growth", "condition", "off_diagonal_ratio"):
                 values = getattr(self, name)[stencil].double().sort().values
                 middle, high = values[len(values) // 2], values[int(0.95 * (len(values) - 1))]
                 lines.append(f"  {name:<22}{middle:12.4g}{high:10.4g}{values[-1]:10.4g}")

@@ -20,7 +20,8 @@ REPORT_FIELDS = (
     "num_neighbors",
     "growth",
     "condition",
-    "dominance",
+    "off_diagonal_ratio",
+    "rule",
     "reason",
 )
 BUFFERS = ("crow", "col", "values", "gradient_values", "mass", "points", "frames", "normals")
@@ -59,7 +60,7 @@ class OperatorStorage(nn.Module):
             self.register_buffer(name, torch.zeros(0))
         self.crow, self.col = torch.zeros(1, dtype=torch.int64), torch.zeros(0, dtype=torch.int64)
         for name in REPORT_FIELDS:
-            real = name in ("growth", "condition", "dominance")
+            real = name in ("growth", "condition", "off_diagonal_ratio")
             empty = torch.zeros(0, dtype=torch.get_default_dtype() if real else torch.int64)
             self.register_buffer(f"report_{name}", empty)
         for name in ("crow_t", "col_t", "order_t"):  # of the transpose, for the backward pass

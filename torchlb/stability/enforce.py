@@ -18,7 +18,7 @@ from torchlb.linalg.krylov import prefers_krylov
 from torchlb.linalg.sparse import to_scipy
 from torchlb.stability.certificate import FEED_SHARE, Certificate, check_certificate
 from torchlb.stencils.assemble import Ladder
-from torchlb.stencils.rows import REASONS, Rows
+from torchlb.stencils.rows import Reason, Rows
 
 __all__ = ["certify"]
 MARGIN = 0.02
@@ -27,9 +27,8 @@ MAX_ROUNDS = 80
 PATIENCE = 20
 """Rounds after which rows step down to the bottom at once; twice as many beyond `krylov.LARGEST_FACTORED` points."""
 SINGLE_STEPS = 4
-"""Times that a row steps down by one rung; from then on its way doubles with every second time."""
+"""Times that a row steps down by one candidate; from then on its way doubles with every second time."""
 WEIGHT_SHARE = 0.1
-STEPPED_DOWN = REASONS.index("stepped down by the certificate")
 
 
 def certify(
@@ -44,22 +43,22 @@ def certify(
     certificate : what was reached; a `StabilityWarning` is issued if it does not hold.
     """
     count = len(areas)
-    first = rows.rung.clone()
+    first = rows.candidate.clone()
     steps = torch.zeros(count, dtype=torch.int64)
-    rounds, bottom = 0, len(ladder.rungs)
+    rounds, bottom = 0, len(ladder.candidates)
     patience = 2 * PATIENCE if prefers_krylov(count) else PATIENCE
     with tqdm(desc="certificate", delay=2, disable=not progress, leave=False) as bar:
         while True:
             bar.update()
             matrix = to_scipy(rows.crow, rows.col, rows.laplacian, (count, count))
-            free = rows.rung < bottom
+            free = rows.candidate < bottom
             astray = _into_sinks(matrix)
             astray = astray[free[astray]]
             if len(astray) > 0 and rounds < MAX_ROUNDS:
                 rounds += 1
                 rows = _step_down(ladder, rows, astray, torch.full_like(astray, bottom))
                 continue
-            stepped = int((rows.rung > first).sum())
+            stepped = int((rows.candidate > first).sum())
             mass, result, feed = check_certificate(matrix, areas, rounds, stepped)
             bar.set_postfix_str(f"min π {result.min_pi:.2g}, {stepped} rows down", refresh=False)
             blamed = _responsible(matrix, mass / areas, feed, free)
@@ -152,15 +151,15 @@ def _way_down(steps: Int[Tensor, " J"]) -> Int[Tensor, " J"]:
 
 
 def _step_down(ladder: Ladder, rows: Rows, movable: Tensor, start: Tensor) -> Rows:
-    """Rebuild the given rows from rung `start` on, one rung lower at least."""
-    start = torch.maximum(rows.rung[movable] + 1, start).clamp_max(len(ladder.rungs))
+    """Rebuild the given rows from candidate `start` on, one candidate lower at least."""
+    start = torch.maximum(rows.candidate[movable] + 1, start).clamp_max(len(ladder.candidates))
     rebuilt = ladder.rows(movable, start)
-    top = ladder.rungs[0].degree - 1
-    reason = torch.where(rebuilt.order < top, STEPPED_DOWN, 0)
+    top = ladder.candidates[0].degree - 1
+    reason = torch.where(rebuilt.order < top, Reason.STABILITY, 0)
     kept = rebuilt.hessian[:, : rows.hessian.shape[1]]
     rebuilt = replace(rebuilt, reason=reason, hessian=kept)
-    place = torch.arange(len(rows.rung))
-    place[movable] = len(rows.rung) + torch.arange(len(movable))
+    place = torch.arange(len(rows.candidate))
+    place[movable] = len(rows.candidate) + torch.arange(len(movable))
     return Rows.stack([rows, rebuilt])[place]
 
 

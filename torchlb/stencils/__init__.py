@@ -1,6 +1,6 @@
 """From a shape to the rows of Δ and ∇: every point takes the first stencil that passes (`method.md`, section 4).
 
-`rows`: rows of a sparse operator, with what is known of each. `low_order`: the rows of points without a stencil.
-`shape`: points, frames, graph, areas and boundary, all that a stencil needs. `acceptance`: the local tests.
-`assemble`: candidates to weights to rows.
+`rows`: rows of a sparse operator, with what is known of each. `conditions`: what holds at the boundary. `low_order`:
+the rows of points without a stencil. `shape`: points, frames, neighbourhoods, areas, boundary. `acceptance`: the
+local tests. `assemble`: candidates to weights to rows.
 """

@@ -19,8 +19,6 @@ MAX_DOMINANCE_AT_BOUNDARY = 6.0
 """One-sided stencils have larger weights, and wide ones would be balanced but poor: a lower order is better there."""
 MAX_SIZE_AT_BOUNDARY = 2.5
 """Points of a stencil per polynomial that holds points of the boundary."""
-CLOSEST = 0.1
-"""Share of the farthest distance in its row that a boundary point's own scale has at least: near pairs are stiff."""
 MAX_RESIDUAL = 1e-10
 MAX_MISFIT = 0.07
 MAX_MISFIT_ON_MESH = 0.03

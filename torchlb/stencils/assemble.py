@@ -20,11 +20,9 @@ from torchlb.errors import StencilError
 from torchlb.fits.polynomials import num_monomials
 from torchlb.fits.rules import WEIGHT_RULES, typical_growth
 from torchlb.fits.weights import Weights, least_squares_weights, positive_weights
-from torchlb.geometry.candidates import Rung, chunks, ladder_rungs, walk_ladder
+from torchlb.geometry.candidates import Candidate, chunks, list_candidates, walk_ladder
 from torchlb.geometry.frames import local_heights, local_offsets
-from torchlb.geometry.neighbors import GraphBalls
 from torchlb.stencils.acceptance import (
-    CLOSEST,
     DEGREE_OF_MISFIT,
     HOPELESS,
     MAX_DOMINANCE,
@@ -41,9 +39,8 @@ from torchlb.stencils.acceptance import (
     WIDE_ON_MESH,
     first_failure,
 )
-from torchlb.stencils.low_order import MeshFallback
 from torchlb.stencils.rows import Rows, matrix_rows, stencil_rows
-from torchlb.stencils.shape import Geometry
+from torchlb.stencils.shape import Shape
 
 __all__ = ["Ladder", "build_stencil"]
 
@@ -53,7 +50,7 @@ class Ladder:
 
     Parameters
     ----------
-    geometry : points, frames, graph and fallback rows.
+    shape : points, frames, neighbourhoods, boundary and low-order rows.
     order : p ≥ 1 of the first rungs.
     projection, weights : keys of `PROJECTIONS` and `WEIGHT_RULES`.
     num_neighbors : K of every rung, instead of `SIZE_FACTORS`.
@@ -61,27 +58,25 @@ class Ladder:
 
     def __init__(
         self,
-        geometry: Geometry,
+        shape: Shape,
         order: int,
         *,
         projection: str = "tangent",
         weights: str = "least_squares",
         num_neighbors: int | None = None,
     ) -> None:
-        self.points, self.frames = geometry.points, geometry.frames
-        self.fallback, self.boundary = geometry.fallback, geometry.boundary
-        self.balls = GraphBalls(geometry.points, geometry.graph, geometry.frames, geometry.sides)
+        self.shape, self.points, self.frames = shape, shape.points, shape.frames
+        self.boundary, self.balls, self.on_mesh = shape.boundary, shape.balls, shape.on_mesh
         self.projection, self.fixed_size = projection, num_neighbors is not None
-        self.on_mesh = isinstance(geometry.fallback, MeshFallback)
         dim = self.frames.shape[-1]
         rules = [weights] if weights == "least_squares" else [weights, "least_squares"]
         # Rows of an even order are no better on evenly spread points than those of the odd order below, and rows of
         # order 1 no better on a mesh than its triangles.
         lowest = 4 if self.on_mesh else 2
         degrees = [order + 1, *range(order // 2 * 2, lowest - 1, -2)]
-        self.rungs = ladder_rungs(dim, degrees, rules, num_neighbors)
+        self.candidates = list_candidates(dim, degrees, rules, num_neighbors)
         if order == 1 or not self.on_mesh:
-            self.rungs += ladder_rungs(dim, [2], ["positive"], num_neighbors)
+            self.candidates += list_candidates(dim, [2], ["positive"], num_neighbors)
 
     def rows(self, centers: Int[Tensor, " B"], start: Int[Tensor, " B"] | None = None) -> Rows:
         """Rows of `centers`, each at the first rung (from `start` on) that passes, else the fallback row."""
@@ -90,21 +85,26 @@ class Ladder:
         place = torch.empty(len(self.points), dtype=torch.int64)
         place[centers] = torch.arange(len(centers))
         start = torch.zeros_like(centers) if start is None else start.clone()
-        top = self.rungs[0].degree
-        lower = [sum(other.degree >= rung.degree for other in self.rungs) for rung in self.rungs]
+        top = self.candidates[0].degree
+        lower = [
+            sum(other.degree >= rung.degree for other in self.candidates)
+            for rung in self.candidates
+        ]
 
-        def attempt(rows: Tensor, index: Tensor, rung: Rung) -> tuple[Tensor, Rows]:
+        def attempt(rows: Tensor, index: Tensor, rung: Candidate) -> tuple[Tensor, Rows]:
             weights = self._weights(rows, index, rung)
             max_misfit, hopeless = self._misfits(rung)
             failure = first_failure(weights, *self._limits(index, rung), max_misfit)
             if rung.degree == top and rung.rule != "positive":
                 reason[place[rows]] = failure
             unresolved = rows[weights.misfit > hopeless]
-            start[place[unresolved]] = lower[self.rungs.index(rung)]
-            return failure == 0, stencil_rows(index, weights, rung.degree)
+            start[place[unresolved]] = lower[self.candidates.index(rung)]
+            return failure == 0, stencil_rows(index, weights, rung.degree, rung.rule)
 
-        for number, rows, block in walk_ladder(self.balls, centers, self.rungs, attempt, start):
-            block.rung[:] = number
+        for number, rows, block in walk_ladder(
+            self.balls, centers, self.candidates, attempt, start
+        ):
+            block.candidate[:] = number
             blocks.append(block)
             taken.append(rows)
         left = torch.ones(len(centers), dtype=torch.bool)
@@ -113,33 +113,14 @@ class Ladder:
             blocks.append(self._fallback_rows(centers[left]))
             taken.append(left.nonzero()[:, 0])
         rows = Rows.stack(blocks)[torch.cat(taken).argsort()]
-        if self.boundary is not None and self.boundary.condition == "dirichlet":
-            rows = replace(rows, laplacian=self._without_boundary(centers, rows))
+        if self.boundary is not None:
+            rows = self.shape.condition.finish(self.points, self.boundary, centers, rows)
         return replace(rows, reason=torch.where(rows.order < top - 1, reason, rows.reason))
 
-    def _without_boundary(self, centers: Tensor, rows: Rows) -> Float[Tensor, " nnz"]:
-        """Entries of Δ for f = 0 on the boundary: none joins a boundary point to another point.
-
-        A boundary point has −4d/h² for itself, as a grid's fastest wave, h its distance to the nearest point, but at
-        least `CLOSEST` of that to the farthest in its row.
-        """
-        assert self.boundary is not None
-        mask, dim = self.boundary.mask, self.frames.shape[-1]
-        local = torch.arange(len(centers)).repeat_interleave(rows.length)
-        row, col = centers[local], rows.col
-        square = (self.points[col] - self.points[row]).square().sum(1)
-        farthest = square.new_zeros(len(centers)).scatter_reduce(0, local, square, "amax")
-        square = torch.where(row == col, torch.inf, square)
-        nearest = farthest.scatter_reduce(0, local, square, "amin")
-        nearest = nearest.maximum(CLOSEST**2 * farthest)
-        nearest = torch.where(nearest > 0, nearest, 1.0)  # a row of coincident points has no scale
-        kept = torch.where(mask[row] | mask[col], 0.0, rows.laplacian)
-        return torch.where(mask[row] & (row == col), -4 * dim / nearest[local], kept)
-
-    def _weights(self, centers: Tensor, index: Tensor, rung: Rung) -> Weights:
+    def _weights(self, centers: Tensor, index: Tensor, rung: Candidate) -> Weights:
         """Weights of a batch; stencils that hold boundary points use the Neumann data there, if they have some."""
         touching = torch.zeros(len(centers), dtype=torch.bool)
-        if self.boundary is not None and self.boundary.condition == "neumann":
+        if self.boundary is not None and self.shape.condition.share is not None:
             touching = self.boundary.mask[index].any(1)
         parts = []
         if not touching.all():
@@ -163,12 +144,12 @@ class Ladder:
             coords = local_offsets(self.points, self.frames, centers, neighbors, "tangent")
         return local_heights(self.points, self.frames, centers, neighbors, coords)
 
-    def _widened(self, rung: Rung, factor: float) -> bool:
+    def _widened(self, rung: Candidate, factor: float) -> bool:
         """Whether the ladder, not the user, has come to more than `factor` points per polynomial."""
         size = ceil(factor * num_monomials(self.frames.shape[-1], rung.degree))
         return rung.size > size and not self.fixed_size
 
-    def _misfits(self, rung: Rung) -> tuple[float, float]:
+    def _misfits(self, rung: Candidate) -> tuple[float, float]:
         """Bounds on the misfit: of this rung, and of all rungs of its degree."""
         if not self.on_mesh:
             hopeless = MAX_MISFIT * HOPELESS
@@ -179,7 +160,9 @@ class Ladder:
         bound = MAX_MISFIT_ON_MESH * min(1.0, growth) * (1.0 if straight else MISFIT_OF_NORMALS)
         return bound * (MISFIT_OF_WIDE if self._widened(rung, WIDE_ON_MESH) else 1.0), bound
 
-    def _limits(self, index: Tensor, rung: Rung) -> tuple[Float[Tensor, " B"], Float[Tensor, " B"]]:
+    def _limits(
+        self, index: Tensor, rung: Candidate
+    ) -> tuple[Float[Tensor, " B"], Float[Tensor, " B"]]:
         """Bounds on growth and dominance; none passes where points of the boundary make a wide stencil lopsided."""
         dim = self.frames.shape[-1]
         largest = MAX_GROWTH_OF_SPLINES if rung.rule == "polyharmonic" else MAX_GROWTH
@@ -192,7 +175,7 @@ class Ladder:
             dominance[touching] = MAX_DOMINANCE_AT_BOUNDARY
         return growth * typical_growth(dim, rung.degree), dominance
 
-    def _neumann_weights(self, centers: Tensor, index: Tensor, rung: Rung) -> Weights:
+    def _neumann_weights(self, centers: Tensor, index: Tensor, rung: Candidate) -> Weights:
         """Second derivatives that use ∂_ν f = 0; first derivatives that do not, since they serve any f.
 
         By straight projection, where the derivative along a conormal is its component in the plane. Splines have no
@@ -210,15 +193,16 @@ class Ladder:
         return replace(weights, gradient=gradient, misfit=free.misfit)
 
     def _fallback_rows(self, centers: Int[Tensor, " B"]) -> Rows:
-        matrix = self.fallback.rows(centers)
+        assert self.shape.low_order is not None
+        matrix = self.shape.low_order.rows(centers)
         rows = matrix_rows(matrix, self.points, self.frames, centers)
-        rows.rung[:] = len(self.rungs)
-        bad = centers[~rows.dominance.isfinite()]
+        rows.candidate[:] = len(self.candidates)
+        bad = centers[~rows.off_diagonal_ratio.isfinite()]
         if len(bad):
             names = ", ".join(map(str, bad[:8].tolist())) + (", …" if len(bad) > 8 else "")
             raise StencilError(
-                f"{len(bad)} points have neither a stencil after {len(self.rungs)} tries nor a fallback row: {names}. "
-                "Nothing admissible lies around them; remove them, or merge them with their neighbours"
+                f"{len(bad)} points have neither a stencil after {len(self.candidates)} tries nor a fallback row: "
+                f"{names}. Nothing admissible lies around them; remove them, or merge them with their neighbours"
             )
         return rows
 
@@ -229,7 +213,7 @@ def build_stencil(ladder: Ladder, *, hessian: bool = False, progress: bool = Tru
     Memory beyond the result: about 1 GB whatever N (`ladder.CHUNK_BYTES`). The result takes 16 + 8 d bytes an entry.
     """
     blocks = []
-    parts = chunks(len(ladder.points), ladder.rungs, ladder.frames.shape[-1])
+    parts = chunks(len(ladder.points), ladder.candidates, ladder.frames.shape[-1])
     for centers in tqdm(parts, "stencils", delay=2, disable=not progress, leave=False):
         rows = ladder.rows(centers)
         blocks.append(rows if hessian else replace(rows, hessian=rows.hessian[:, :0]))

@@ -21,7 +21,7 @@ from torchlb.geometry.boundary import Boundary
 from torchlb.geometry.neighbors import GraphBalls, nearest_neighbors
 from torchlb.geometry.voronoi import cell_laplacian, cell_volume
 
-__all__ = ["CloudFallback", "MeshFallback"]
+__all__ = ["CloudLowOrder", "MeshLowOrder"]
 
 ISLAND_REACH = 2
 """How much farther a point on an island looks than the few nearest."""
@@ -29,7 +29,7 @@ MAX_HOPS = 3
 """Neighbours of a row of robust_laplacian farther than this along the graph lie across a gap."""
 
 
-class MeshFallback:
+class MeshLowOrder:
     """Rows and areas of robust_laplacian on a triangle mesh."""
 
     def __init__(self, vertices: Float[Tensor, "N n"], faces: Int[Tensor, "F 3"]) -> None:
@@ -44,7 +44,7 @@ class MeshFallback:
         return sparse.csr_array(self._matrix[centers.numpy()])
 
 
-class CloudFallback:
+class CloudLowOrder:
     """Finite-volume rows and cell volumes of a cloud in any dimension.
 
     Parameters

@@ -4,29 +4,40 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass, fields
+from enum import IntEnum
 
 import torch
 from jaxtyping import Float, Int
 from scipy import sparse
 from torch import Tensor
 
+from torchlb.fits.rules import WEIGHT_RULES
 from torchlb.fits.weights import Weights
 from torchlb.linalg.sparse import from_scipy
 
-__all__ = ["REASONS", "Rows", "matrix_rows", "stencil_rows"]
+__all__ = ["Reason", "Rows", "matrix_rows", "stencil_rows"]
 
-REASONS = (
-    "requested order reached",
-    "too few admissible neighbours",
-    "rank below the number of polynomials",
-    "moment equations not met",
-    "weight of the centre not negative",
-    "neighbours outweigh the centre",
-    "growth beyond that of good stencils",
-    "stepped down by the certificate",
-    "points do not resolve the surface",
-)
-"""Why a row is below the requested order; its last failure there. `Rows.reason` counts in this list."""
+
+class Reason(IntEnum):
+    """Why a row is below the requested order: the last test that it failed there; `text` says it in words."""
+
+    text: str
+
+    def __new__(cls, value: int, text: str) -> Reason:
+        """Give the number a sentence."""
+        reason = int.__new__(cls, value)
+        reason._value_, reason.text = value, text
+        return reason
+
+    REACHED = 0, "requested order reached"
+    FEW = 1, "too few admissible neighbours"
+    RANK = 2, "rank below the number of polynomials"
+    MOMENTS = 3, "moment equations not met"
+    CENTER = 4, "weight of the centre not negative"
+    RATIO = 5, "neighbours outweigh the centre"
+    GROWTH = 6, "growth beyond that of good stencils"
+    STABILITY = 7, "lowered by the certificate"
+    UNRESOLVED = 8, "points do not resolve the surface"
 
 
 @dataclass(frozen=True)
@@ -39,13 +50,13 @@ class Rows:
     col : (nnz,), points, ascending within a row.
     laplacian : (nnz,), 1/ℓ².
     gradient : (nnz, d), 1/ℓ, in the frame of the row's point.
-    hessian : (nnz, d(d+1)/2), 1/ℓ², ∂_a∂_b for a ≤ b at the origin of the tangent plane; zero in fallback rows.
-    rung : (B,), place in the ladder; the number of rungs for a fallback row.
+    hessian : (nnz, d(d+1)/2), 1/ℓ², ∂_a∂_b for a ≤ b at the origin of the tangent plane; zero in low-order rows.
+    candidate : (B,), place in the ladder; the number of rungs for a fallback row.
     order : (B,), order of accuracy p; 0 for a fallback row.
     growth : (B,), ρ² Σ|w|, the factor of the a-priori error bound.
     condition : (B,), of the scaled weighted Vandermonde matrix.
-    dominance : (B,), Σ_{j≠i}|w_ij| / |w_ii|; 1 for an M-matrix row.
-    reason : (B,), index into `REASONS`.
+    off_diagonal_ratio : (B,), Σ_{j≠i}|w_ij| / |w_ii|; 1 for an M-matrix row.
+    reason : (B,), a `Reason`.
     """
 
     length: Int[Tensor, " B"]
@@ -53,11 +64,12 @@ class Rows:
     laplacian: Float[Tensor, " nnz"]
     gradient: Float[Tensor, "nnz d"]
     hessian: Float[Tensor, "nnz pairs"]
-    rung: Int[Tensor, " B"]
+    candidate: Int[Tensor, " B"]
+    rule: Int[Tensor, " B"]
     order: Int[Tensor, " B"]
     growth: Float[Tensor, " B"]
     condition: Float[Tensor, " B"]
-    dominance: Float[Tensor, " B"]
+    off_diagonal_ratio: Float[Tensor, " B"]
     reason: Int[Tensor, " B"]
 
     @property
@@ -86,7 +98,7 @@ ENTRIES = {"col", "laplacian", "gradient", "hessian"}
 """The fields of `Rows` that have one value an entry; the others have one a row."""
 
 
-def stencil_rows(index: Int[Tensor, "B K"], weights: Weights, degree: int) -> Rows:
+def stencil_rows(index: Int[Tensor, "B K"], weights: Weights, degree: int, rule: str) -> Rows:
     """A batch of stencils of one size as rows, columns ascending."""
     batch, size = index.shape
     col, order = index.sort(dim=1)
@@ -102,11 +114,12 @@ def stencil_rows(index: Int[Tensor, "B K"], weights: Weights, degree: int) -> Ro
         laplacian=laplacian.take_along_dim(order, dim=1).flatten(),
         gradient=entries(weights.gradient),
         hessian=entries(weights.hessian),
-        rung=torch.zeros(batch, dtype=torch.int64),
+        candidate=torch.zeros(batch, dtype=torch.int64),
+        rule=torch.full((batch,), list(WEIGHT_RULES).index(rule)),
         order=torch.full((batch,), degree - 1),
         growth=weights.radius.square() * total,
         condition=weights.condition,
-        dominance=(total - center) / center,
+        off_diagonal_ratio=(total - center) / center,
         reason=torch.zeros(batch, dtype=torch.int64),
     )
 
@@ -146,10 +159,11 @@ def matrix_rows(
         laplacian=laplacian,
         gradient=gradient,
         hessian=gradient.new_zeros(len(col), coords.shape[1] * (coords.shape[1] + 1) // 2),
-        rung=torch.zeros_like(length),
+        candidate=torch.zeros_like(length),
+        rule=torch.full_like(length, len(WEIGHT_RULES)),
         order=torch.zeros_like(length),
         growth=radius.square() * total,
         condition=torch.full_like(total, torch.nan),
-        dominance=(total - center) / center,
+        off_diagonal_ratio=(total - center) / center,
         reason=torch.zeros_like(length),
     )

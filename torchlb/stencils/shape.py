@@ -1,17 +1,17 @@
-"""What a ladder needs to know of a shape: points, graph, tangent frames, areas and the rows of last resort."""
+"""What stencils need to know of a shape: points, frames, neighbourhoods, boundary, areas and low-order rows."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import torch
 from jaxtyping import Bool, Float, Int
-from scipy import sparse
 from torch import Tensor
 from tqdm import tqdm
 
+from torchlb.errors import InputError
 from torchlb.geometry.boundary import Boundary, boundary_of_cloud, boundary_of_mesh, detect_boundary
-from torchlb.geometry.candidates import chunks, ladder_rungs
+from torchlb.geometry.candidates import chunks, list_candidates
 from torchlb.geometry.frames import (
     cloud_frames,
     complete_frames,
@@ -27,16 +27,18 @@ from torchlb.geometry.orientation import (
     orient_normals,
     thin_sides,
 )
-from torchlb.stencils.low_order import CloudFallback, MeshFallback
+from torchlb.stencils.conditions import Condition, Neumann
+from torchlb.stencils.low_order import CloudLowOrder, MeshLowOrder
 
-__all__ = ["Geometry", "cloud_geometry", "mesh_geometry"]
+__all__ = ["Shape", "cloud_shape", "mesh_shape"]
 
+NEUMANN = Neumann()
 CANDIDATES = {1: 12, 2: 24, 3: 64}
 """Nearest points from which the frames and the graph of a cloud start, by dimension."""
 
 
 @dataclass(frozen=True)
-class Geometry:
+class Shape:
     """A shape ready for stencils.
 
     Attributes
@@ -44,26 +46,31 @@ class Geometry:
     points : (N, n), ℓ, float64.
     frames : (N, n, d), orthonormal; [frames, normal] is right-handed where there is a normal.
     normals : (N, n) unit normals of a hypersurface, else None. Oriented by the faces, or consistently on a cloud.
-    normal_order : (N,), the degree q of the fit behind each frame; 0 for a frame that stayed poor.
-    sides : (N, n), those normals where the shape is thin, zero elsewhere, see `thin_sides`; None without normals.
-    graph : (N, N) adjacency whose balls are the neighbourhoods.
+    normal_order : (N,), the degree q of the fit behind each frame; 0 for a frame that stayed the initial one.
+    balls : its neighbourhoods.
     areas : (N,), ℓ^d, positive: a first-order share of the area.
-    fallback : M-matrix rows for points without a stencil.
-    boundary : its points and conormals; None for a closed shape, or where it is to be ignored.
+    low_order : M-matrix rows for points without a stencil; None if there are none to be had.
+    boundary : its points and conormals; None for a closed shape, or where no condition holds.
+    condition : what holds there.
     """
 
     points: Float[Tensor, "N n"]
     frames: Float[Tensor, "N n d"]
     normals: Float[Tensor, "N n"] | None
-    sides: Float[Tensor, "N n"] | None
     normal_order: Int[Tensor, " N"]
-    graph: sparse.csr_array
+    balls: GraphBalls
     areas: Float[Tensor, " N"]
-    fallback: CloudFallback | MeshFallback
+    low_order: CloudLowOrder | MeshLowOrder | None
     boundary: Boundary | None
+    condition: Condition
+
+    @property
+    def on_mesh(self) -> bool:
+        """Whether triangles know the surface where points do not resolve it."""
+        return isinstance(self.low_order, MeshLowOrder)
 
 
-def cloud_geometry(
+def cloud_shape(
     points: Float[Tensor, "N n"],
     dim: int,
     normal_order: int,
@@ -71,46 +78,49 @@ def cloud_geometry(
     num_neighbors: int | None = None,
     normals: Float[Tensor, "N n"] | None = None,
     boundary: Bool[Tensor, " N"] | str | None = None,
-    condition: str = "neumann",
+    condition: Condition | None = NEUMANN,
     progress: bool = True,
-) -> Geometry:
-    """Geometry of a point cloud: graph and frames from the nearest neighbours.
+) -> Shape:
+    """A point cloud: graph and frames from the nearest neighbours.
 
-    `boundary` is the mask of its boundary points, or "detect"; `condition` what holds there.
+    `boundary` is the mask of its boundary points, or "detect"; `condition` what holds there, None if nothing does.
     """
     candidates = nearest_neighbors(points, min(CANDIDATES.get(dim, 128), len(points)))
-    poor = cloud_frames(points, candidates, dim) if normals is None else complete_frames(normals)
-    graph = nearest_graph(points, poor, candidates)
+    initial = cloud_frames(points, candidates, dim) if normals is None else complete_frames(normals)
+    graph = nearest_graph(points, initial, candidates)
     sides = None
     if dim == points.shape[1] - 1:
         pairs = nearest_pairs(candidates)
-        oriented = orient_normals(points, normals_of_frames(poor), pairs)
+        oriented = orient_normals(points, normals_of_frames(initial), pairs)
         normals = oriented if normals is None else normals
         sides = thin_sides(points, oriented, pairs)
-    balls = GraphBalls(points, graph, poor, sides)
-    frames, order = _refined(balls, normal_order, num_neighbors, progress)
-    balls = GraphBalls(points, graph, frames, _follow(sides, frames))
+    balls, order = _refined(
+        GraphBalls(points, graph, initial, sides), normal_order, num_neighbors, progress
+    )
+    frames = balls.frames
     mask = detect_boundary(points, frames, balls) if isinstance(boundary, str) else boundary
-    rim = None if mask is None else boundary_of_cloud(points, mask, frames, normal_order)
-    fallback = CloudFallback(balls, rim, surface=dim == 2 and points.shape[1] <= 3)
-    rim = None if rim is None else replace(rim, condition=condition)
-    return _oriented(balls, normals, order, fallback, rim)
+    edge = None if mask is None else boundary_of_cloud(points, mask, frames, normal_order)
+    low_order = CloudLowOrder(balls, edge, surface=dim == 2 and points.shape[1] <= 3)
+    return _oriented(balls, normals, order, low_order.areas(), low_order, edge, condition)
 
 
-def mesh_geometry(
+def mesh_shape(
     vertices: Float[Tensor, "N n"],
     faces: Int[Tensor, "F v"],
     normal_order: int,
     *,
     num_neighbors: int | None = None,
-    boundary: str | None = "neumann",
+    boundary: Bool[Tensor, " N"] | None = None,
+    condition: Condition | None = NEUMANN,
+    areas: Float[Tensor, " N"] | None = None,
     progress: bool = True,
-) -> Geometry:
-    """Geometry of a mesh of triangles (or of segments, or tetrahedra in Rⁿ): graph and frames from the faces.
+) -> Shape:
+    """A mesh of triangles (or of segments, or tetrahedra in Rⁿ): graph and frames from the faces.
 
-    `boundary` is the condition on its boundary; None leaves it alone.
+    `condition` holds on its boundary, or on the part of it that is the mask `boundary`; None leaves it alone. With
+    `areas` given there are no low-order rows.
     """
-    poor = mesh_frames(vertices, faces)
+    initial = mesh_frames(vertices, faces)
     graph = mesh_graph(faces, len(vertices))
     reference = sides = None
     if faces.shape[1] == vertices.shape[1] and faces.shape[1] < 4:
@@ -118,16 +128,38 @@ def mesh_geometry(
         if consistently_wound(faces):
             candidates = nearest_neighbors(vertices, min(CANDIDATES[2], len(vertices)))
             sides = thin_sides(vertices, reference, nearest_pairs(candidates))
-    balls = GraphBalls(vertices, graph, poor, sides)
-    frames, order = _refined(balls, normal_order, num_neighbors, progress)
-    balls = GraphBalls(vertices, graph, frames, _follow(sides, frames))
-    rim = boundary_of_mesh(vertices, faces, frames, normal_order) if boundary else None
-    if faces.shape[1] == 3 and vertices.shape[1] <= 3:
-        fallback = MeshFallback(vertices, faces)
-    else:
-        fallback = CloudFallback(balls, rim, surface=False)
-    rim = None if rim is None or boundary is None else replace(rim, condition=boundary)
-    return _oriented(balls, reference, order, fallback, rim)
+    balls, order = _refined(
+        GraphBalls(vertices, graph, initial, sides), normal_order, num_neighbors, progress
+    )
+    edge = None
+    if condition is not None or boundary is not None:
+        edge = boundary_of_mesh(vertices, faces, balls.frames, normal_order)
+    if boundary is not None:
+        edge = _part(edge, boundary)
+    low_order = None
+    if areas is None:
+        triangles = faces.shape[1] == 3 and vertices.shape[1] <= 3
+        low_order = (
+            MeshLowOrder(vertices, faces)
+            if triangles
+            else CloudLowOrder(balls, edge, surface=False)
+        )
+        areas = low_order.areas()
+    return _oriented(balls, reference, order, areas, low_order, edge, condition)
+
+
+def _part(boundary: Boundary | None, mask: Bool[Tensor, " N"]) -> Boundary | None:
+    """The boundary of a mesh where the mask is set; InputError if points of it lie inside."""
+    astray = (mask if boundary is None else mask & ~boundary.mask).nonzero()[:, 0]
+    if len(astray):
+        names = ", ".join(map(str, astray[:8].tolist())) + (", …" if len(astray) > 8 else "")
+        raise InputError(
+            f"boundary: expected points of the mesh's own boundary, got {len(astray)} inside ({names}); leave them "
+            "out of the mask, or leave `boundary` out to take all of the boundary"
+        )
+    if boundary is None or not mask.any():
+        return None
+    return Boundary(mask, boundary.conormals * mask[:, None])
 
 
 def _follow(sides: Tensor | None, frames: Tensor) -> Tensor | None:
@@ -144,27 +176,33 @@ def _turned(normals: Tensor, reference: Tensor) -> Tensor:
 
 def _refined(
     balls: GraphBalls, degree: int, num_neighbors: int | None, progress: bool
-) -> tuple[Tensor, Tensor]:
-    """Frames of order q, in chunks; the poor ones of `balls` if q = 0 or in a flat space."""
-    points, poor = balls.points, balls.frames
-    if degree == 0 or poor.shape[1] == poor.shape[2]:
-        return poor, torch.full((len(points),), degree)
-    rungs = ladder_rungs(poor.shape[-1], range(degree, 0, -1), num_neighbors=num_neighbors)
-    parts = chunks(len(points), rungs, poor.shape[-1])
-    bar = tqdm(parts, "tangent frames", delay=2, disable=not progress, leave=False)
-    frames, order = zip(
-        *(refine_frames(points, poor, balls, centers, rungs) for centers in bar), strict=True
+) -> tuple[GraphBalls, Int[Tensor, " N"]]:
+    """The same neighbourhoods with frames of order q, in chunks; the initial ones if q = 0 or in a flat space."""
+    points, initial = balls.points, balls.frames
+    if degree == 0 or initial.shape[1] == initial.shape[2]:
+        return balls, torch.full((len(points),), degree)
+    candidates = list_candidates(
+        initial.shape[-1], range(degree, 0, -1), num_neighbors=num_neighbors
     )
-    return torch.cat(frames), torch.cat(order)
+    parts = chunks(len(points), candidates, initial.shape[-1])
+    bar = tqdm(parts, "tangent frames", delay=2, disable=not progress, leave=False)
+    found, order = zip(
+        *(refine_frames(points, initial, balls, centers, candidates) for centers in bar),
+        strict=True,
+    )
+    frames = torch.cat(found)
+    return GraphBalls(points, balls.graph, frames, _follow(balls.sides, frames)), torch.cat(order)
 
 
 def _oriented(
     balls: GraphBalls,
     reference: Tensor | None,
     order: Tensor,
-    fallback: CloudFallback | MeshFallback,
+    areas: Tensor,
+    low_order: CloudLowOrder | MeshLowOrder | None,
     boundary: Boundary | None,
-) -> Geometry:
+    condition: Condition | None,
+) -> Shape:
     """Turn normals to the side of `reference`, and frames so that [frames, normal] is right-handed."""
     points, frames = balls.points, balls.frames
     normals = None
@@ -173,7 +211,7 @@ def _oriented(
         normals = righthanded if reference is None else _turned(righthanded, reference)
         hand = (normals * righthanded).sum(1)[:, None, None].sign()
         frames = torch.cat([hand * frames[..., :1], frames[..., 1:]], -1)
-    areas = fallback.areas()
-    return Geometry(
-        points, frames, normals, balls.sides, order, balls.graph, areas, fallback, boundary
-    )
+    balls = GraphBalls(points, balls.graph, frames, balls.sides)
+    if condition is None:
+        boundary, condition = None, Condition()
+    return Shape(points, frames, normals, order, balls, areas, low_order, boundary, condition)
