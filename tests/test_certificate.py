@@ -200,8 +200,9 @@ def test_rows_of_last_resort_leave_no_pocket_behind():
 def test_points_on_a_line_are_stable_and_said_to_be_no_surface():
     """None has a triangle, so robust_laplacian refuses them; cells do not."""
     line = torch.nn.functional.pad(torch.arange(100.0).double()[:, None], (0, 2))
-    with pytest.warns(UserWarning, match="manifold of dimension 2"):
+    with pytest.warns(UserWarning, match="manifold of dimension 2") as caught:
         lb = LaplaceBeltrami.from_points(line)
+    assert caught[0].filename == __file__, "a warning names the line that called torchlb"
     assert lb.certificate.holds
     assert lb.certificate.components == 1
 

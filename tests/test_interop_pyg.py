@@ -111,7 +111,7 @@ def test_eigenbases_come_along(k, monkeypatch):
     one = to_operator(shapes[1]).eigenbasis(k)
     torch.testing.assert_close(one.eigenvectors, single[1].eigenbasis(k).eigenvectors)
     closed, expected = lb.eigenbasis(k, closed=True), theirs.eigenbasis(k, closed=True)
-    assert closed.is_closed == expected.is_closed
+    assert closed.is_invariant == expected.is_invariant
     torch.testing.assert_close(closed.left, expected.left)
 
 

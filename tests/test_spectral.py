@@ -9,6 +9,7 @@ from scipy import linalg
 
 from torchlb import (
     EigenbasisError,
+    InputError,
     LaplaceBeltrami,
     SpectralConv,
     diffusion_distance,
@@ -19,6 +20,7 @@ from torchlb import (
     wave_kernel_signature,
 )
 from torchlb.linalg.sparse import to_scipy
+from torchlb.spectral.eigenbasis import check_num_pairs
 from torchlb.spectral.eigensolver import solve_eigenbasis
 from torchlb.surfaces import Circle, CliffordTorus, Hemisphere, Sphere, Torus, UnitDisk
 
@@ -66,14 +68,15 @@ def test_contract(build, n, k):
 
 @every_builder
 def test_exact_flow_on_the_span_is_the_exponential_of_the_small_matrix(build):
-    """V e^{−t rates} V⁻¹ = e^{−tB}, B = −WᵀΔΦ."""
+    """V e^{−t decay_rates} V⁻¹ = e^{−tB}, B = −WᵀΔΦ."""
     basis = build(500).eigenbasis(50, closed=True)
-    assert basis.is_closed
+    assert basis.is_invariant
     lb = build(500)
     b = -basis.left.T @ lb(basis.eigenvectors)
-    v, inverse, turned = basis.mixing
+    v, inverse, turned = basis.modal_transform
     for t in (0.01, 1.0):
-        decay, angle = torch.exp(-t * basis.rates[0])[:, None], t * basis.rates[1][:, None]
+        decay, angle = t * basis.decay_rates[:, :, None]
+        decay = torch.exp(-decay)
         flow = v @ (decay * (angle.cos() * inverse + angle.sin() * turned))
         assert (flow - torch.matrix_exp(-t * b)).abs().max() < 1e-9
 
@@ -198,8 +201,23 @@ def test_a_solve_that_cannot_succeed_says_what_to_do():
     matrix = to_scipy(lb.crow, lb.col, lb.values, (500, 500))
     with pytest.raises(EigenbasisError, match="not stable; build it with certify=True"):
         solve_eigenbasis(-matrix, lb.mass, 10)
-    with pytest.raises(ValueError, match="at least 1 eigenvector"):
-        lb.eigenbasis(0)
+
+
+@pytest.mark.parametrize("k", [0, -1, 2.5, None, "a", True])
+def test_a_number_of_pairs_that_is_none_is_named(k):
+    with pytest.raises(InputError, match=f"whole number of eigenpairs, at least 1, got {k!r}"):
+        check_num_pairs(k)
+
+
+@pytest.mark.parametrize("signature", [heat_kernel_signature, wave_kernel_signature])
+def test_signatures_need_a_positive_eigenvalue(signature):
+    """Times and energies come from λ_1, in the shape's own unit: there is no other scale."""
+    lb = LaplaceBeltrami.from_points(Circle().points(40))
+    with pytest.raises(EigenbasisError, match="ask for a larger k"):
+        signature(lb, k=1)
+    with pytest.raises(InputError, match="at least 1, got 0"):
+        signature(lb, k=0)
+    assert heat_kernel_signature(lb, torch.tensor([1.0]), k=1).shape == (40, 1)
 
 
 def test_heat_kernel_signature_of_the_sphere():

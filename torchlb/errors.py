@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+import sys
+import warnings
+from pathlib import Path
+
 __all__ = [
     "CacheWarning",
     "DiffusionError",
@@ -11,7 +15,9 @@ __all__ = [
     "StabilityWarning",
     "StencilError",
     "TorchlbError",
+    "warn",
 ]
+HERE = str(Path(__file__).parent)
 
 
 class TorchlbError(ValueError):
@@ -44,3 +50,11 @@ class StabilityWarning(UserWarning):
 
 class CacheWarning(UserWarning):
     """A file of a cache was damaged, outdated, or could not be written; the message names it."""
+
+
+def warn(message: str, category: type[Warning] = UserWarning) -> None:
+    """Warn of the line outside torchlb from which the call came."""
+    frame, level = sys._getframe(), 1
+    while frame.f_back is not None and frame.f_code.co_filename.startswith(HERE):
+        frame, level = frame.f_back, level + 1
+    warnings.warn(message, category, stacklevel=level)

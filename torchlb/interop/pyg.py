@@ -28,7 +28,7 @@ from torchlb.stability.certificate import Certificate
 
 __all__ = ["LaplaceBeltramiTransform", "to_operator"]
 
-BASIS = ("eigenvalues", "eigenvectors", "left", "rates", "mixing")
+BASIS = ("eigenvalues", "eigenvectors", "left", "decay_rates", "modal_transform")
 
 
 @functional_transform("laplace_beltrami")
@@ -46,7 +46,7 @@ class LaplaceBeltramiTransform(BaseTransform):
     lb_frames          (N, n, d)    orthonormal tangent vectors
     lb_normals         (N, n)       unit normals of a hypersurface
     lb_basis           (…,)         with k > 0: all parts of the eigenbasis in one vector, for `to_operator`
-    lb_basis_size      (1, 2)       number of eigenpairs, and whether the basis is closed
+    lb_basis_size      (1, 2)       number of eigenpairs, and whether its span is invariant
     lb_info            str          kind, options and certificate as JSON
     =================  ===========  ============================================================================
 
@@ -121,7 +121,7 @@ def _keys(lb: LaplaceBeltrami, k: int) -> dict[str, Any]:
         basis = lb.eigenbasis(1, closed=True)  # all that was solved
         parts = [getattr(basis, name) for name in BASIS]
         keys["lb_basis"] = torch.cat([part.flatten() for part in parts if part is not None])
-        size = [basis.eigenvectors.shape[1], int(basis.is_closed)]
+        size = [basis.eigenvectors.shape[1], int(basis.is_invariant)]
         keys["lb_basis_size"] = torch.tensor([size])
     return keys
 
@@ -189,6 +189,8 @@ def _bases(data: Any, sizes: list[int]) -> list[Eigenbasis]:
     bases = []
     for parts, mass in zip(shapes, data.lb_mass.split(sizes), strict=True):
         values, vectors, left, *rest = (next(pieces).view(part) for part in parts)
-        rates, mixing = rest or (None, None)
-        bases.append(Eigenbasis(values, vectors, mass, left, rates=rates, mixing=mixing))
+        rates, modal = rest or (None, None)
+        bases.append(
+            Eigenbasis(values, vectors, mass, left, decay_rates=rates, modal_transform=modal)
+        )
     return bases

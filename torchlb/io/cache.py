@@ -12,7 +12,6 @@ import hashlib
 import json
 import os
 import uuid
-import warnings
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +19,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchlb.errors import CacheWarning, InputError, OperatorFileError
+from torchlb.errors import CacheWarning, InputError, OperatorFileError, warn
 from torchlb.operator.dispatch import build_operator, builder_of, complete_options
 from torchlb.operator.laplace_beltrami import LaplaceBeltrami
 from torchlb.version import __version__
@@ -140,7 +139,7 @@ def _cached(path: Path, key: str) -> LaplaceBeltrami | None:
     except FileNotFoundError:
         return None
     except OperatorFileError as error:
-        warnings.warn(f"{error}. It is computed again and replaced", CacheWarning, stacklevel=3)
+        warn(f"{error}. It is computed again and replaced", CacheWarning)
         return None
     return lb
 

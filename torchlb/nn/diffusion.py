@@ -107,14 +107,14 @@ def _full(
     lb: LaplaceBeltrami, basis: Eigenbasis, x: Tensor, time: Tensor, tolerance: float
 ) -> Tensor:
     """e^{−tB} on the span, a series on the rest, whose time is cut where it has decayed below the tolerance."""
-    if basis.mixing is None or basis.rates is None:
+    if basis.modal_transform is None or basis.decay_rates is None:
         raise DiffusionError(
             "method='full': the slow eigenvectors are too close to dependent, or fewer than the components; "
             "ask for another k, or use method='chebyshev' or 'spectral'"
         )
     coefficients = basis.to_basis_obliquely(x)
-    v, inverse, turned = basis.mixing.to(x.dtype).unbind(-3)
-    rates, frequencies = basis.rates.to(x.dtype)[..., None].unbind(-3)
+    v, inverse, turned = basis.modal_transform.to(x.dtype).unbind(-3)
+    rates, frequencies = basis.decay_rates.to(x.dtype)[..., None].unbind(-3)
     decay = torch.exp(-rates * time)
     flowed = decay * (frequencies * time).cos() * (inverse @ coefficients)
     flowed = v @ (flowed + decay * (frequencies * time).sin() * (turned @ coefficients))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
 from dataclasses import asdict, dataclass, replace
 from typing import Any
 
@@ -10,7 +9,7 @@ import torch
 from torch import Tensor
 
 from torchlb.baseline.cotangent import cotangent_laplacian
-from torchlb.errors import InputError
+from torchlb.errors import InputError, warn
 from torchlb.geometry.frames import PROJECTIONS
 from torchlb.operator.checks import (
     check_boundary,
@@ -110,10 +109,9 @@ def build_cloud(
     )
     built = _finished(geometry, "points", options, progress)
     if not (built.rows.order > 0).any():
-        warnings.warn(
+        warn(
             f"no point has a stencil, only rows of last resort: do the points lie on a manifold of dimension {d}? "
             "If not, pass its dimension as `dim`; else `report` says what is wrong",
-            stacklevel=3,
         )
     return built
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import operator
-import warnings
 from typing import Any
 
 import numpy as np
@@ -12,7 +11,7 @@ from jaxtyping import Bool, Float, Int
 from scipy.spatial import KDTree
 from torch import Tensor
 
-from torchlb.errors import InputError
+from torchlb.errors import InputError, warn
 from torchlb.fits.polynomials import num_monomials
 
 __all__ = [
@@ -99,10 +98,9 @@ def warn_of_coincident(vertices: Float[Tensor, "N n"]) -> None:
     """UserWarning if vertices of a mesh coincide, as in STL files: the surface is cut open there."""
     _, bad = _twins(vertices)
     if len(bad):
-        warnings.warn(
+        warn(
             f"vertices: {len(bad)} share a place with another ({_some(bad)}), so the mesh is cut open along them; if "
             "it should not be, merge them first, for example with trimesh.Trimesh(vertices, faces).merge_vertices()",
-            stacklevel=4,
         )
 
 

@@ -17,7 +17,7 @@ from torchlb.operator.batching import join_buffers, join_certificates
 from torchlb.operator.build import Built, Options, build_cloud, build_cotangent, build_mesh
 from torchlb.operator.report import StencilReport
 from torchlb.operator.storage import REPORT_FIELDS, OperatorStorage
-from torchlb.spectral.eigenbasis import Eigenbasis, stack_eigenbases
+from torchlb.spectral.eigenbasis import Eigenbasis, check_num_pairs, stack_eigenbases
 from torchlb.spectral.eigensolver import blockwise_eigenbasis
 from torchlb.stability.certificate import Certificate
 
@@ -292,8 +292,7 @@ class LaplaceBeltrami(OperatorStorage):
         ------
         StencilError : where the solver does not converge, or the operator is not stable.
         """
-        if k < 1:
-            raise InputError(f"k: expected at least 1 eigenvector, got {k}")
+        k = check_num_pairs(k)
         if self.basis_left.shape[-1] < min(k, max(self.sizes or (self.num_points,))):
             n = self.num_points
             matrix = to_scipy(self.crow, self.col, self.values, (n, n))
@@ -301,9 +300,9 @@ class LaplaceBeltrami(OperatorStorage):
             self._keep(blockwise_eigenbasis(matrix, self.mass, k, self.sizes, rounding=rounding))
         if store:
             self._keep(None, store=True)
-        rates, mixing = (t if len(t) else None for t in (self.basis_rates, self.basis_mixing))
+        modes = (self.basis_decay_rates, self.basis_modal_transform)
         pairs = (self.basis_eigenvalues, self.basis_eigenvectors, self.mass, self.basis_left)
-        basis = Eigenbasis(*pairs, self.sizes, rates, mixing)
+        basis = Eigenbasis(*pairs, self.sizes, *(t if len(t) else None for t in modes))
         return basis if closed else basis.truncate(k)
 
     def extra_repr(self) -> str:

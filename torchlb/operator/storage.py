@@ -25,7 +25,7 @@ REPORT_FIELDS = (
     "reason",
 )
 BUFFERS = ("crow", "col", "values", "gradient_values", "mass", "points", "frames", "normals")
-BASIS = ("eigenvalues", "eigenvectors", "left", "rates", "mixing")
+BASIS = ("eigenvalues", "eigenvectors", "left", "decay_rates", "modal_transform")
 
 
 class OperatorStorage(nn.Module):
@@ -46,8 +46,8 @@ class OperatorStorage(nn.Module):
     basis_eigenvalues: Tensor
     basis_eigenvectors: Tensor
     basis_left: Tensor
-    basis_rates: Tensor
-    basis_mixing: Tensor
+    basis_decay_rates: Tensor
+    basis_modal_transform: Tensor
 
     def __init__(self) -> None:
         super().__init__()

@@ -2,13 +2,28 @@
 
 from __future__ import annotations
 
+from numbers import Integral
 from typing import Protocol, runtime_checkable
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-__all__ = ["Eigenbasis", "Spectral", "stack_eigenbases"]
+from torchlb.errors import InputError
+
+__all__ = ["Eigenbasis", "Spectral", "check_num_pairs", "stack_eigenbases"]
+
+
+def check_num_pairs(k: object) -> int:
+    """k as an int; InputError if it is no number of eigenpairs.
+
+    >>> check_num_pairs(0)
+    Traceback (most recent call last):
+    torchlb.errors.InputError: k: expected a whole number of eigenpairs, at least 1, got 0
+    """
+    if isinstance(k, bool) or not isinstance(k, Integral) or k < 1:
+        raise InputError(f"k: expected a whole number of eigenpairs, at least 1, got {k!r}")
+    return int(k)
 
 
 @runtime_checkable
@@ -39,9 +54,9 @@ class Eigenbasis:
     mass : π, (N,), ℓ^d.
     left : W, (N, k), WᵀΦ = I: left eigenvectors of Δ, for the oblique projector ΦWᵀ. Equal to ΠΦ if ΠΔ is symmetric.
     sizes : numbers of points of the shapes of a batch; None for a single shape.
-    rates : (2, k) or (S, 2, k): real and imaginary parts of the eigenvalues of B = −WᵀΔΦ, in 1/ℓ².
-    mixing : (3, k, k) or (S, 3, k, k): V, V⁻¹ and JV⁻¹ with BV = V(rates[0] − rates[1] J), J a quarter turn in each
-        conjugate pair. Both are there only in a closed basis, whose span is invariant: see `is_closed`.
+    decay_rates : (2, k) or (S, 2, k): real and imaginary parts of the eigenvalues of B = −WᵀΔΦ, in 1/ℓ².
+    modal_transform : (3, k, k) or (S, 3, k, k): V, V⁻¹ and JV⁻¹ with BV = V(decay_rates[0] − decay_rates[1] J), J a
+        quarter turn in each conjugate pair. Both are there only where the span is invariant: see `is_invariant`.
     """
 
     def __init__(
@@ -51,12 +66,12 @@ class Eigenbasis:
         mass: Float[Tensor, " N"],
         left: Float[Tensor, "N k"],
         sizes: tuple[int, ...] | None = None,
-        rates: Float[Tensor, "*S 2 k"] | None = None,
-        mixing: Float[Tensor, "*S 3 k k"] | None = None,
+        decay_rates: Float[Tensor, "*S 2 k"] | None = None,
+        modal_transform: Float[Tensor, "*S 3 k k"] | None = None,
     ) -> None:
         self.eigenvalues, self.eigenvectors = eigenvalues, eigenvectors
         self.mass, self.left, self.sizes = mass, left, sizes
-        self.rates, self.mixing = rates, mixing
+        self.decay_rates, self.modal_transform = decay_rates, modal_transform
 
     def __repr__(self) -> str:
         n, k = self.eigenvectors.shape
@@ -65,9 +80,9 @@ class Eigenbasis:
         return f"Eigenbasis({k} pairs of {n} points{shapes}, eigenvalues 0 to {last:.4g})"
 
     @property
-    def is_closed(self) -> bool:
+    def is_invariant(self) -> bool:
         """Whether the span is invariant under Δ, and the exact e^{tΔ} on it is at hand."""
-        return self.mixing is not None
+        return self.modal_transform is not None
 
     def truncate(self, k: int) -> Eigenbasis:
         """The first k of the pairs; itself if there are no more."""
@@ -113,10 +128,14 @@ def stack_eigenbases(bases: list[Eigenbasis]) -> Eigenbasis:
     def padded(t: Tensor, sides: int) -> Tensor:
         return torch.nn.functional.pad(t, (0, k - t.shape[-1]) * sides)
 
-    rates = mixing = None
-    if all(basis.is_closed for basis in bases):
-        rates = torch.stack([padded(b.rates, 1) for b in bases if b.rates is not None])
-        mixing = torch.stack([padded(b.mixing, 2) for b in bases if b.mixing is not None])
+    decay_rates = modal_transform = None
+    if all(basis.is_invariant for basis in bases):
+        decay_rates = torch.stack(
+            [padded(b.decay_rates, 1) for b in bases if b.decay_rates is not None]
+        )
+        modal_transform = torch.stack(
+            [padded(b.modal_transform, 2) for b in bases if b.modal_transform is not None]
+        )
     return Eigenbasis(
         torch.stack(
             [
@@ -128,6 +147,6 @@ def stack_eigenbases(bases: list[Eigenbasis]) -> Eigenbasis:
         torch.cat([b.mass for b in bases]),
         torch.cat([padded(b.left, 1) for b in bases]),
         tuple(len(b.mass) for b in bases),
-        rates,
-        mixing,
+        decay_rates,
+        modal_transform,
     )

@@ -77,7 +77,7 @@ class _Part:
 def solve_eigenbasis(
     matrix: sparse.csr_array, mass: Float[Tensor, " N"], k: int, *, rounding: float = 0.0
 ) -> Eigenbasis:
-    """The k smallest eigenpairs of −Δ, and a few more where pairs would be split: a closed basis, in float64.
+    """The k smallest eigenpairs of −Δ, and a few more where pairs would be split: an invariant span, in float64.
 
     Parameters
     ----------
@@ -233,7 +233,7 @@ Solved = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]
 
 
 def _ritz(part: _Part, cut: float) -> Solved:
-    """Rayleigh–Ritz on one component: (eigenvalues, Φ, W, rates, mixing) in its scaled coordinates, zero first."""
+    """Rayleigh–Ritz on one component: eigenvalues, zero first, Φ, W, decay rates, modal transform, all scaled."""
     zero = part.root / linalg.norm(part.root)
     u = _real_span(part.right, cut)
     closed = part.null_left is not None
@@ -256,7 +256,7 @@ def _ritz(part: _Part, cut: float) -> Solved:
         phi, z = np.column_stack([zero, u]), np.column_stack([part.null_left, z])
         values = np.append(0.0, values)
     if part.symmetric or phi.shape[1] == 0:
-        return values, phi, phi, np.stack([values, 0 * values]), _plain_mixing(len(values))
+        return values, phi, phi, np.stack([values, 0 * values]), _plain_transform(len(values))
     overlap = phi.T @ z if z.shape == phi.shape else np.zeros((1, 1))
     if linalg.svdvals(overlap)[-1] < 1e-8 * linalg.svdvals(overlap)[0]:
         raise EigenbasisError(
@@ -267,16 +267,16 @@ def _ritz(part: _Part, cut: float) -> Solved:
     b = w.T @ (part.matrix @ phi)
     if closed:
         b[:, 0] = 0.0  # constants, exactly
-    rates, mixing = _exact_modes(b)
-    return values, phi, w, rates, mixing
+    rates, transform = _exact_modes(b)
+    return values, phi, w, rates, transform
 
 
-def _plain_mixing(k: int) -> np.ndarray:
+def _plain_transform(k: int) -> np.ndarray:
     return np.stack([np.eye(k), np.eye(k), np.zeros((k, k))])
 
 
 def _exact_modes(b: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Rates and mixing of `Eigenbasis` for a matrix B; NaN where its eigenvectors are too close to dependent.
+    """Decay rates and modal transform for a matrix B; NaN where its eigenvectors are too close to dependent.
 
     For a pair α ± iβ with p ± iq: B[p q] = [p q](α + βJ'), so e^{−tB} turns [p q] by βt while it shrinks by e^{−αt}.
     """
@@ -304,17 +304,17 @@ def _merged(parts: list[_Part], solved: list[Solved], pi: np.ndarray, k: int) ->
     total = int(start[-1])
     values, rates = (np.concatenate([s[i] for s in solved], axis=-1) for i in (0, 3))
     phi, left = np.zeros((len(pi), total)), np.zeros((len(pi), total))
-    mixing = np.zeros((3, total, total))
+    transform = np.zeros((3, total, total))
     for part, (_, f, w, _, m), at in zip(parts, solved, start[:-1], strict=True):
         place = slice(at, at + f.shape[1])
         phi[part.index, place] = f / part.root[:, None]
         left[part.index, place] = w * part.root[:, None]
-        mixing[:, place, place] = m
+        transform[:, place, place] = m
     zeros = start[:-1][closed_parts]
     order = np.concatenate([zeros, np.setdiff1d(np.arange(total), zeros)])
     order[count:] = order[count:][np.argsort(values[order[count:]], kind="stable")]
     values, phi, left = values[order], phi[:, order], left[:, order]
-    v, others = mixing[0][order], mixing[1:, :, order]
+    v, others = transform[0][order], transform[1:, :, order]
     if count:
         closed_index = [part.index for part in parts if part.null_left is not None]
         root = np.sqrt(np.array([pi[index].sum() for index in closed_index]))
@@ -324,10 +324,10 @@ def _merged(parts: list[_Part], solved: list[Solved], pi: np.ndarray, k: int) ->
         v[:count], others[:, :, :count] = t.T @ v[:count], others[:, :, :count] @ t
         phi[np.concatenate(closed_index), 0] = 1 / linalg.norm(root)
     closed: dict[str, Any] = {}
-    if count <= k and np.isfinite(mixing).all():
+    if count <= k and np.isfinite(transform).all():
         closed = {
-            "rates": torch.from_numpy(rates),
-            "mixing": torch.from_numpy(np.stack([v, *others])),
+            "decay_rates": torch.from_numpy(rates),
+            "modal_transform": torch.from_numpy(np.stack([v, *others])),
         }
     keep = slice(None) if count <= k else slice(k)
     arrays = (values[keep], phi[:, keep], pi, left[:, keep])

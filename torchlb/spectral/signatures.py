@@ -12,7 +12,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from torchlb.errors import InputError
+from torchlb.errors import EigenbasisError, InputError
 from torchlb.spectral.eigenbasis import Eigenbasis, Spectral
 
 __all__ = [
@@ -33,10 +33,15 @@ def _present(basis: Eigenbasis) -> Tensor:
 
 
 def _first_positive(basis: Eigenbasis) -> Tensor:
-    """λ_1, the smallest eigenvalue that is not zero, (1,) or (S, 1); that of the last pair if there is none."""
+    """λ_1, the smallest eigenvalue that is not zero, (1,) or (S, 1); EigenbasisError if a shape has none."""
     values = basis.eigenvalues
-    positive = torch.where(values > 0, values, torch.inf).amin(-1, keepdim=True)
-    return torch.where(positive.isfinite(), positive, values.new_ones(()))
+    first = torch.where(values > 0, values, torch.inf).amin(-1, keepdim=True)
+    if first.isinf().any():
+        raise EigenbasisError(
+            f"signature: expected a positive eigenvalue, got {values.shape[-1]} pairs of eigenvalue zero, one for each "
+            "connected component; ask for a larger k"
+        )
+    return first
 
 
 def _log_space(start: Tensor, end: Tensor, count: int) -> Tensor:
@@ -71,9 +76,8 @@ def heat_kernel_signature(
     basis = lb.eigenbasis(k)
     values = basis.eigenvalues
     if times is None:
-        largest = torch.maximum(values[..., -1:], _first_positive(basis))
         bound = 4 * math.log(10)
-        times = _log_space(bound / largest, bound / _first_positive(basis), count)
+        times = _log_space(bound / values[..., -1:], bound / _first_positive(basis), count)
     decay = torch.exp(-values[..., :, None] * times.to(values)[..., None, :])
     return basis.synthesise(basis.eigenvectors**2, decay)
 
@@ -98,8 +102,7 @@ def wave_kernel_signature(
     """
     basis = lb.eigenbasis(k)
     values = basis.eigenvalues
-    low = _first_positive(basis).log()
-    high = torch.maximum(values[..., -1:].clamp_min(torch.finfo(values.dtype).tiny).log(), low)
+    low, high = _first_positive(basis).log(), values[..., -1:].log()
     sigma = width * (high - low) / 100 + torch.finfo(values.dtype).eps
     if energies is None:
         fraction = torch.linspace(0, 1, count, dtype=values.dtype, device=values.device)
@@ -111,7 +114,7 @@ def wave_kernel_signature(
         -(((energies.to(values)[..., None, :] - logs[..., :, None]) / sigma[..., None]) ** 2) / 2
     )
     weights = torch.where(positive[..., :, None], exponent, -torch.inf).softmax(dim=-2)
-    return basis.synthesise(basis.eigenvectors**2, torch.nan_to_num(weights))
+    return basis.synthesise(basis.eigenvectors**2, weights)
 
 
 def spectral_wavelets(
