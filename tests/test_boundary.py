@@ -48,7 +48,7 @@ def test_spectrum_converges_at_the_order(surface, condition, order):
     sizes, errors = [350, 700, 1400], []
     for n in sizes:
         lb = LaplaceBeltrami.from_mesh(*surface.mesh(n), order=order, boundary=condition)
-        exact = surface.eigenvalues(10, boundary=condition)
+        exact = surface.eigenvalues(10, condition=condition)
         values, _ = spectrum(lb, 10)
         errors.append(float(((values - exact).abs()[1:] / exact[1:]).max()))
     slope = -2 * np.polyfit(np.log(sizes), np.log(errors), 1)[0]
@@ -63,7 +63,7 @@ def test_dirichlet_spectrum(surface, order, bound):
     """First 10 eigenvalues against squared Bessel zeros (disk) and l(l + 1) (hemisphere) at N = 700, mesh and cloud."""
     vertices, faces = surface.mesh(700)
     mask = surface.boundary_mask(vertices)
-    exact = surface.eigenvalues(10, boundary="dirichlet")
+    exact = surface.eigenvalues(10, condition="dirichlet")
     for lb in (
         LaplaceBeltrami.from_mesh(vertices, faces, order=order, boundary="dirichlet"),
         LaplaceBeltrami.from_points(

@@ -13,8 +13,8 @@ Everything is float64, and derivatives are exact to rounding: forward-mode diffe
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
-from functools import cached_property
+from collections.abc import Callable, Mapping
+from functools import lru_cache
 from typing import ClassVar
 
 import numpy as np
@@ -65,34 +65,30 @@ class Surface:
         return points
 
     def _faces(self, points: np.ndarray) -> np.ndarray:
-        raise InputError(f"{type(self).__name__}: triangles need a surface of dimension 2")
+        raise NotImplementedError
 
-    def _spectrum(self, k: int, dirichlet: bool) -> np.ndarray:
+    def _spectrum(self, k: int) -> np.ndarray:
         raise InputError(f"{type(self).__name__}: no exact eigenvalues are known")
+
+    def _spectra(self) -> Mapping[str, Callable[[int], np.ndarray]]:
+        """By boundary condition, what gives the k least eigenvalues, or more of them in any order."""
+        return {"neumann": self._spectrum}
 
     def retract(self, x: Places) -> Places:
         """Smooth map R of a neighbourhood onto the surface, the identity on it."""
         return self._retract(x)
 
-    def eigenvalues(self, k: int, boundary: str = "neumann") -> Float[Tensor, " k"]:
+    def eigenvalues(self, k: int, condition: str = "neumann") -> Float[Tensor, " k"]:
         """The first k exact eigenvalues of −Δ with multiplicity, ascending, 1/ℓ²; ValueError if unknown."""
-        conditions = ("neumann", "dirichlet") if self.perimeter else ("neumann",)
-        require(boundary in conditions, "boundary", " or ".join(conditions), boundary)
+        spectra = self._spectra()
+        require(condition in spectra, "condition", " or ".join(spectra), condition)
         require(k >= 1, "k", "a positive number", k)
-        return torch.from_numpy(np.sort(self._spectrum(k, boundary == "dirichlet"))[:k])
+        return torch.from_numpy(np.sort(spectra[condition](k))[:k])
 
-    @cached_property
+    @property
     def area(self) -> float:
         """The d-dimensional volume, ℓ^d, by Gauss quadrature of the chart's area element; to rounding."""
-        density, weights = self._quadrature
-        return float(density @ weights)
-
-    @cached_property
-    def _quadrature(self) -> tuple[Float[Tensor, " Q"], Float[Tensor, " Q"]]:
-        gauss, weight = np.polynomial.legendre.leggauss(256 if self.dim < 3 else 24)
-        cube = torch.cartesian_prod(*[torch.from_numpy(gauss + 1) / 2] * self.dim)
-        weights = torch.cartesian_prod(*[torch.from_numpy(weight) / 2] * self.dim)
-        return self._density(cube.view(-1, self.dim)), weights.view(-1, self.dim).prod(1)
+        return _area_and_peak(self)[0]
 
     def _density(self, cube: Float[Tensor, "N d"]) -> Float[Tensor, " N"]:
         """Area element √det JᵀJ of the chart."""
@@ -101,8 +97,9 @@ class Surface:
 
     def _sample(self, n: int, draw: Callable[[int], Tensor]) -> Points:
         """n points uniform in area: what rejection leaves of `draw(count)`, (count, d + 1) in [0, 1)."""
-        bound = 1.001 * float(self._quadrature[0].max())
-        count = int(1.1 * n * bound / self.area) + 64
+        area, peak = _area_and_peak(self)
+        bound = 1.001 * peak
+        count = int(1.1 * n * bound / area) + 64
         while True:
             cube, level = draw(count).split([self.dim, 1], dim=1)
             accepted = cube[bound * level[:, 0] <= self._density(cube)]
@@ -154,9 +151,7 @@ class Surface:
             everything = torch.cat([free, fixed]).numpy()
             _, found = KDTree(everything).query(free.numpy(), k=neighbors + 1)
             nearest = np.asarray(found)[:, 1:]  # without the point itself
-            frames = self.frames(
-                free
-            )  # R need not be the nearest point, so stay on its tangent plane
+            frames = self.frames(free)  # R need not be the nearest point: stay on its tangent plane
             for _ in range(4):  # neighbours change slowly
                 offset = (free[:, None] - torch.cat([free, fixed])[nearest]) / (1.3 * spacing)
                 distance = offset.norm(dim=-1, keepdim=True)
@@ -218,6 +213,7 @@ class Surface:
 
     def triangulate(self, points: Points) -> Int[Tensor, "F 3"]:
         """Triangles on points of a surface of dimension 2, oriented outward; each point is a vertex."""
+        require(self.dim == 2, type(self).__name__, "dimension 2, for triangles", self.dim)
         faces = self._faces(self._checked(points).numpy()).astype(np.int64)
         unused = np.setdiff1d(np.arange(len(points)), faces).tolist()
         require(not unused, "points", "each in a triangle (are there duplicates?)", unused[:8])
@@ -245,6 +241,23 @@ def _second_derivatives(f: Function, x: Points, frames: Float[Tensor, "N n d"]) 
 def _jacobian(f: Function, x: Points) -> Float[Tensor, "N n_values n"]:
     axes = torch.eye(x.shape[1], dtype=x.dtype)
     return torch.stack([_derivative(f, x, axis.expand_as(x)) for axis in axes], -1)
+
+
+@lru_cache
+def _quadrature(dim: int) -> tuple[Float[Tensor, "Q d"], Float[Tensor, " Q"]]:
+    """Gauss nodes and weights of the unit cube."""
+    gauss, weight = np.polynomial.legendre.leggauss(256 if dim < 3 else 24)
+    nodes = torch.cartesian_prod(*[torch.from_numpy(gauss + 1) / 2] * dim)
+    weights = torch.cartesian_prod(*[torch.from_numpy(weight) / 2] * dim)
+    return nodes.view(-1, dim), weights.view(-1, dim).prod(1)
+
+
+@lru_cache
+def _area_and_peak(surface: Surface) -> tuple[float, float]:
+    """Integral and maximum of the area element; once for all surfaces that are equal."""
+    nodes, weights = _quadrature(surface.dim)
+    density = surface._density(nodes)
+    return float(density @ weights), float(density.max())
 
 
 def circle(turns: Float[Tensor, " N"]) -> Float[Tensor, "N 2"]:

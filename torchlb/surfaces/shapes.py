@@ -1,14 +1,10 @@
-"""Analytic manifolds with exact answers: points, meshes, derivatives and spectra to compare with.
-
-Each is a retraction and a chart, which `manifold.py` turns into points, frames and derivatives, together with what is
-known of it in closed form.
-"""
+"""Spheres, tori, curves, disks: each a retraction and a chart for `base`, with what is known of it in closed form."""
 
 from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import ClassVar
 
@@ -22,22 +18,6 @@ from torch.nn.functional import pad
 
 from torchlb.surfaces.base import Function, Places, Points, Surface, circle, require
 
-__all__ = [
-    "Circle",
-    "CliffordTorus",
-    "Ellipsoid",
-    "Hemisphere",
-    "SpaceCurve",
-    "Sphere",
-    "StarShaped",
-    "ThreeSphere",
-    "Torus",
-    "UnitDisk",
-    "deserno_points",
-    "smooth_function",
-    "spherical_harmonic",
-]
-
 
 class _Radial(Surface):
     """One point a direction: what the retraction makes of a unit vector."""
@@ -46,8 +26,6 @@ class _Radial(Surface):
         return self.retract(_directions(cube))
 
     def _faces(self, points: np.ndarray) -> np.ndarray:
-        if self.dim != 2:
-            return super()._faces(points)
         directions = points / np.linalg.norm(points, axis=1, keepdims=True)
         faces = ConvexHull(directions).simplices
         inward = np.linalg.det(directions[faces]) < 0
@@ -65,13 +43,12 @@ class _Round(_Radial):
     def _retract(self, x: Places) -> Places:
         return self.radius * _unit(x)
 
-    def _spectrum(self, k: int, dirichlet: bool) -> np.ndarray:
+    def _spectrum(self, k: int) -> np.ndarray:
         d, degree = self.dim, np.arange(k)  # one for each harmonic polynomial of the degree
         times = [math.comb(j + d, d) - math.comb(max(j + d - 2, 0), d) for j in degree]
         return np.repeat(degree * (degree + d - 1) / self.radius**2, times)
 
 
-@dataclass(frozen=True)
 class Sphere(_Round):
     """The sphere of a radius ℓ in R³: eigenvalues l (l + 1) / radius², 2l + 1 times.
 
@@ -82,7 +59,6 @@ class Sphere(_Round):
     """
 
 
-@dataclass(frozen=True)
 class Circle(_Round):
     """The circle of a radius ℓ in R²: eigenvalues l² / radius², twice for l > 0."""
 
@@ -90,7 +66,6 @@ class Circle(_Round):
     ambient_dim: ClassVar[int] = 2
 
 
-@dataclass(frozen=True)
 class ThreeSphere(_Round):
     """The sphere S³ of a radius ℓ in R⁴: eigenvalues l (l + 2) / radius², (l + 1)² times."""
 
@@ -106,6 +81,7 @@ class Ellipsoid(_Radial):
 
     def __post_init__(self) -> None:
         require(min(self.semi_axes) > 0, "semi_axes", "positive lengths", self.semi_axes)
+        object.__setattr__(self, "semi_axes", tuple(self.semi_axes))  # to be hashed
 
     def _retract(self, x: Places) -> Places:
         return _unit(x / x.new_tensor(self.semi_axes)) * x.new_tensor(self.semi_axes)
@@ -159,7 +135,7 @@ class Torus(Surface):
         tube = 2 * scale * np.arctan2(ratio * np.sin(half), np.cos(half))
         return _periodic_delaunay(np.stack([np.arctan2(y, x), tube], 1), np.array([1, scale]))
 
-    def _spectrum(self, k: int, dirichlet: bool) -> np.ndarray:
+    def _spectrum(self, k: int) -> np.ndarray:
         """Fourier collocation for f = g(v) w^{−1/2} e^{imu}, w = major + minor cos v; error about 1e-11 λ_k.
 
         −g″/minor² + (w″/2w − w′²/4w²) g/minor² + m² g/w² = λ g, analytic in a strip around the real v.
@@ -197,7 +173,7 @@ class CliffordTorus(Surface):
     def _faces(self, points: np.ndarray) -> np.ndarray:
         return _periodic_delaunay(np.arctan2(points[:, 1::2], points[:, ::2]), np.ones(2))
 
-    def _spectrum(self, k: int, dirichlet: bool) -> np.ndarray:
+    def _spectrum(self, k: int) -> np.ndarray:
         square = np.arange(-math.isqrt(k) - 2, math.isqrt(k) + 3) ** 2
         return np.add.outer(square, square).ravel() / self.radius**2
 
@@ -220,7 +196,7 @@ class SpaceCurve(Surface):
         a, b, c = x.split(1, dim=-1)
         return self._at(torch.atan2(c, torch.hypot(a, b) - 1) - torch.atan2(b, a))
 
-    def _spectrum(self, k: int, dirichlet: bool) -> np.ndarray:
+    def _spectrum(self, k: int) -> np.ndarray:
         return (2 * math.pi / self.area * np.arange(-k, k + 1)) ** 2
 
 
@@ -245,14 +221,15 @@ class UnitDisk(Surface):
     def _faces(self, points: np.ndarray) -> np.ndarray:
         return Delaunay(points[:, :2]).simplices
 
-    def _spectrum(self, k: int, dirichlet: bool) -> np.ndarray:
-        count = math.isqrt(k) + 8  # zeros are about π apart, the k-th eigenvalue is about 4k
+    def _spectra(self) -> Mapping[str, Callable[[int], np.ndarray]]:
+        def squares_of(zeros: Callable[[int, int], np.ndarray]) -> Callable[[int], np.ndarray]:
+            # They are about π apart, and the k-th eigenvalue is about 4k.
+            return lambda k: _by_angle(k, lambda m: zeros(m, math.isqrt(k) + 8) ** 2)
 
-        def of_order(m: int) -> np.ndarray:
-            zeros = jn_zeros(m, count) if dirichlet else jnp_zeros(m, count)
-            return np.append(0.0, zeros)[int(dirichlet or m > 0) :] ** 2
+        def of_derivative(m: int, count: int) -> np.ndarray:
+            return np.append([0.0] * (m == 0), jnp_zeros(m, count))
 
-        return _by_angle(k, of_order)
+        return {"neumann": squares_of(of_derivative), "dirichlet": squares_of(jn_zeros)}
 
 
 @dataclass(frozen=True)
@@ -275,9 +252,12 @@ class Hemisphere(Surface):
     def _faces(self, points: np.ndarray) -> np.ndarray:
         return Delaunay(points[:, :2] / (1 + points[:, 2:])).simplices  # stereographic: conformal
 
-    def _spectrum(self, k: int, dirichlet: bool) -> np.ndarray:
-        degree = np.arange(k + 1)
-        return np.repeat(degree * (degree + 1.0), degree if dirichlet else degree + 1)
+    def _spectra(self) -> Mapping[str, Callable[[int], np.ndarray]]:
+        def harmonics(k: int, more: int) -> np.ndarray:
+            degree = np.arange(k + 1)
+            return np.repeat(degree * (degree + 1.0), degree + more)
+
+        return {"neumann": lambda k: harmonics(k, 1), "dirichlet": lambda k: harmonics(k, 0)}
 
 
 def deserno_points(n: int) -> Float[Tensor, "N 3"]:
@@ -359,9 +339,7 @@ def _periodic_delaunay(base: np.ndarray, scale: np.ndarray) -> np.ndarray:
     faces = near[Delaunay(copies[near]).simplices]
     vertices = faces % count
     lowest = np.take_along_axis(faces, vertices.argmin(1)[:, None], 1)[:, 0]
-    vertices = vertices[
-        lowest < count
-    ]  # of all translates, that with its lowest vertex in the base
+    vertices = vertices[lowest < count]  # of its translates, the one with its lowest vertex in base
     edges = np.unique(np.concatenate([vertices[:, [i, i - 1]] for i in range(3)]), axis=0)
     manifold = len(vertices) == 2 * count and len(edges) == 6 * count
     require(manifold, "points", "more of them, or less regular", f"{count} with {len(edges)} edges")
