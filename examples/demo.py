@@ -83,20 +83,26 @@ def draw_accuracy(sizes, errors, path):
 
 
 def draw_surface(vertices, faces, lb, name, unit, path):
-    """f, Δf and the order reached, side by side, each from two sides."""
+    """f, Δf, mean curvature and the order reached, side by side, each from two sides."""
     low, high = vertices.amin(0), vertices.amax(0)
     f = smooth_function(3 * (vertices - (low + high) / 2) / (high - low).max())  # in [−1.5, 1.5]³
-    figure, axes = plt.subplots(1, 3, figsize=(15, 6.5), layout="constrained")
-    panels = [(f, "a smooth function f", ""), (lb(f), "Δf", f"1/{unit}²" if unit else "1/length²")]
+    mean_curvature = -(lb.mean_curvature_normal() * lb.normals).sum(1) / 2  # 1/r on a sphere
+    figure, axes = plt.subplots(1, 4, figsize=(19, 6), layout="constrained")
+    unit = unit or "length"
+    panels = [
+        (f, "a smooth function f", ""),
+        (lb(f), "Δf", f"1/{unit}²"),
+        (mean_curvature, "mean curvature", f"1/{unit}"),
+    ]
     for ax, (values, title, label) in zip(axes, panels, strict=False):
         if faces is None:
             plot_points(vertices, values, ax=ax, title=title, label=label, view=SIDES)
         else:
             plot_surface(vertices, faces, values, ax=ax, title=title, label=label, view=SIDES)
-    plot_orders(vertices, faces, lb.report.order, ax=axes[2], view=SIDES)
+    plot_orders(vertices, faces, lb.report.order, ax=axes[3], view=SIDES)
     figure.suptitle(f"{name}, {len(vertices):,} points", fontsize="x-large")
     figure.get_layout_engine().set(h_pad=0.12)
-    figure.savefig(path, dpi=130)
+    figure.savefig(path, dpi=100)
     plt.close(figure)
 
 
@@ -108,7 +114,7 @@ def main(arguments=None):
     parser.add_argument("--quick", action="store_true", help="a smaller table")
     options = parser.parse_args(arguments)
     try:
-        vertices, faces, name, unit = read(options.mesh) if options.mesh else cortex("pial_left")
+        vertices, faces, name, unit = read(options.mesh) if options.mesh else cortex()
         start = time.perf_counter()
         if faces is None:
             lb = LaplaceBeltrami.from_points(vertices, order=options.order)

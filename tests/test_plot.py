@@ -191,10 +191,10 @@ def test_order_map_counts_points_and_shows_the_lowest_order_of_a_triangle():
     order = torch.tensor([0, 3, 3, 9])
     ax = plot_orders(vertices, faces, order)
     texts = [text.get_text() for text in ax.get_legend().get_texts()]
-    assert texts == ["order 9: 1", "order 3: 2", "fallback: 1"]
+    assert texts == ["order 9: 1", "order 3: 2", "low order: 1"]
     hues = ax.collections[0].get_facecolors()[:, :3]
     hues = hues / hues.max(axis=1, keepdims=True)
-    expected = np.array([[0xD5, 0x5E, 0x00], [0x56, 0xB4, 0xE9]])
+    expected = np.array([[0xCF, 0xC9, 0xBF], [0x7F, 0xA9, 0xCF]])
     expected = expected / expected.max(axis=1, keepdims=True)
     distance = np.abs(hues[:, None] - expected).max(axis=2)
     assert sorted(distance.argmin(axis=1)) == [0, 1]

@@ -38,8 +38,8 @@ Faces = Int[Tensor, "F 3"] | Int[np.ndarray, "F 3"]
 Cloud = Float[Tensor, "N n"] | Float[np.ndarray, "N n"]
 Scalar = Num[Tensor, " N"] | Num[np.ndarray, " N"]
 Vectors = Float[Tensor, "N n"] | Float[np.ndarray, "N n"]
-ORDER_COLORS = ("#d55e00", "#e69f00", "#f0e442", "#56b4e9", "#009e73", "#0072b2", "#cc79a7")
-"""By order reached, fallback first, the last for all beyond. Okabe and Ito's, distinct for the colour-blind too."""
+ORDER_COLORS = ("#cfc9bf", "#dcae6b", "#c4c56a", "#7fa9cf", "#67b39c", "#3f689b", "#a184b8")
+"""By order reached, low-order rows first, the last for all beyond. Muted: no order is an alarm."""
 LINE_COLORS = ("#d55e00", "#56b4e9", "#0072b2", "#000000", "#e69f00", "#009e73", "#cc79a7")
 MARKERS = "osD^vP*"
 PALE = "0.88"
@@ -207,7 +207,7 @@ def plot_orders(
     ----------
     vertices : (N, 3); also (N, 2) for a cloud.
     faces : (F, 3), or None for a cloud. A triangle takes the lowest order of its corners.
-    order : (N,), 0 for a fallback row.
+    order : (N,), 0 for a low-order row.
     ax, title, view : as for `plot_surface`.
 
     Returns
@@ -232,7 +232,7 @@ def plot_orders(
     _fill(ax, places, corners, palette[shown.clip(0, last)], view)
     counts = np.bincount(reached)
     handles = [
-        Patch(color=palette[min(p, last)], label=f"{f'order {p}' if p else 'fallback'}: {count:,}")
+        Patch(color=palette[min(p, last)], label=f"{f'order {p}' if p else 'low order'}: {count:,}")
         for p, count in reversed(list(enumerate(counts)))
         if count
     ]
