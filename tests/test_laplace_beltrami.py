@@ -235,6 +235,43 @@ def test_a_whole_module_can_be_saved(lb):
     assert torch.equal(torch.load(file, weights_only=True).values, lb.values)
 
 
+def test_the_spectral_bounds_travel_with_it(lb):
+    """Found when it is built; the same in every type and in every copy, and found again for a state without them."""
+    state = lb.state_dict()
+    other = LaplaceBeltrami()
+    other.load_state_dict(state)
+    for copied in (copy.deepcopy(lb).half(), pickle.loads(pickle.dumps(lb)), other):
+        assert copied._bounds is not None
+        assert copied.spectral_bounds == lb.spectral_bounds
+    del state["_extra_state"]["bounds"]
+    other.load_state_dict(state)
+    assert other._bounds is None
+    assert other.spectral_bounds == pytest.approx(lb.spectral_bounds)
+
+
+def test_a_batch_has_the_bounds_of_its_shapes():
+    """The ellipse of each shape lies in that of the batch, which nothing is solved for."""
+    shapes = [built(name) for name in ("points", "mesh", "cotangent")]
+    batch = LaplaceBeltrami.batch(shapes)
+    assert batch._bounds is not None
+    radius, height = batch.spectral_bounds
+    assert radius == max(shape.spectral_bounds.radius for shape in shapes)
+    angle = torch.linspace(0, 2 * torch.pi, 60)
+    for shape in shapes:
+        r, b = shape.spectral_bounds
+        x, y = r / 2 * (angle.cos() - 1), b * angle.sin()
+        assert ((1 + 2 * x / radius) ** 2 + (y / height) ** 2 <= 1 + 1e-5).all()
+
+
+def test_an_unstable_operator_has_no_ellipse():
+    """With an eigenvalue in the right half plane: the height is None, the radius Gershgorin's."""
+    lb = copy.deepcopy(built("points"))
+    lb.values = -lb.values
+    lb.set_bounds(None)
+    assert lb.spectral_bounds.height is None
+    assert lb.spectral_bounds.radius >= torch.linalg.eigvals(dense(lb)).abs().max()
+
+
 def test_repr_says_what_it_is(lb):
     text = repr(lb)
     assert f"{lb.num_points} points" in text

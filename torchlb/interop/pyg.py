@@ -20,6 +20,7 @@ from torch_geometric.transforms import BaseTransform
 
 from torchlb.errors import InputError
 from torchlb.io.cache import load_or_build
+from torchlb.linalg.spectral_bounds import Bounds, join_bounds
 from torchlb.operator.batching import join_certificates
 from torchlb.operator.dispatch import build_operator
 from torchlb.operator.laplace_beltrami import LaplaceBeltrami
@@ -153,6 +154,8 @@ def to_operator(data: Any) -> LaplaceBeltrami:
         lb.sizes = tuple(sizes.tolist())
         known = [i["certificate"] and Certificate(**i["certificate"]) for i in infos]
         lb.certificate = join_certificates(known)
+        bounds = [i.get("bounds") for i in infos]
+        lb.set_bounds(join_bounds([Bounds(*b) for b in bounds]) if all(bounds) else None)
     else:
         lb.set_extra_state(infos[0])
     if "lb_basis" in data:

@@ -17,7 +17,6 @@ from torch.nn.functional import softplus
 
 from torchlb.errors import DiffusionError, InputError
 from torchlb.linalg.exponential import EXPANSIONS, heat
-from torchlb.linalg.spectral_bounds import spectral_extent
 from torchlb.operator.laplace_beltrami import LaplaceBeltrami
 from torchlb.spectral.eigenbasis import Eigenbasis
 
@@ -135,9 +134,15 @@ def _expanded(
     lb: LaplaceBeltrami, x: Tensor, time: Tensor, expansion: str, tolerance: float
 ) -> Tensor:
     """e^{tΔ}x by one of the expansions; the surfaces of a stack (B, N, C) become channels."""
-    if lb.spectral_extent is None:
-        lb.spectral_extent = spectral_extent(lb.to_scipy(), lb.mass.detach().cpu().double().numpy())
-    extent = lb.spectral_extent
+    radius, height = lb.spectral_bounds
+    if height is None:
+        if expansion == "chebyshev":
+            raise DiffusionError(
+                "method='chebyshev': no ellipse in the left half plane holds the spectrum, as on an operator that "
+                "is not stable; build it with certify=True, or use method='rational'"
+            )
+        expansion = "rational"
+    extent = radius, height or 0.0
     pattern = [lb.crow, lb.col, lb.crow_t, lb.col_t, lb.order_t]
     values = lb.values.to(x.dtype)
     options = extent, expansion, tolerance, lb.sizes or (lb.num_points,)

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from torchlb.errors import InputError
 from torchlb.linalg.sparse import matmul, to_scipy
-from torchlb.linalg.spectral_bounds import join_extents
+from torchlb.linalg.spectral_bounds import join_bounds
 from torchlb.operator.batching import join_buffers, join_certificates
 from torchlb.operator.build import Built, Options, build_cloud, build_cotangent, build_mesh
 from torchlb.operator.report import StencilReport
@@ -169,8 +169,7 @@ class LaplaceBeltrami(OperatorStorage):
         lb.kind, lb.options = "batch", dict(shapes[0].options)
         lb.certificate = join_certificates([shape.certificate for shape in shapes])
         lb.sizes = tuple(n for shape in shapes for n in shape.sizes or (shape.num_points,))
-        extents = [e for e in (shape.spectral_extent for shape in shapes) if e is not None]
-        lb.spectral_extent = join_extents(extents) if len(extents) == len(shapes) else None
+        lb.set_bounds(join_bounds([shape.spectral_bounds for shape in shapes]))
         bases = [shape.eigenbasis(1, closed=True) for shape in shapes if len(shape.basis_left)]
         if len(bases) == len(shapes) and not any(shape.sizes for shape in shapes):
             lb._keep(stack_eigenbases(bases))
@@ -190,6 +189,7 @@ class LaplaceBeltrami(OperatorStorage):
         for name in REPORT_FIELDS:
             setattr(lb, f"report_{name}", report[name])
         lb._transpose()
+        _ = lb.bounds  # found once, from values that are not yet rounded
         dtype = torch.as_tensor(given).dtype
         return lb.to(dtype if dtype.is_floating_point else torch.get_default_dtype())
 

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import asdict
+from math import isnan
 from typing import Any
 
 import torch
 from torch import Tensor, nn
 
-from torchlb.linalg.sparse import transpose_pattern
+from torchlb.linalg.sparse import to_scipy, transpose_pattern
+from torchlb.linalg.spectral_bounds import Bounds, spectral_bounds
 from torchlb.spectral.eigenbasis import Eigenbasis
 from torchlb.stability.certificate import Certificate
 
@@ -55,7 +57,7 @@ class OperatorStorage(nn.Module):
         self.options: dict[str, Any] = {}
         self.certificate: Certificate | None = None
         self.sizes: tuple[int, ...] | None = None
-        self.spectral_extent: tuple[float, float] | None = None  # found by the layers that need it
+        self._bounds: Tensor | None = None
         for name in BUFFERS:
             self.register_buffer(name, torch.zeros(0))
         self.crow, self.col = torch.zeros(1, dtype=torch.int64), torch.zeros(0, dtype=torch.int64)
@@ -79,6 +81,29 @@ class OperatorStorage(nn.Module):
         sizes = self.sizes or (self.num_points,)
         return tuple(sum(sizes[:i]) for i in range(len(sizes) + 1))
 
+    @property
+    def spectral_bounds(self) -> Bounds:
+        """The ellipse that holds the spectrum of Δ, 1/ℓ²; found when the operator is built, and stored with it."""
+        radius, height = self.bounds.tolist()
+        return Bounds(radius, None if isnan(height) else height)
+
+    @property
+    def bounds(self) -> Tensor:
+        """`spectral_bounds` as a float64 tensor (2,) on the CPU, NaN for no height, which compiled code can take."""
+        if self._bounds is None:  # from a file or state of an older torchlb
+            n = self.num_points
+            matrix = to_scipy(self.crow, self.col, self.values.double(), (n, n))
+            self.set_bounds(spectral_bounds(matrix, self.mass.detach().cpu().double().numpy()))
+        assert self._bounds is not None
+        return self._bounds
+
+    def set_bounds(self, bounds: Bounds | None) -> None:
+        """Hold what is known of the spectrum; it is neither rounded nor moved with the buffers."""
+        known = None if bounds is None else [torch.nan if b is None else b for b in bounds]
+        self._bounds = (
+            None if known is None else torch.tensor(known, dtype=torch.float64, device="cpu")
+        )
+
     def _transpose(self) -> None:
         self.crow_t, self.col_t, self.order_t = transpose_pattern(
             self.crow, self.col, self.num_points
@@ -94,7 +119,7 @@ class OperatorStorage(nn.Module):
             self.register_buffer(key, value, persistent=not outside if store is None else store)
 
     def get_extra_state(self) -> dict[str, Any]:
-        """Kind, options and certificate, plain types only."""
+        """Kind, options, certificate and spectral bounds, plain types only."""
         certificate = None if self.certificate is None else asdict(self.certificate)
         sizes = None if self.sizes is None else list(self.sizes)
         return {
@@ -102,6 +127,7 @@ class OperatorStorage(nn.Module):
             "options": self.options,
             "certificate": certificate,
             "sizes": sizes,
+            "bounds": list(self.spectral_bounds),
         }
 
     def set_extra_state(self, state: dict[str, Any]) -> None:
@@ -111,6 +137,8 @@ class OperatorStorage(nn.Module):
         self.certificate = None if found is None else Certificate(**found)
         sizes = state.get("sizes")
         self.sizes = None if sizes is None else tuple(sizes)
+        bounds = state.get("bounds")
+        self.set_bounds(bounds and Bounds(*bounds))
 
     def _load_from_state_dict(
         self,
@@ -126,7 +154,7 @@ class OperatorStorage(nn.Module):
         for name in BASIS:
             stored = f"{prefix}basis_{name}" in state_dict
             self.register_buffer(f"basis_{name}", self.values.new_zeros(0), persistent=stored)
-        self.spectral_extent = None
+        self._bounds = None
         for name, buffer in list(self.named_buffers()):
             incoming = state_dict.get(prefix + name)
             if incoming is not None:
