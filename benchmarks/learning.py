@@ -8,7 +8,7 @@ every shape turned at random, also those that test. Weights, order and turns of 
 torchlb: `from_mesh`, and `from_points` on clouds. cotangent: `from_cotangent`; it has none for clouds, which get
 torchlb's. original: what DiffusionNet's own code computes, written from its description: potpourri3d's cotangent
 matrix and lumped mass on meshes, robust_laplacian on clouds, `eigsh` at 1e-8, gradients by least squares over the one
-ring or 30 neighbours; its diffusion is the spectral one. Gradients are not rotated (`with_gradient_rotations=False`),
+ring or 30 neighbours; its diffusion is the spectral one. Gradients are not rotated (`rotations=False`),
 which a cloud without oriented normals asks for in either code.
 """
 
@@ -169,10 +169,10 @@ def run(
     net = DiffusionNet(
         3,
         classes,
-        options.width,
-        options.blocks,
-        with_gradient_rotations=False,
-        diffusion_method=method,
+        width=options.width,
+        num_blocks=options.blocks,
+        rotations=False,
+        method=method,
         k=options.k,
     )
     optimizer = torch.optim.Adam(net.parameters(), lr=3e-3)
@@ -198,7 +198,7 @@ def main() -> None:
     parser.add_argument("--width", type=int, default=32)
     parser.add_argument("--blocks", type=int, default=3)
     parser.add_argument(
-        "--methods", nargs="+", default=["spectral", "full"], help="of diffusion, on torchlb's"
+        "--methods", nargs="+", default=["spectral", "deflated"], help="of diffusion, on torchlb's"
     )
     options = parser.parse_args()
     if options.quick:
@@ -215,8 +215,8 @@ def main() -> None:
     )
     print(
         f"\n\n{len(sets['train'])} shapes train, {len(shapes[2::3])} test; {options.points} points, "
-        f"{classes} labels, {options.epochs} epochs of Adam (3e-3, cosine), C_width={options.width}, "
-        f"N_block={options.blocks}, k={options.k}; accuracy in % of the points, mean ± deviation of "
+        f"{classes} labels, {options.epochs} epochs of Adam (3e-3, cosine), width={options.width}, "
+        f"num_blocks={options.blocks}, k={options.k}; accuracy in % of the points, mean ± deviation of "
         f"{options.seeds} seeds; one thread.\n"
     )
     columns = ["operators", "diffusion", *list(sets)[1:], "s an epoch"]

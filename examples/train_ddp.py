@@ -34,7 +34,9 @@ def shape(i, points, cache):
 def train(rank, processes, options):
     """Loss of every step, the mean over all shapes. Each process takes every `processes`-th of them."""
     torch.manual_seed(0)  # the same weights everywhere; DDP would send those of the first
-    net = DiffusionNet(3, 1, 16, 2, dropout=False, diffusion_method="spectral", k=16).double()
+    net = DiffusionNet(
+        3, 1, width=16, num_blocks=2, dropout=False, method="spectral", k=16
+    ).double()
     model = DistributedDataParallel(net) if processes > 1 else net
     optimizer = torch.optim.Adam(model.parameters(), lr=5e-3)
     cache = options.output / "cache"

@@ -50,8 +50,8 @@ def main(arguments=None):
     test = shapes.pop(3)
     train = DataLoader(shapes, batch_size=2, shuffle=True)
 
-    small = {"C_width": 32, "N_block": 2, "k": K, "dropout": False}
-    net = DiffusionNet(test.x.shape[1], 1, diffusion_method="spectral", **small)
+    small = {"width": 32, "num_blocks": 2, "k": K, "dropout": False}
+    net = DiffusionNet(test.x.shape[1], 1, method="spectral", **small)
     optimizer = torch.optim.Adam(net.parameters(), lr=5e-3)
     losses = []
     for _ in tqdm(range(options.epochs), "epochs"):

@@ -9,10 +9,12 @@ from torchlb import (
     DiffusionNet,
     DiffusionNetBlock,
     GradientFeatures,
+    InputError,
     LaplaceBeltrami,
     heat_flow,
 )
-from torchlb.nn.diffusion_net import _Dropout
+from torchlb.nn.checks import check_choice
+from torchlb.nn.diffusion_net import Place, _Dropout
 from torchlb.surfaces import Circle, Sphere, Torus
 
 WIDTH, HIDDEN, BLOCKS = 8, [12, 10], 2
@@ -84,12 +86,12 @@ def test_original_weights_give_the_original_formula(mesh, gradients, rotations):
     net = DiffusionNet(
         3,
         5,
-        WIDTH,
-        BLOCKS,
-        mlp_hidden_dims=HIDDEN,
-        with_gradient_features=gradients,
-        with_gradient_rotations=rotations,
-        diffusion_method="spectral",
+        width=WIDTH,
+        num_blocks=BLOCKS,
+        hidden=HIDDEN,
+        gradient_features=gradients,
+        rotations=rotations,
+        method="spectral",
         k=40,
     )
     net = net.double().eval()
@@ -105,7 +107,7 @@ def test_published_layout_of_the_default_network():
     with pytest.raises(ValueError, match=r"missing \['block_0.diffusion.diffusion_time'"):
         net.load_original_state_dict({})
     state = original_weights()
-    small = DiffusionNet(3, 5, WIDTH, BLOCKS, mlp_hidden_dims=HIDDEN)
+    small = DiffusionNet(3, 5, width=WIDTH, num_blocks=BLOCKS, hidden=HIDDEN)
     with pytest.raises(ValueError, match=re.escape("unexpected ['more']")):
         small.load_original_state_dict({**state, "more": torch.zeros(1)})
     state["last_lin.bias"] = torch.zeros(6)
@@ -131,7 +133,7 @@ def test_network_of_intrinsic_features_does_not_see_rigid_motions():
     points = Torus().random_points(300)
     rotation = torch.linalg.qr(torch.randn(3, 3).double())[0]
     rotation *= rotation.det()
-    net = DiffusionNet(2, 3, WIDTH, k=30).double().eval()
+    net = DiffusionNet(2, 3, width=WIDTH, k=30).double().eval()
     x = torch.randn(300, 2).double()
     first = LaplaceBeltrami.from_points(points)
     second = LaplaceBeltrami.from_points(points @ rotation.T + 1)
@@ -143,7 +145,7 @@ def test_outputs_at_every_place(mesh):
     lb, faces = mesh
     edges = faces[:, :2]
     nets = {
-        place: DiffusionNet(3, 5, WIDTH, outputs_at=place, k=30).double().eval()
+        place: DiffusionNet(3, 5, width=WIDTH, outputs_at=place, k=30).double().eval()
         for place in ("vertices", "faces", "edges", "global_mean")
     }
     for net in nets.values():
@@ -163,7 +165,7 @@ def test_outputs_at_every_place(mesh):
 def test_block_is_its_formula(mesh):
     """x + MLP(x, e^{tΔ}x)."""
     lb, _ = mesh
-    block = DiffusionNetBlock(4, [6], dropout=False, with_gradient_features=False, k=30).double()
+    block = DiffusionNetBlock(4, hidden=[6], dropout=False, gradient_features=False, k=30).double()
     x = torch.randn(300, 4).double()
     diffused = heat_flow(lb, x, block.diffusion.time, k=30)
     torch.testing.assert_close(block(x, lb), x + block.mlp(torch.cat([x, diffused], dim=1)))
@@ -171,7 +173,7 @@ def test_block_is_its_formula(mesh):
 
 def test_dropout_is_there_while_training_only(mesh):
     lb, _ = mesh
-    net = DiffusionNet(3, 5, WIDTH, k=30).double()
+    net = DiffusionNet(3, 5, width=WIDTH, k=30).double()
     assert not torch.equal(net(lb.points, lb), net(lb.points, lb))
     net.eval()
     assert torch.equal(net(lb.points, lb), net(lb.points, lb))
@@ -200,18 +202,16 @@ def test_dropout_keeps_half_and_doubles_it(dtype):
 
 def test_a_curve_has_gradient_features_without_rotations():
     lb = LaplaceBeltrami.from_points(Circle().points(60))
-    net = DiffusionNet(2, 3, WIDTH, with_gradient_rotations=False, k=20).double()
+    net = DiffusionNet(2, 3, width=WIDTH, rotations=False, k=20).double()
     assert net(lb.points, lb).shape == (60, 3)
     with pytest.raises(ValueError, match="rotations need a surface, got dim=1"):
-        DiffusionNet(2, 3, WIDTH, k=20).double()(lb.points, lb)
+        DiffusionNet(2, 3, width=WIDTH, k=20).double()(lb.points, lb)
 
 
 def test_arguments_that_are_none():
-    with pytest.raises(ValueError, match="outputs_at: expected one of"):
-        DiffusionNet(3, 5, outputs_at="volumes")
-    with pytest.raises(ValueError, match="method: expected one of"):
-        DiffusionNet(3, 5, diffusion_method="implicit_dense")
-    with pytest.raises(ValueError, match="expected C_in = 3"):
+    with pytest.raises(InputError, match="outputs_at: expected one of"):
+        check_choice("outputs_at", "volumes", Place)
+    with pytest.raises(InputError, match="expected 3 channels"):
         DiffusionNet(3, 5)(
             torch.zeros(100, 2), LaplaceBeltrami.from_points(Sphere().points(100).float())
         )
@@ -220,7 +220,7 @@ def test_arguments_that_are_none():
 def test_it_learns_where_the_poles_are():
     """Sign of z on the sphere from xyz: every step lowers the loss to a tenth in the end."""
     lb = LaplaceBeltrami.from_points(Sphere().points(200).float())
-    net = DiffusionNet(3, 2, WIDTH, 2, dropout=False, k=20)
+    net = DiffusionNet(3, 2, width=WIDTH, num_blocks=2, dropout=False, k=20)
     labels = (lb.points[:, 2] > 0).long()
     optimizer = torch.optim.Adam(net.parameters(), lr=5e-3)
     losses = []

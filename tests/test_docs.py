@@ -55,7 +55,7 @@ def damaged():
 
 def circle_network():
     lb = LaplaceBeltrami.from_points(Circle().points(30).float(), order=1)
-    DiffusionNet(2, 1, C_width=4, N_block=1, k=4)(torch.zeros(30, 2), lb)
+    DiffusionNet(2, 1, width=4, num_blocks=1, k=4)(torch.zeros(30, 2), lb)
 
 
 # By the beginning of the heading: what gives the message.

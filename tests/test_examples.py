@@ -145,7 +145,7 @@ SMALL = ["--decimate", "150", "--k", "12", "--width", "8"]
 @pytest.mark.parametrize(("operator", "test"), [("stencil", "clouds"), ("cotangent", "meshes")])
 def test_segmentation_trains_resumes_where_it_stopped_and_draws(tmp_path, operator, test, capsys):
     example = load("train_segmentation")
-    method = "full" if operator == "stencil" else "spectral"
+    method = "deflated" if operator == "stencil" else "spectral"
     chosen = [*SMALL, "--operator", operator, "--test", test, "--method", method]
     whole, parts = tmp_path / "whole", tmp_path / "parts"
     accuracy = example.main([*chosen, "--output", str(whole), "--epochs", "2"])

@@ -290,7 +290,7 @@ def test_the_network_on_the_tuple_is_torchlbs_own_on_the_operator(shape):
         nn.init.uniform_(block.diffusion.diffusion_time, 0.01, 0.3)
     _, mass, L, evals, evecs, gradX, gradY = get_operators(verts, faces, k_eig=20)
     ours = torchlb.DiffusionNet(
-        3, 4, C_width=8, N_block=2, diffusion_method="spectral", dropout=False, k=20
+        3, 4, width=8, num_blocks=2, method="spectral", dropout=False, k=20
     ).double()
     ours.load_original_state_dict(original.state_dict())
     y = original(verts, mass, L, evals, evecs, gradX, gradY)

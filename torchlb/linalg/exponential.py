@@ -5,7 +5,7 @@ Two expansions e^{tL}x = Σ_k c_k(t) v_k, whose vectors v_k all channels and tim
 - "chebyshev": v_k = r^{−k} T_k((L + a)/d) x, c_k = 2 r^k e^{−ta} I_k(td), for a spectrum in the ellipse around −a
   with the half axes a and b, d² = a² − b², r = (a + b)/d. It touches 0, so that no c_k v_k is larger than x; b = 0 is
   the interval. About √(4ta ln 1/ε) + tb products.
-- "rational": v_k = (z_k − L)⁻¹x on a hyperbola in the left half plane (Weideman, Trefethen 2007), by sparse LU on
+- "contour": v_k = (z_k − L)⁻¹x on a hyperbola in the left half plane (Weideman, Trefethen 2007), by sparse LU on
   the CPU; about 15 of them, for any spectrum in a sector around the negative axis and all times within a factor 10.
 
 "either" is the first unless that takes more than `PRODUCTS` of them, where slivers make the spectrum long. In both
@@ -28,16 +28,15 @@ from scipy.optimize import minimize_scalar
 from scipy.special import ive
 from torch import Tensor
 
-from torchlb.errors import InputError
+from torchlb.errors import DiffusionError
 from torchlb.linalg.factor import factorized
 from torchlb.linalg.sparse import csr_product, multiply
 
-__all__ = ["EXPANSIONS", "chebyshev_coefficients", "heat", "hyperbola"]
+__all__ = ["chebyshev_coefficients", "heat", "hyperbola"]
 
-EXPANSIONS = ["chebyshev", "rational"]
 MAX_TERMS = 30_000
 PRODUCTS = 5_000
-"""Beyond this many the sparse factors of the rational sum are quicker."""
+"""Beyond this many the sparse factors of the contour sum are quicker."""
 SECTOR = 0.4
 """Half angle (radians) around the negative axis that the hyperbola stays clear of; the largest seen is 0.35."""
 WINDOW = 10.0
@@ -65,7 +64,7 @@ def heat(
     values : of L, 1/ℓ²; no gradient goes there.
     time : t ≥ 0, ℓ².
     extent : (R, b): the spectrum lies in the ellipse of half axes R/2, b around −R/2.
-    expansion : one of `EXPANSIONS`, or "either".
+    expansion : "chebyshev", "contour" or "either".
     tolerance : of the result, relative to x.
     sizes : numbers of rows of the diagonal blocks of L; (N,) for one shape.
     """
@@ -90,7 +89,7 @@ def _heat(
     sizes: Sequence[int],
     transposed: bool,
 ) -> Tensor:
-    expansion, dtype = _settled(expansion, x, time, extent, tolerance)
+    expansion, dtype = _choose_expansion(expansion, x, time, extent, tolerance)
     y = torch.zeros_like(x, dtype=dtype, memory_format=torch.contiguous_format)
     options = extent, expansion, tolerance, sizes, transposed
     for where, vector, coefficient, _ in _terms(pattern, values, x.to(dtype), time, *options):
@@ -116,7 +115,7 @@ def _heat_backward(
     transposed: bool,
     grad: Tensor,
 ) -> tuple[Tensor, Tensor]:
-    expansion, dtype = _settled(expansion, x, time, extent, tolerance)
+    expansion, dtype = _choose_expansion(expansion, x, time, extent, tolerance)
     grad_x = torch.zeros_like(x, dtype=dtype, memory_format=torch.contiguous_format)
     grad_t = torch.zeros_like(time)
     options = extent, expansion, tolerance, sizes, not transposed
@@ -128,18 +127,18 @@ def _heat_backward(
     return grad_x.to(x.dtype), grad_t
 
 
-def _settled(
+def _choose_expansion(
     expansion: str, x: Tensor, time: Tensor, extent: Sequence[float], tolerance: float
 ) -> tuple[str, torch.dtype]:
     """What "either" stands for, and the type to sum in; here, since outside the operation times have no values yet.
 
-    The rational sum cancels: its terms are some hundred times larger than it.
+    The contour sum cancels: its terms are some hundred times larger than it.
     """
     if expansion == "either":
         longest = float(time.max()) if len(time) else 0.0
         few = _estimate(longest, extent[0] / 2, extent[1], tolerance) < PRODUCTS
-        expansion = "chebyshev" if few else "rational"
-    return expansion, torch.float64 if expansion == "rational" else x.dtype
+        expansion = "chebyshev" if few else "contour"
+    return expansion, torch.float64 if expansion == "contour" else x.dtype
 
 
 @_heat.register_fake
@@ -201,7 +200,7 @@ def _terms(
         return iter(())
     if expansion == "chebyshev":
         return _chebyshev(pattern, values, x, times, extent, tolerance, sizes, transposed)
-    return _rational(pattern, values, x, times, extent[0], tolerance, transposed)
+    return _contour(pattern, values, x, times, extent[0], tolerance, transposed)
 
 
 def _estimate(longest: float, a: float, b: float, tolerance: float) -> float:
@@ -228,9 +227,9 @@ def chebyshev_coefficients(
     longest = float(times.max())
     estimate = _estimate(longest, a, b, tolerance)
     if not estimate < MAX_TERMS:
-        raise InputError(
+        raise DiffusionError(
             f"a diffusion time of {longest:.3g} with a spectral radius of {radius:.3g} takes {estimate:.0f} products; "
-            "use shorter times, method='rational' or method='spectral', or mend the slivers that make the radius large"
+            "use shorter times, method='contour' or method='spectral', or mend the slivers that make the radius large"
         )
     distinct, place = np.unique(times, return_inverse=True)
     k = np.arange(-1, int(estimate) + 2)[:, None]
@@ -329,7 +328,7 @@ def _windows(times: np.ndarray) -> Iterator[np.ndarray]:
         order = order[together:]
 
 
-def _rational(
+def _contour(
     pattern: Sequence[Tensor],
     values: Tensor,
     x: Tensor,

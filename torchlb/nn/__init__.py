@@ -1,5 +1,6 @@
 """Layers that learn, with the operator as an argument.
 
-`diffusion`: heat flow for given and for learned times. `spectral_conv`: learned filters in the spectrum.
+`checks`: what all of them ask of features and operator. `diffusion`: heat flow for given and for learned times.
+`spectral_conv`: learned filters in the spectrum.
 `gradient_features`, `diffusion_net`: the network of Sharp et al. on any operator.
 """

@@ -1,14 +1,16 @@
 """Heat flow e^{tΔ}f, for given times and for learned ones (`method.md`, section 8).
 
-method="full", the default, is exact at every scale: on the span of the slow eigenvectors by their own small matrix, on
-the rest, split off by the oblique projector, by a short Chebyshev series, since nothing of it is left after about
+method="deflated", the default, is exact at every scale: on the span of the slow eigenvectors by their own small matrix,
+on the rest, split off by the oblique projector, by a short Chebyshev series, since nothing of it is left after about
 16/λ_k. "spectral" is the first part alone: everything beyond the basis is dropped, also as t → 0. "chebyshev" and
-"rational" need no basis.
+"contour" need no basis.
 """
 
 from __future__ import annotations
 
 import math
+import warnings
+from typing import Literal, cast
 
 import torch
 from jaxtyping import Float
@@ -16,13 +18,15 @@ from torch import Tensor, nn
 from torch.nn.functional import softplus
 
 from torchlb.errors import DiffusionError, InputError
-from torchlb.linalg.exponential import EXPANSIONS, heat
+from torchlb.linalg.exponential import heat
+from torchlb.nn.checks import check_choice, check_features, check_shape
 from torchlb.operator.laplace_beltrami import LaplaceBeltrami
 from torchlb.spectral.eigenbasis import Eigenbasis
 
-__all__ = ["Diffusion", "heat_flow", "raw_of_time"]
+__all__ = ["Diffusion", "Method", "heat_flow", "raw_of_time"]
 
-METHODS = ["full", "spectral", *EXPANSIONS]
+Method = Literal["deflated", "spectral", "chebyshev", "contour"]
+FORMER_NAMES = {"full": "deflated", "rational": "contour"}
 TOLERANCE = 1e-7
 SHARPNESS = 100.0
 """Of the softplus that keeps learned times positive: above 0.05 ℓ² it is the identity to 1 %."""
@@ -33,25 +37,29 @@ def heat_flow(
     f: Float[Tensor, "*B N C"] | Float[Tensor, " N"],
     t: float | Tensor,
     *,
-    method: str = "full",
+    method: Method = "deflated",
     k: int = 128,
     tolerance: float = TOLERANCE,
 ) -> Tensor:
     """e^{tΔ}f: what f becomes when it diffuses over the surface for a time t; differentiable in f and t.
+
+    Computed in the wider of the types of f and the operator, at least float32; only a half-precision f gives its own.
 
     Parameters
     ----------
     lb : operator of one shape, or of a batch.
     f : (N,), (N, C) or (B, N, C).
     t : time ≥ 0 in ℓ², one for all channels or (C,). (In a time t a peak spreads to a width of √(2t).)
-    method : "full", "spectral", "chebyshev" or "rational".
+    method : "deflated", "spectral", "chebyshev" or "contour".
     k : number of eigenpairs, for the first two.
-    tolerance : of the others, relative to f.
+    tolerance : of the error in the norm of π, relative to |f|. Values that are smaller than that everywhere around,
+        as far away from a heated point, are noise: logarithms and directions of them (geodesics) need an implicit step.
 
     Raises
     ------
-    ValueError : for negative times, an unknown method, or a time that would take too many products.
-    DiffusionError : where the eigenbasis cannot be had.
+    InputError : for times that are negative or not finite, for an unknown method and a wrong shape.
+    DiffusionError : where the method cannot be used: a series of too many products or of no ellipse, a basis of
+        dependent eigenvectors.
 
     Examples
     --------
@@ -60,40 +68,42 @@ def heat_flow(
     >>> bool(torch.allclose(heat_flow(lb, theta.cos(), 0.5), math.exp(-0.5) * theta.cos(), atol=1e-2))
     True
     """
-    check_method(method)
+    method = checked_method(method)
     x = f[:, None] if f.ndim == 1 else f
-    time = torch.as_tensor(t, dtype=torch.promote_types(x.dtype, torch.float32), device=x.device)
-    if not torch.compiler.is_compiling() and bool((time < 0).any()):
-        raise InputError(f"t: expected times of at least 0, got {float(time.min()):.3g}")
-    time = time.expand(x.shape[-1])
-    y = _flow(lb, x, time, method, k, tolerance)
+    check_shape(x, lb)
+    dtype = torch.promote_types(torch.promote_types(x.dtype, lb.values.dtype), torch.float32)
+    time = torch.as_tensor(t, dtype=dtype, device=x.device)
+    if not torch.compiler.is_compiling() and not bool(((time >= 0) & time.isfinite()).all()):
+        raise InputError(f"t: expected finite times of at least 0, got {time.detach().cpu()}")
+    with torch.autocast(x.device.type, enabled=False):
+        y = _flow(lb, x.to(dtype), time.expand(x.shape[-1]), method, k, tolerance)
+    y = y.to(x.dtype) if x.dtype.itemsize < 4 else y
     return y[:, 0] if f.ndim == 1 else y
 
 
-def check_method(method: str) -> None:
-    """ValueError for a method that is none."""
-    if method not in METHODS:
-        raise InputError(f"method: expected one of {METHODS}, got {method!r}")
+def checked_method(method: str) -> Method:
+    """The method, by its name of today.
+
+    >>> checked_method("chebyshev")
+    'chebyshev'
+    """
+    if method in FORMER_NAMES:
+        message = f"method={method!r} is called {FORMER_NAMES[method]!r} now"
+        warnings.warn(message, DeprecationWarning, stacklevel=3)
+        method = FORMER_NAMES[method]
+    check_choice("method", method, Method)
+    return cast(Method, method)
 
 
 def _flow(
     lb: LaplaceBeltrami, x: Tensor, time: Tensor, method: str, k: int, tolerance: float
 ) -> Tensor:
-    """e^{tΔ}x, computed in the wider of the types of x and the operator, at least float32, also under autocast."""
-    if not (x.ndim in (2, 3) and x.shape[-2] == lb.num_points):
-        raise InputError(
-            f"expected features of shape (N, C) or (B, N, C) with N = {lb.num_points}, got {tuple(x.shape)}"
-        )
-    dtype = torch.promote_types(torch.promote_types(x.dtype, lb.values.dtype), torch.float32)
-    with torch.autocast(x.device.type, enabled=False):
-        wide, time = x.to(dtype), time.to(dtype)
-        if method == "spectral":
-            y = _spectral(lb.eigenbasis(k), wide, time)
-        elif method == "full":
-            y = _full(lb, lb.eigenbasis(k, closed=True), wide, time, tolerance)
-        else:
-            y = _expanded(lb, wide, time, method, tolerance)
-    return y.to(x.dtype) if x.dtype.itemsize < 4 else y
+    """e^{tΔ}x in the type of x, which is float32 or float64; autocast has to be off."""
+    if method == "spectral":
+        return _spectral(lb.eigenbasis(k), x, time)
+    if method == "deflated":
+        return _deflated(lb, lb.eigenbasis(k, closed=True), x, time, tolerance)
+    return _expanded(lb, x, time, method, tolerance)
 
 
 def _spectral(basis: Eigenbasis, x: Tensor, time: Tensor) -> Tensor:
@@ -102,13 +112,13 @@ def _spectral(basis: Eigenbasis, x: Tensor, time: Tensor) -> Tensor:
     return basis.from_basis(decay * basis.to_basis(x))
 
 
-def _full(
+def _deflated(
     lb: LaplaceBeltrami, basis: Eigenbasis, x: Tensor, time: Tensor, tolerance: float
 ) -> Tensor:
     """e^{−tB} on the span, a series on the rest, whose time is cut where it has decayed below the tolerance."""
     if basis.modal_transform is None or basis.decay_rates is None:
         raise DiffusionError(
-            "method='full': the slow eigenvectors are too close to dependent, or fewer than the components; "
+            "method='deflated': the slow eigenvectors are too close to dependent, or fewer than the components; "
             "ask for another k, or use method='chebyshev' or 'spectral'"
         )
     coefficients = basis.to_basis_obliquely(x)
@@ -139,9 +149,9 @@ def _expanded(
         if expansion == "chebyshev":
             raise DiffusionError(
                 "method='chebyshev': no ellipse in the left half plane holds the spectrum, as on an operator that "
-                "is not stable; build it with certify=True, or use method='rational'"
+                "is not stable; build it with certify=True, or use method='contour'"
             )
-        expansion = "rational"
+        expansion = "contour"
     extent = radius, height or 0.0
     pattern = [lb.crow, lb.col, lb.crow_t, lb.col_t, lb.order_t]
     values = lb.values.to(x.dtype)
@@ -159,11 +169,11 @@ class Diffusion(nn.Module):
     Parameters
     ----------
     channels : C.
-    method : "full" (exact at every scale), "spectral" (of the original DiffusionNet: Φe^{−λt}Φᵀπ, which drops
-        everything beyond the basis), "chebyshev" or "rational" (no basis; the latter solves on the CPU).
+    method : "deflated" (exact at every scale), "spectral" (of the original DiffusionNet: Φe^{−λt}Φᵀπ, which drops
+        everything beyond the basis), "chebyshev" or "contour" (no basis; the latter solves on the CPU).
     k : number of eigenpairs for the first two.
     init_time : ℓ², at the start. Shapes of radius about one are expected.
-    tolerance : of "full", "chebyshev" and "rational", relative to x.
+    tolerance : of all but "spectral", see `heat_flow`.
 
     Attributes
     ----------
@@ -181,15 +191,15 @@ class Diffusion(nn.Module):
     def __init__(
         self,
         channels: int,
-        method: str = "full",
         *,
+        method: Method = "deflated",
         k: int = 128,
         init_time: float = 0.01,
         tolerance: float = TOLERANCE,
     ) -> None:
         super().__init__()
-        check_method(method)
-        self.channels, self.method, self.k, self.tolerance = channels, method, k, tolerance
+        self.channels, self.method = channels, checked_method(method)
+        self.k, self.tolerance = k, tolerance
         self.raw_time = nn.Parameter(raw_of_time(torch.full((channels,), init_time)))
 
     @property
@@ -198,14 +208,21 @@ class Diffusion(nn.Module):
         return softplus(self.raw_time, beta=SHARPNESS)
 
     def forward(self, x: Float[Tensor, "*B N C"], lb: LaplaceBeltrami) -> Float[Tensor, "*B N C"]:
-        """The diffused features, of the shape of x: (N, C), or (B, N, C) on one surface."""
-        if not (x.shape[-1] == self.channels):
-            raise InputError(f"expected {self.channels} channels, got x of shape {tuple(x.shape)}")
-        return _flow(lb, x, self.time, self.method, self.k, self.tolerance)
+        """The diffused features, of the shape and type of x: (N, C), or (B, N, C) on one surface."""
+        dtype = check_features(x, lb, self.channels, self.raw_time, self.used_k)
+        with torch.autocast(x.device.type, enabled=False):
+            time = self.time.to(dtype)
+            y = _flow(lb, x.to(dtype), time, self.method, self.k, self.tolerance)
+        return y.to(x.dtype)
+
+    @property
+    def used_k(self) -> int:
+        """Number of eigenpairs that the method needs."""
+        return self.k if self.method in ("deflated", "spectral") else 0
 
     def extra_repr(self) -> str:
         """Channels, method, k."""
-        basis = f", k={self.k}" if self.method in ("full", "spectral") else ""
+        basis = f", k={self.k}" if self.used_k else ""
         return f"{self.channels}, method={self.method!r}{basis}"
 
 

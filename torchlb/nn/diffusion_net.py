@@ -1,27 +1,29 @@
 """DiffusionNet (Sharp, Attaiki, Crane, Ovsjanikov 2022) on any operator: diffusion, gradients, pointwise networks.
 
-The arguments are those of the original where its users know them. What differs: the operator comes in as one argument,
-`forward(x, lb)`; diffusion is "full" unless asked to be the original's "spectral"; learned times are positive by
-parametrisation; batches of different shapes are one operator. Its trained weights load: `load_original_state_dict`.
+What differs from the original: the operator comes in as one argument, `forward(x, lb)`; diffusion is "deflated" unless
+asked to be the original's "spectral"; learned times are positive by parametrisation; batches of different shapes are
+one operator. Its trained weights load: `load_original_state_dict`.
 """
 
 from __future__ import annotations
 
 from collections import OrderedDict
 from collections.abc import Callable, Mapping, Sequence
+from typing import Literal
 
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor, nn
 
 from torchlb.errors import InputError
-from torchlb.nn.diffusion import Diffusion, raw_of_time
+from torchlb.nn.checks import check_choice, check_features
+from torchlb.nn.diffusion import Diffusion, Method, raw_of_time
 from torchlb.nn.gradient_features import GradientFeatures
 from torchlb.operator.laplace_beltrami import LaplaceBeltrami
 
 __all__ = ["DiffusionNet", "DiffusionNetBlock"]
 
-PLACES = ["vertices", "edges", "faces", "global_mean"]
+Place = Literal["vertices", "edges", "faces", "global_mean"]
 LEAST_TIME = 1e-8
 """What the original cuts its times to before it uses them, ℓ²."""
 
@@ -57,34 +59,35 @@ class DiffusionNetBlock(nn.Module):
 
     Parameters
     ----------
-    C_width : channels in and out.
-    mlp_hidden_dims : widths of the hidden layers.
-    dropout : whether the network drops half of its hidden values while it trains.
-    diffusion_method, k : of `Diffusion`.
-    with_gradient_features, with_gradient_rotations : see `GradientFeatures`.
+    width : channels in and out.
+    hidden : widths of the hidden layers of the pointwise network; [width, width] by default.
+    dropout : whether that network drops half of its hidden values while it trains.
+    gradient_features, rotations : whether there are any, and whether they turn: see `GradientFeatures`.
+    method, k : of `Diffusion`.
     """
 
     def __init__(
         self,
-        C_width: int,
-        mlp_hidden_dims: Sequence[int],
-        dropout: bool = True,
-        diffusion_method: str = "full",
-        with_gradient_features: bool = True,
-        with_gradient_rotations: bool = True,
+        width: int,
         *,
+        hidden: Sequence[int] | None = None,
+        dropout: bool = True,
+        gradient_features: bool = True,
+        rotations: bool = True,
+        method: Method = "deflated",
         k: int = 128,
     ) -> None:
         super().__init__()
-        self.diffusion = Diffusion(C_width, diffusion_method, k=k)
+        self.diffusion = Diffusion(width, method=method, k=k)
         self.gradient_features = (
-            GradientFeatures(C_width, with_gradient_rotations) if with_gradient_features else None
+            GradientFeatures(width, rotations=rotations) if gradient_features else None
         )
-        inputs = 3 if with_gradient_features else 2
-        self.mlp = _mlp([inputs * C_width, *mlp_hidden_dims, C_width], dropout)
+        inputs = 3 if gradient_features else 2
+        hidden = [width, width] if hidden is None else hidden
+        self.mlp = _mlp([inputs * width, *hidden, width], dropout)
 
     def forward(self, x: Float[Tensor, "*B N C"], lb: LaplaceBeltrami) -> Float[Tensor, "*B N C"]:
-        """Features (N, C_width) or (B, N, C_width) in the shape of x."""
+        """Features (N, width) or (B, N, width) in the shape of x."""
         diffused = self.diffusion(x, lb)
         features = [x, diffused]
         if self.gradient_features is not None:
@@ -93,69 +96,64 @@ class DiffusionNetBlock(nn.Module):
 
 
 class DiffusionNet(nn.Module):
-    """A network of `N_block` blocks between two pointwise linear maps.
+    """A network of `num_blocks` blocks between two pointwise linear maps.
 
     Parameters
     ----------
-    C_in, C_out : channels of the input and of the output.
-    C_width : channels of the blocks.
-    N_block : number of blocks.
-    last_activation : applied to the output, such as ``lambda y: y.log_softmax(-1)``.
+    in_channels, out_channels : of the features and of the output.
+    width : channels of the blocks.
+    num_blocks : number of `DiffusionNetBlock`.
     outputs_at : "vertices", "edges", "faces" (means over the corners) or "global_mean" (over the surface, by mass).
-    mlp_hidden_dims : hidden widths of the blocks' networks; [C_width, C_width] by default.
-    dropout, with_gradient_features, with_gradient_rotations : of the blocks.
-    diffusion_method : "full", "spectral" (the original's), "chebyshev" or "rational".
-    k : number of eigenpairs.
+    last_activation : applied to the output, such as ``lambda y: y.log_softmax(-1)``.
+    hidden, dropout, gradient_features, rotations, method, k : of the blocks.
 
     Raises
     ------
-    ValueError : for a method or a place that is none.
+    InputError : for a method or a place that is none.
 
     Examples
     --------
     >>> theta = torch.arange(36) * torch.pi / 18
     >>> circle = torch.stack([theta.cos(), theta.sin()], dim=1)
     >>> lb = LaplaceBeltrami.from_points(circle)
-    >>> DiffusionNet(2, 5, C_width=8, with_gradient_rotations=False)(circle, lb).shape
+    >>> DiffusionNet(2, 5, width=8, rotations=False)(circle, lb).shape
     torch.Size([36, 5])
     """
 
     def __init__(
         self,
-        C_in: int,
-        C_out: int,
-        C_width: int = 128,
-        N_block: int = 4,
-        last_activation: Callable[[Tensor], Tensor] | None = None,
-        outputs_at: str = "vertices",
-        mlp_hidden_dims: Sequence[int] | None = None,
-        dropout: bool = True,
-        with_gradient_features: bool = True,
-        with_gradient_rotations: bool = True,
-        diffusion_method: str = "full",
+        in_channels: int,
+        out_channels: int,
         *,
+        width: int = 128,
+        num_blocks: int = 4,
+        outputs_at: Place = "vertices",
+        last_activation: Callable[[Tensor], Tensor] | None = None,
+        hidden: Sequence[int] | None = None,
+        dropout: bool = True,
+        gradient_features: bool = True,
+        rotations: bool = True,
+        method: Method = "deflated",
         k: int = 128,
     ) -> None:
         super().__init__()
-        if outputs_at not in PLACES:
-            raise InputError(f"outputs_at: expected one of {PLACES}, got {outputs_at!r}")
-        self.C_in, self.C_out, self.outputs_at = C_in, C_out, outputs_at
-        self.last_activation = last_activation
-        hidden = [C_width, C_width] if mlp_hidden_dims is None else mlp_hidden_dims
-        self.first_lin = nn.Linear(C_in, C_width)
+        check_choice("outputs_at", outputs_at, Place)
+        self.in_channels, self.out_channels = in_channels, out_channels
+        self.outputs_at, self.last_activation = outputs_at, last_activation
+        self.first_lin = nn.Linear(in_channels, width)
         self.blocks = nn.ModuleList(
             DiffusionNetBlock(
-                C_width,
-                hidden,
-                dropout,
-                diffusion_method,
-                with_gradient_features,
-                with_gradient_rotations,
+                width,
+                hidden=hidden,
+                dropout=dropout,
+                gradient_features=gradient_features,
+                rotations=rotations,
+                method=method,
                 k=k,
             )
-            for _ in range(N_block)
+            for _ in range(num_blocks)
         )
-        self.last_lin = nn.Linear(C_width, C_out)
+        self.last_lin = nn.Linear(width, out_channels)
 
     def forward(
         self,
@@ -164,18 +162,15 @@ class DiffusionNet(nn.Module):
         faces: Int[Tensor, "F corners"] | None = None,
         edges: Int[Tensor, "E 2"] | None = None,
     ) -> Tensor:
-        """Outputs (…, N, C_out), or (…, F, C_out), (…, E, C_out), (…, C_out) at the place asked for.
+        """Outputs (…, N, out_channels), or (…, F, ·), (…, E, ·), (…, ·) at the place asked for.
 
         Parameters
         ----------
-        x : features (N, C_in), or (B, N, C_in) of B inputs on one surface.
-        lb : operator of one shape or of a batch, whose global mean is (S, C_out), one for each shape.
-        faces, edges : for outputs there; in a batch, moved by `lb.offsets`.
+        x : features (N, in_channels), or (B, N, in_channels) of B inputs on one surface.
+        lb : operator of one shape or of a batch, whose global mean is (S, out_channels), one for each shape.
+        faces, edges : for outputs there; in a batch, those of shape s moved by ``lb.offsets[s]``.
         """
-        if not (x.shape[-1] == self.C_in):
-            raise InputError(
-                f"expected C_in = {self.C_in} channels, got x of shape {tuple(x.shape)}"
-            )
+        check_features(x, lb, self.in_channels, self.first_lin.weight)
         y = self.first_lin(x)
         for block in self.blocks:
             y = block(y, lb)
@@ -184,11 +179,7 @@ class DiffusionNet(nn.Module):
             y = _global_mean(y, lb)
         elif self.outputs_at != "vertices":
             corners = faces if self.outputs_at == "faces" else edges
-            if corners is None:
-                raise InputError(
-                    f"outputs_at={self.outputs_at!r} needs {self.outputs_at}, got None"
-                )
-            y = y[..., corners, :].mean(-2)
+            y = y[..., _checked_corners(self.outputs_at, corners, lb), :].mean(-2)
         return y if self.last_activation is None else self.last_activation(y)
 
     def load_original_state_dict(self, state: Mapping[str, Tensor]) -> None:
@@ -203,12 +194,12 @@ class DiffusionNet(nn.Module):
         block_{i}.mlp.miniMLP_mlp_layer_{jjj}.weight     blocks.{i}.mlp.linear_{j}.weight
         ===============================================  ==========================================
 
-        Times below 1e-8, which the original raises to it when it runs, become 1e-8. With diffusion_method="spectral"
-        and the same operators the network then computes what the original did.
+        Times below 1e-8, which the original raises to it when it runs, become 1e-8. With method="spectral" and
+        the same operators the network then computes what the original did.
 
         Raises
         ------
-        ValueError : that lists the missing and the unexpected keys, or a shape that differs.
+        InputError : that lists the missing and the unexpected keys, or a shape that differs.
         """
         own = self.state_dict()
         names = {_original_name(key): key for key in own}
@@ -216,7 +207,7 @@ class DiffusionNet(nn.Module):
         if missing or unexpected:
             raise InputError(
                 f"state of another network: missing {sorted(missing)}, unexpected {sorted(unexpected)}; "
-                "C_width, N_block, mlp_hidden_dims and the options on gradients have to be those it was trained with"
+                "width, num_blocks, hidden and the options on gradients have to be those it was trained with"
             )
         taken = {}
         for original, key in names.items():
@@ -242,6 +233,25 @@ def _original_name(key: str) -> str:
         return name
     number, _, kind = after.partition(".")
     return f"{before}miniMLP_mlp_layer_{int(number):03d}.{kind}"
+
+
+def _checked_corners(place: str, corners: Tensor | None, lb: LaplaceBeltrami) -> Tensor:
+    """The corners of faces or edges, where they are those of every shape."""
+    if corners is None:
+        raise InputError(f"outputs_at={place!r} needs {place}, got None")
+    if corners.numel() == 0 or torch.compiler.is_compiling():
+        return corners
+    last, starts = int(corners.max()), lb.offsets
+    if not 0 <= int(corners.min()) <= last < starts[-1]:
+        raise InputError(f"{place}: expected indices from 0 to {starts[-1] - 1}, got {last}")
+    ends = torch.tensor(starts[1:], device=corners.device)
+    shape = torch.bucketize(corners.contiguous(), ends, right=True)
+    if last < starts[-2] or bool((shape != shape[:, :1]).any()):
+        raise InputError(
+            f"{place}: in a batch of {len(lb.sizes or ())} shapes, those of shape s have to be moved by lb.offsets[s]; "
+            f"indices up to {last} leave some shapes without {place}, or join two of them"
+        )
+    return corners
 
 
 def _global_mean(y: Tensor, lb: LaplaceBeltrami) -> Tensor:

@@ -8,6 +8,7 @@ from torch import Tensor, nn
 from torch.nn.functional import linear
 
 from torchlb.errors import InputError
+from torchlb.nn.checks import check_features
 from torchlb.operator.laplace_beltrami import LaplaceBeltrami
 
 __all__ = ["GradientFeatures"]
@@ -30,7 +31,7 @@ class GradientFeatures(nn.Module):
     tensor(True)
     """
 
-    def __init__(self, channels: int, rotations: bool = True) -> None:
+    def __init__(self, channels: int, *, rotations: bool = True) -> None:
         super().__init__()
         self.channels, self.rotations = channels, rotations
         if rotations:
@@ -40,10 +41,11 @@ class GradientFeatures(nn.Module):
             self.A = nn.Linear(channels, channels, bias=False)
 
     def forward(self, x: Float[Tensor, "*B N C"], lb: LaplaceBeltrami) -> Float[Tensor, "*B N C"]:
-        """The features of x, (N, C) or (B, N, C), in its shape."""
+        """The features of x, (N, C) or (B, N, C), in its shape and type."""
+        check_features(x, lb, self.channels, next(self.parameters()))
         if self.rotations and lb.dim != 2:
             raise InputError(f"rotations need a surface, got dim={lb.dim}; use rotations=False")
-        gradient = lb.local_gradient(x)  # (…, N, d, C)
+        gradient = lb.local_gradient(x).to(x.dtype)  # (…, N, d, C)
         if self.rotations:  # z ↦ Az of complex numbers is a real map of both parts side by side
             upper = torch.cat([self.A_re.weight, -self.A_im.weight], dim=1)
             lower = torch.cat([self.A_im.weight, self.A_re.weight], dim=1)

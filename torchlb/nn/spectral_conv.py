@@ -8,7 +8,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from torchlb.errors import InputError
+from torchlb.nn.checks import check_features
 from torchlb.operator.laplace_beltrami import LaplaceBeltrami
 
 __all__ = ["SpectralConv"]
@@ -54,13 +54,9 @@ class SpectralConv(nn.Module):
         nn.init.normal_(self.weight, std=1 / math.sqrt(in_channels * num_filters))
 
     def forward(self, x: Float[Tensor, "*B N C"], lb: LaplaceBeltrami) -> Float[Tensor, "*B N D"]:
-        """Features (N, C_out) or (B, N, C_out) of x (N, C_in) or (B, N, C_in)."""
-        if not (x.shape[-1] == self.in_channels):
-            raise InputError(
-                f"expected {self.in_channels} channels, got x of shape {tuple(x.shape)}"
-            )
+        """Features (N, out_channels) or (B, N, out_channels) of x (…, N, in_channels), of its type."""
+        dtype = check_features(x, lb, self.in_channels, self.weight, self.k)
         basis = lb.eigenbasis(self.k)
-        dtype = torch.promote_types(x.dtype, torch.float32)
         with torch.autocast(x.device.type, enabled=False):
             u = basis.eigenvalues.to(dtype) / (basis.eigenvalues.to(dtype) + self.scale)
             orders = torch.arange(self.num_filters, dtype=dtype, device=x.device)

@@ -1,0 +1,61 @@
+"""What every layer asks of its input: one rule of shapes and types, one of names."""
+
+from __future__ import annotations
+
+import warnings
+from typing import Any, get_args
+
+import torch
+from torch import Tensor
+
+from torchlb.errors import InputError
+from torchlb.operator.laplace_beltrami import LaplaceBeltrami
+
+__all__ = ["check_choice", "check_features", "check_shape"]
+
+
+def check_shape(x: Tensor, lb: LaplaceBeltrami) -> None:
+    """InputError unless x is (N, C) or (B, N, C) with the N of the operator."""
+    if x.ndim not in (2, 3) or x.shape[-2] != lb.num_points:
+        raise InputError(
+            f"expected features of shape (N, C) or (B, N, C) with N = {lb.num_points}, got {tuple(x.shape)}"
+        )
+
+
+def check_features(
+    x: Tensor, lb: LaplaceBeltrami, channels: int, parameter: Tensor, k: int = 0
+) -> torch.dtype:
+    """The type to compute in: that of features and parameters, at least float32; the operator is cast to it.
+
+    Warns where the operator holds a basis of fewer than k pairs: it is solved anew in the forward pass and kept by
+    that operator alone, so that those made for every step, as by a data loader, pay for it at each.
+
+    Raises
+    ------
+    InputError : for a wrong shape, and for features of another type than the parameters, unless autocast made them so.
+    """
+    if x.shape[-1] != channels:
+        raise InputError(f"expected {channels} channels, got x of shape {tuple(x.shape)}")
+    check_shape(x, lb)
+    device = x.device.type
+    cast = torch.is_autocast_enabled(device) and x.dtype == torch.get_autocast_dtype(device)
+    if x.dtype != parameter.dtype and not cast:
+        raise InputError(
+            f"expected features of the type of the layer's parameters, {parameter.dtype}, got {x.dtype}: cast one of "
+            "them, x.to(…) or layer.to(…); the operator may have any type"
+        )
+    if k and not torch.compiler.is_compiling():
+        held = lb.basis_left.shape[-1]
+        if 0 < held < min(k, max(lb.sizes or (lb.num_points,))):
+            warnings.warn(
+                f"the operator holds a basis of {held} pairs, a layer asks for k = {k}: it is solved anew, for each "
+                f"operator that is made; store k = {k} pairs, or give the layer k = {held}",
+                stacklevel=2,
+            )
+    return torch.promote_types(x.dtype, torch.float32)
+
+
+def check_choice(name: str, value: str, choices: Any) -> None:
+    """InputError unless the value is one of a Literal."""
+    if value not in get_args(choices):
+        raise InputError(f"{name}: expected one of {get_args(choices)}, got {value!r}")
