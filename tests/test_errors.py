@@ -5,9 +5,12 @@ import numpy as np
 import pytest
 import torch
 import trimesh
+from scipy.spatial import Delaunay
 
 import torchlb
-from torchlb import LaplaceBeltrami, clean_mesh
+from torchlb import LaplaceBeltrami, clean_mesh, clean_points
+from torchlb.operator.checks import check_dimension, mended_faces
+from torchlb.operator.cleaning import turned_faces
 from torchlb.surfaces import CliffordTorus, Sphere
 
 POINTS = Sphere().points(100)
@@ -36,6 +39,8 @@ def spoiled(index, value):
         (POINTS > 0, "expected real numbers"),
         (spoiled(3, POINTS[5]), "such as 3, 5 .*remove duplicates"),
         (spoiled(3, POINTS[5] + 1e-14), "such as 3, 5 .*remove duplicates"),
+        (POINTS.T, "shape \\(3, 100\\) is 3 points in R\\^100.*points.T"),
+        (POINTS * 0 + 1, "all 100 share one place; remove duplicates"),
         (POINTS * 1e160, "extend over .*rescale"),
         (POINTS * 1e-160, "extend over .*rescale"),
         (POINTS[:12], "12 points are fewer than the 15 .*lower `order` to 2"),
@@ -114,9 +119,40 @@ def test_coincident_vertices_of_a_mesh_are_named():
         LaplaceBeltrami.from_mesh(cut, faces)
 
 
-def test_a_wrong_dimension_is_suspected():
-    with pytest.warns(UserWarning, match="manifold of dimension 3.*`dim`"):
-        LaplaceBeltrami.from_points(CliffordTorus().points(200))
+def grid(size):
+    """Points of the unit square, and its squares as faces of four corners."""
+    steps = torch.linspace(0, 1, size, dtype=torch.float64)
+    index = torch.arange(size**2).view(size, size)
+    corners = (index[:-1, :-1], index[1:, :-1], index[1:, 1:], index[:-1, 1:])
+    return torch.cartesian_prod(steps, steps), torch.stack(corners, -1).view(-1, 4)
+
+
+@pytest.mark.parametrize(
+    ("points", "dim", "remedy"),
+    [
+        (lambda: grid(12)[0], 2, "pass dim=2"),
+        (lambda: torch.rand(200, 2), 2, "pass dim=2"),
+        (lambda: CliffordTorus().points(200), 2, "pass dim=2"),
+        (lambda: torch.cat([POINTS, POINTS, POINTS[:, :1]], 1).repeat_interleave(3, 0), 2, ":3"),
+        (
+            lambda: torch.cat([Sphere().points(300), torch.rand(300, 1)], 1),
+            2,
+            r"pass points\[:, :3\]",
+        ),
+    ],
+    ids=["grid", "random square", "surface in R⁴", "normals", "random attribute"],
+)
+def test_a_dimension_other_than_n_minus_1_is_asked_for(points, dim, remedy):
+    with pytest.raises(ValueError, match=f"like one of dimension {dim}.*{remedy}"):
+        check_dimension(points().double(), None)
+
+
+@pytest.mark.parametrize("n", [2, 3, 4, 5])
+def test_a_hypersurface_needs_no_dim(n):
+    """The unit sphere of R^n, at random points."""
+    points = torch.nn.functional.normalize(torch.randn(600, n, dtype=torch.float64))
+    assert check_dimension(points, None) == n - 1
+    assert check_dimension(points, 1) == 1
 
 
 @pytest.mark.parametrize("dtype", [torch.bool, torch.int8, torch.int64, torch.float32])
@@ -145,6 +181,97 @@ def test_clean_mesh_is_the_remedy_that_the_error_names():
     assert 7 not in kept.tolist()
     assert torch.equal(vertices, VERTICES[kept])
     assert LaplaceBeltrami.from_mesh(vertices, faces).num_points == 99
+
+
+def test_clean_points_is_the_remedy_that_the_error_names():
+    doubled = torch.cat([POINTS, POINTS[:10], POINTS[5:10]])
+    points, kept = clean_points(doubled)
+    assert torch.equal(points, POINTS)
+    assert kept.tolist() == list(range(100))
+
+
+def test_quads_are_named_and_split():
+    """A quad mesh of a curved square: an error, and its triangles after `clean_mesh`."""
+    flat, quads = grid(9)
+    points = torch.cat([flat, (flat**2).sum(1, keepdim=True)], 1)
+    for faces in (quads, quads.int().tolist()):
+        with pytest.raises(ValueError, match=r"look like quads.*clean_mesh"):
+            LaplaceBeltrami.from_mesh(points, faces)
+    vertices, faces, kept = clean_mesh(points, quads)
+    assert (tuple(faces.shape), kept.tolist()) == ((128, 3), list(range(81)))
+    sides = vertices[faces[:, 1:]] - vertices[faces[:, :1]]
+    area = torch.linalg.cross(sides[:, 0], sides[:, 1]).norm(dim=1).sum() / 2
+    assert float(area) == pytest.approx(1.8616, rel=0.01)  # ∫ (1 + 4x² + 4y²)^½
+
+
+def test_a_quad_that_repeats_a_corner_is_a_triangle():
+    _, faces, _ = clean_mesh(torch.eye(4), torch.tensor([[0, 1, 2, 3], [0, 1, 2, 2]]))
+    assert sorted(faces.sort(1).values.tolist()) == [[0, 1, 2], [0, 2, 3]]
+
+
+def test_tetrahedra_stay_what_they_are():
+    points = torch.rand(60, 3, dtype=torch.float64)
+    simplices = torch.from_numpy(Delaunay(points).simplices.astype(np.int64))
+    thin = points * torch.tensor([1, 1, 0.02])
+    for vertices in (points, thin):
+        assert torch.equal(mended_faces(vertices, simplices), simplices)
+        assert torch.equal(clean_mesh(vertices, simplices)[1], simplices)
+
+
+@pytest.mark.parametrize("copies", [FACES[:20], FACES, FACES.flip(1)], ids=["20", "all", "turned"])
+def test_a_face_counts_once(copies):
+    """The operator of a mesh with doubled faces is that of the mesh, and the warning counts them."""
+    plain = LaplaceBeltrami.from_mesh(VERTICES, FACES, order=1)
+    doubled = torch.cat([FACES, copies])
+    for build, expected in (
+        (lambda f: LaplaceBeltrami.from_mesh(VERTICES, f, order=1), plain),
+        (
+            lambda f: LaplaceBeltrami.from_cotangent(VERTICES, f),
+            LaplaceBeltrami.from_cotangent(VERTICES, FACES),
+        ),
+    ):
+        with pytest.warns(UserWarning, match=f"{len(copies)} have the corners of an earlier one"):
+            lb = build(doubled)
+        assert torch.equal(lb.values, expected.values)
+        assert torch.equal(lb.mass, expected.mass)
+    assert torch.equal(clean_mesh(VERTICES, doubled)[1], FACES)
+
+
+def test_faces_are_wound_alike():
+    """With 30 of 196 triangles turned round the normals are those of the mesh, and a warning counts them."""
+    turned = torch.zeros(len(FACES), dtype=torch.bool)
+    turned[torch.randperm(len(FACES))[:30]] = True
+    mixed = torch.where(turned[:, None], FACES.flip(1), FACES)
+    assert torch.equal(turned_faces(mixed), turned)
+    with pytest.warns(UserWarning, match="30 are wound against their neighbours"):
+        lb = LaplaceBeltrami.from_mesh(VERTICES, mixed, order=1)
+    assert torch.equal(lb.normals, LaplaceBeltrami.from_mesh(VERTICES, FACES, order=1).normals)
+    assert torch.equal(clean_mesh(VERTICES, mixed)[1], FACES)
+
+
+def test_one_side_is_left_alone():
+    """A Möbius band of 20 squares cannot be wound alike; a sphere beside it can."""
+    i = 2 * torch.arange(20)
+    band = torch.stack([i, i + 1, i + 2, i + 2, i + 1, i + 3], 1).view(-1, 3)
+    band = torch.where(band >= 40, 81 - band, band)
+    assert not turned_faces(band).any()
+    mixed = torch.cat([band, FACES + 40, FACES[:1].flip(1) + 40])[: len(band) + len(FACES)]
+    mixed[-1] = mixed[-1].flip(0)
+    assert turned_faces(mixed).nonzero().tolist() == [[len(mixed) - 1]]
+
+
+def test_any_byte_order_and_stride():
+    """Faces of FreeSurfer are big-endian."""
+    vertices, faces = VERTICES.numpy().astype(">f8"), FACES.numpy().astype(">i4")
+    lb = LaplaceBeltrami.from_mesh(vertices[:, ::-1][:, ::-1], faces, order=1)
+    assert torch.equal(lb.values, LaplaceBeltrami.from_mesh(VERTICES, FACES, order=1).values)
+    assert torch.equal(clean_mesh(vertices, faces)[1], FACES.int())
+
+
+def test_rounding_far_from_zero_is_named():
+    far = (POINTS + 1e5).float()
+    with pytest.warns(UserWarning, match="float32 has steps of 0.012.*centre"):
+        LaplaceBeltrami.from_points(far, order=1)
 
 
 def test_numpy_arrays_and_int32_faces_are_welcome():

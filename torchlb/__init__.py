@@ -23,7 +23,7 @@ from torchlb.nn.diffusion import Diffusion, heat_flow
 from torchlb.nn.diffusion_net import DiffusionNet, DiffusionNetBlock
 from torchlb.nn.gradient_features import GradientFeatures
 from torchlb.nn.spectral_conv import SpectralConv
-from torchlb.operator.checks import clean_mesh
+from torchlb.operator.cleaning import clean_mesh, clean_points
 from torchlb.operator.laplace_beltrami import LaplaceBeltrami
 from torchlb.operator.report import StencilReport
 from torchlb.spectral.eigenbasis import Eigenbasis
@@ -59,6 +59,7 @@ __all__ = [
     "TorchlbError",
     "__version__",
     "clean_mesh",
+    "clean_points",
     "diffusion_distance",
     "diffusion_map",
     "heat_flow",

@@ -22,7 +22,7 @@ from torchlb.io.cache import describe_file
 from torchlb.io.files import read_shape
 from torchlb.io.precompute import concerns_the_shape, precompute_operators
 from torchlb.operator.build import WEIGHTS
-from torchlb.operator.checks import clean_mesh
+from torchlb.operator.cleaning import clean_mesh
 from torchlb.operator.dispatch import OPERATORS, build_operator
 from torchlb.operator.laplace_beltrami import LaplaceBeltrami
 from torchlb.plot.comparison import draw_comparison, spectra, spectrum_table

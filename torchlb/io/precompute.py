@@ -25,7 +25,7 @@ from tqdm import tqdm
 from torchlb.errors import InputError
 from torchlb.io.cache import load_or_build, operator_key
 from torchlb.io.files import SUFFIXES, read_shape
-from torchlb.operator.checks import clean_mesh
+from torchlb.operator.cleaning import clean_mesh
 from torchlb.operator.dispatch import check_options_of
 
 __all__ = ["PrecomputeReport", "ShapeResult", "concerns_the_shape", "precompute_operators"]

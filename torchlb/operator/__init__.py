@@ -1,6 +1,6 @@
 """The operator as a module, from input to answer.
 
-`checks`: bad input is refused, with the remedy. `report`: what order was reached where. `storage`: its tensors, and
-how they travel. `batching`: several shapes as one operator. `build`: checked input to finished rows.
-`laplace_beltrami`: the class. `dispatch`: any operator by name and options.
+`cleaning`: every face and point once, wound alike. `checks`: bad input is refused, with the remedy. `report`: what
+order was reached where. `storage`: its tensors, and how they travel. `batching`: several shapes as one operator.
+`build`: checked input to finished rows. `laplace_beltrami`: the class. `dispatch`: any operator by name and options.
 """

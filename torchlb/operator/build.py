@@ -13,13 +13,14 @@ from torchlb.errors import InputError, warn
 from torchlb.geometry.frames import PROJECTIONS
 from torchlb.operator.checks import (
     check_boundary,
+    check_dimension,
     check_distinct,
     check_faces,
     check_normals,
     check_options,
     check_points,
     check_scale,
-    warn_of_coincident,
+    mended_faces,
 )
 from torchlb.stability.certificate import Certificate
 from torchlb.stability.enforce import certify
@@ -88,7 +89,7 @@ def build_cloud(
     points = check_points(points)
     check_scale(points)
     ambient = points.shape[1]
-    d = max(ambient - 1, 1) if dim is None else dim
+    d = check_dimension(points, dim, hypersurface=normals is not None)
     options.check(len(points), ambient, d)
     check_distinct(points)
     if condition not in CONDITIONS:
@@ -124,7 +125,7 @@ def build_mesh(
     check_scale(vertices)
     faces = check_faces(faces, len(vertices))
     options.check(len(vertices), vertices.shape[1], faces.shape[1] - 1)
-    warn_of_coincident(vertices)
+    faces = mended_faces(vertices, faces)
     if boundary not in (*CONDITIONS, None):
         raise InputError(f"boundary: expected one of {list(CONDITIONS)} or None, got {boundary!r}")
     geometry = mesh_shape(
@@ -145,6 +146,7 @@ def build_cotangent(vertices: Any, faces: Any) -> Built:
     faces = check_faces(faces, len(vertices))
     if faces.shape[1] != 3:
         raise InputError(f"faces: the cotangent operator needs triangles, got {tuple(faces.shape)}")
+    faces = mended_faces(vertices, faces)
     matrix, mass = cotangent_laplacian(vertices, faces)
     geometry = mesh_shape(vertices, faces, 0, condition=None, areas=mass)
     everything: Tensor = torch.arange(len(vertices))

@@ -13,24 +13,33 @@ from torch import Tensor
 
 from torchlb.errors import InputError, warn
 from torchlb.fits.polynomials import num_monomials
+from torchlb.operator.cleaning import (
+    ArrayLike,
+    are_quads,
+    as_tensor,
+    coincident,
+    first_of_each,
+    proper_faces,
+    turned_faces,
+)
 
 __all__ = [
     "check_boundary",
+    "check_dimension",
     "check_distinct",
     "check_faces",
     "check_normals",
     "check_options",
     "check_points",
     "check_scale",
-    "clean_mesh",
-    "warn_of_coincident",
+    "mended_faces",
 ]
 
 
 MAX_EXTENT = 1e70
 """Largest extent of the points, and the inverse of the smallest: fourth powers of it must stay finite."""
-COINCIDENT = 1e-12
-"""Points closer than this share of the largest coordinate are one point: their difference is rounding."""
+COARSE = 1e-3
+"""Step of single precision over the spacing of the points above which Δ is rounding."""
 
 
 def _some(index: Tensor, limit: int = 8) -> str:
@@ -39,10 +48,10 @@ def _some(index: Tensor, limit: int = 8) -> str:
     return names + (", …" if len(index) > limit else "")
 
 
-def check_points(points: Any, what: str = "points") -> Float[Tensor, "N n"]:
+def check_points(points: ArrayLike, what: str = "points") -> Float[Tensor, "N n"]:
     """As (N, n) float64 on the CPU, detached; ValueError for a wrong shape or type, none at all, NaN or infinity."""
     try:
-        points = torch.as_tensor(points)
+        points = as_tensor(points)
     except (TypeError, ValueError, RuntimeError) as error:
         raise InputError(
             f"{what}: expected an (N, n) tensor or array, got {type(points)}"
@@ -51,6 +60,11 @@ def check_points(points: Any, what: str = "points") -> Float[Tensor, "N n"]:
         raise InputError(f"{what}: expected shape (N, n), got {tuple(points.shape)}")
     if len(points) == 0 or points.shape[1] == 0:
         raise InputError(f"{what}: got none (shape {tuple(points.shape)})")
+    if len(points) < points.shape[1]:
+        raise InputError(
+            f"{what}: shape {tuple(points.shape)} is {len(points)} points in R^{points.shape[1]}, which have no "
+            f"manifold; if they are columns, pass {what}.T"
+        )
     if points.is_complex() or points.dtype == torch.bool:
         raise InputError(f"{what}: expected real numbers, got {points.dtype}")
     points = points.detach().to("cpu", torch.float64)
@@ -65,6 +79,8 @@ def check_points(points: Any, what: str = "points") -> Float[Tensor, "N n"]:
 def check_scale(points: Float[Tensor, "N n"]) -> None:
     """ValueError if the points extend so far, or so little, that 1/ℓ² leaves the range of numbers."""
     extent = float((points - points[0]).abs().max())
+    if len(points) > 1 and extent == 0:
+        raise InputError(f"points: all {len(points)} share one place; remove duplicates")
     if len(points) > 1 and not 1 / MAX_EXTENT < extent < MAX_EXTENT:
         raise InputError(
             f"points: they extend over {extent:.3g}, and 1/ℓ² of that leaves the range of numbers; "
@@ -72,42 +88,102 @@ def check_scale(points: Float[Tensor, "N n"]) -> None:
         )
 
 
-def _twins(points: Float[Tensor, "N n"]) -> tuple[Int[Tensor, " N"], Int[Tensor, " T"]]:
-    """(nearest other point of each, indices of those whose nearest is in the same place to rounding)."""
-    distance, nearest = KDTree(points.numpy()).query(points.numpy(), k=min(2, len(points)))
-    distance = torch.from_numpy(distance).view(len(points), -1)[:, -1]
-    index = torch.arange(len(points))
-    nearest = torch.from_numpy(nearest).view(len(points), -1)
-    other = torch.where(nearest[:, 0] == index, nearest[:, -1], nearest[:, 0])
-    close = (distance <= COINCIDENT * points.abs().max()) & (other != index)
-    return other, close.nonzero()[:, 0]
-
-
 def check_distinct(points: Float[Tensor, "N n"]) -> None:
     """ValueError that names points which coincide."""
-    other, bad = _twins(points)
+    spacing, other, bad = coincident(points)
     if len(bad):
         pair = sorted((int(bad[0]), int(other[bad[0]])))
         raise InputError(
             f"points: {len(bad)} points share a place with another, such as {pair[0]}, {pair[1]} (all: {_some(bad)}); "
-            "remove duplicates, for example with torch.unique(points.round(decimals=9), dim=0)"
+            "remove duplicates with points, kept = torchlb.clean_points(points)"
+        )
+    _warn_of_rounding(points, spacing)
+
+
+def _warn_of_rounding(points: Float[Tensor, "N n"], spacing: Float[Tensor, " N"]) -> None:
+    """UserWarning for single-precision positions so far from 0 that their rounding shows between neighbours."""
+    step = torch.finfo(torch.float32).eps * float(points.abs().max())
+    width = float(spacing.median())
+    if step > COARSE * width and bool((points.float() == points).all()):
+        warn(
+            f"points: neighbours are {width:.2g} apart, and float32 has steps of {step:.2g} so far from 0, which Δ "
+            "will show; centre the points in float64 before they are rounded: (points − points.mean(0)).float()"
         )
 
 
-def warn_of_coincident(vertices: Float[Tensor, "N n"]) -> None:
-    """UserWarning if vertices of a mesh coincide, as in STL files: the surface is cut open there."""
-    _, bad = _twins(vertices)
+def check_dimension(
+    points: Float[Tensor, "N n"], dim: int | None, *, hypersurface: bool = False
+) -> int:
+    """`dim`, or its default n − 1; ValueError if points of R², R⁴, R⁵, … do not look like a hypersurface.
+
+    Judged is in how many directions the 3n nearest neighbours of a point spread, the median over up to 500 points
+    of at least 32n. In R³ surfaces are taken for granted. Of four columns and more the first three alone must not be
+    a surface: the others may be attributes.
+    """
+    count, n = points.shape
+    if dim is not None or hypersurface or n in (1, 3) or count < 32 * n:
+        return max(n - 1, 1) if dim is None else dim
+    found, advice = _local_dimension(points, 0.4), ""
+    if n > 3:
+        found = 2 if _local_dimension(points[:, :3], 0.2) < 3 else found
+        advice = f"; if the last {n - 3} columns are attributes, pass points[:, :3]"
+    if found != n - 1:
+        raise InputError(
+            f"points: without `dim`, points in R^{n} are taken for a manifold of dimension {n - 1}, but these look "
+            f"like one of dimension {found}: pass dim={found}, or dim={n - 1} if it is meant{advice}"
+        )
+    return n - 1
+
+
+def _local_dimension(points: Float[Tensor, "N n"], thin: float) -> int:
+    """Directions in which near points spread by more than `thin` of the largest; the median over a sample of points."""
+    centers = points[:: -(-len(points) // 500)].numpy()
+    _, near = KDTree(points.numpy()).query(centers, k=3 * points.shape[1])
+    around = points[torch.from_numpy(near)]
+    spread = torch.linalg.svdvals(around - around.mean(1, keepdim=True))
+    return int((spread > thin * spread[:, :1]).sum(1).median())
+
+
+def mended_faces(vertices: Float[Tensor, "N n"], faces: Int[Tensor, "F v"]) -> Int[Tensor, "G v"]:
+    """Faces, each once and triangles wound alike; warnings name what was changed, and vertices that coincide.
+
+    ValueError for quads.
+    """
+    if faces.shape[1] == 4 and are_quads(faces):
+        raise InputError(
+            f"faces: shape {tuple(faces.shape)} is for tetrahedra, but these look like quads, since most share no "
+            "three corners with another; split them with vertices, faces, kept = torchlb.clean_mesh(vertices, faces)"
+        )
+    first = first_of_each(faces)
+    if not first.all():
+        again = (~first).nonzero()[:, 0]
+        warn(
+            f"faces: {len(again)} have the corners of an earlier one ({_some(again)}) and are left out; "
+            "torchlb.clean_mesh(vertices, faces) removes them"
+        )
+        faces = faces[first]
+    turned = turned_faces(faces)
+    if turned.any():
+        wrong = turned.nonzero()[:, 0]
+        warn(
+            f"faces: {len(wrong)} are wound against their neighbours ({_some(wrong)}) and are turned round, so that "
+            "the normals agree; torchlb.clean_mesh(vertices, faces) does it in the mesh"
+        )
+        faces = torch.where(turned[:, None], faces.flip(1), faces)
+    spacing, _, bad = coincident(vertices)
+    _warn_of_rounding(vertices, spacing)
     if len(bad):
         warn(
             f"vertices: {len(bad)} share a place with another ({_some(bad)}), so the mesh is cut open along them; if "
-            "it should not be, merge them first, for example with trimesh.Trimesh(vertices, faces).merge_vertices()",
+            "it should not be, merge them first, for example with trimesh.Trimesh(vertices, faces).merge_vertices()"
         )
+    return faces
 
 
-def check_faces(faces: Any, num_points: int) -> Int[Tensor, "F v"]:
+def check_faces(faces: ArrayLike, num_points: int) -> Int[Tensor, "F v"]:
     """As (F, d + 1) int64 on the CPU; ValueError for wrong shapes, types, indices, or unreferenced vertices."""
     try:
-        faces = torch.as_tensor(np.asarray(faces) if not isinstance(faces, Tensor) else faces)
+        faces = as_tensor(faces if isinstance(faces, Tensor) else np.asarray(faces))
     except (TypeError, ValueError, RuntimeError) as error:
         raise InputError(f"faces: expected an (F, 3) tensor or array, got {type(faces)}") from error
     if faces.ndim != 2 or faces.shape[1] not in (2, 3, 4):
@@ -126,49 +202,17 @@ def check_faces(faces: Any, num_points: int) -> Int[Tensor, "F v"]:
             f"face {int(bad[0])} is {faces[bad[0]].tolist()}"
         )
     used = torch.zeros(num_points, dtype=torch.bool)
-    used[_proper(faces).reshape(-1)] = True
+    used[proper_faces(faces).reshape(-1)] = True
     lost = (~used).nonzero()[:, 0]
     if len(lost):
         raise InputError(
             f"faces: {len(lost)} vertices ({_some(lost)}) belong to no face with distinct corners; drop them with "
             "vertices, faces, kept = torchlb.clean_mesh(vertices, faces)"
         )
-    return _proper(faces)
+    return proper_faces(faces)
 
 
-def _proper(faces: Int[Tensor, "F v"]) -> Int[Tensor, "G v"]:
-    """The faces whose corners are distinct; one that repeats a corner covers nothing."""
-    ordered = faces.sort(dim=1).values
-    return faces[(ordered[:, 1:] != ordered[:, :-1]).all(1)]
-
-
-def clean_mesh(vertices: Tensor, faces: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Mesh without unreferenced vertices and without faces that repeat a corner.
-
-    Parameters
-    ----------
-    vertices : (N, n).
-    faces : (F, 3) indices.
-
-    Returns
-    -------
-    vertices : (N', n), those in use, in their order.
-    faces : (F', 3), renumbered.
-    kept : (N',), their indices in the input: `values[kept]` carries data over.
-
-    Examples
-    --------
-    >>> vertices, faces, kept = clean_mesh(torch.eye(4), torch.tensor([[0, 1, 3], [0, 0, 1]]))
-    >>> faces.tolist(), kept.tolist()
-    ([[0, 1, 2]], [0, 1, 3])
-    """
-    vertices, faces = torch.as_tensor(vertices), torch.as_tensor(faces)
-    faces = _proper(faces)
-    kept, renumbered = torch.unique(faces, return_inverse=True)
-    return vertices[kept.long()], renumbered.to(faces.dtype), kept
-
-
-def check_normals(normals: Any, points: Float[Tensor, "N n"]) -> Float[Tensor, "N n"]:
+def check_normals(normals: ArrayLike, points: Float[Tensor, "N n"]) -> Float[Tensor, "N n"]:
     """Unit normals of the shape of `points`; ValueError for wrong shapes, NaN or zero vectors."""
     normals = check_points(normals, "normals")
     if normals.shape != points.shape:

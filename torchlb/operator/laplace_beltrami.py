@@ -15,6 +15,7 @@ from torchlb.linalg.sparse import matmul, to_scipy
 from torchlb.linalg.spectral_bounds import join_bounds
 from torchlb.operator.batching import join_buffers, join_certificates
 from torchlb.operator.build import Built, Options, build_cloud, build_cotangent, build_mesh
+from torchlb.operator.cleaning import float_type
 from torchlb.operator.report import StencilReport
 from torchlb.operator.storage import REPORT_FIELDS, OperatorStorage
 from torchlb.spectral.eigenbasis import Eigenbasis, check_num_pairs, stack_eigenbases
@@ -190,8 +191,7 @@ class LaplaceBeltrami(OperatorStorage):
             setattr(lb, f"report_{name}", report[name])
         lb._transpose()
         _ = lb.bounds  # found once, from values that are not yet rounded
-        dtype = torch.as_tensor(given).dtype
-        return lb.to(dtype if dtype.is_floating_point else torch.get_default_dtype())
+        return lb.to(float_type(given))
 
     @property
     def dim(self) -> int:
