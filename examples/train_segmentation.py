@@ -92,7 +92,8 @@ def evaluate(net, data):
 
 def draw(shapes, predicted, path):
     """Predicted labels above the given ones, a colour for each triangle (that of its median corner) or point."""
-    figure, axes = plt.subplots(2, len(shapes), figsize=(4 * len(shapes), 8), layout="constrained")
+    size = (4 * len(shapes), 8)
+    figure, axes = plt.subplots(2, len(shapes), figsize=size, layout="constrained", squeeze=False)
     for column, (vertices, faces, given), found in zip(axes.T, shapes, predicted, strict=True):
         for ax, labels, title in zip(column, (found, given), ("predicted", "given"), strict=True):
             if faces is None:

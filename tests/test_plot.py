@@ -1,12 +1,14 @@
 """Pictures: what is drawn is what was given, in the order and the colours that the documentation says."""
 
 import builtins
+import sys
 
 import numpy as np
 import pytest
 import torch
 from jaxtyping import TypeCheckError
 
+from torchlb import LaplaceBeltrami
 from torchlb.plot import (
     plot_convergence,
     plot_orders,
@@ -14,9 +16,14 @@ from torchlb.plot import (
     plot_surface,
     plot_vectors,
 )
+from torchlb.plot.comparison import draw_comparison, spectra
+from torchlb.plot.figures import ORDER_COLORS
 from torchlb.surfaces import Sphere, smooth_function
 
 plt = pytest.importorskip("matplotlib.pyplot")
+from matplotlib.colors import to_rgb  # noqa: E402
+from matplotlib.figure import Figure  # noqa: E402
+
 WRONG = (ValueError, TypeCheckError)  # the suite checks the shapes in the signatures, too
 
 
@@ -192,15 +199,30 @@ def test_order_map_counts_points_and_shows_the_lowest_order_of_a_triangle():
     ax = plot_orders(vertices, faces, order)
     texts = [text.get_text() for text in ax.get_legend().get_texts()]
     assert texts == ["order 9: 1", "order 3: 2", "low order: 1"]
-    hues = ax.collections[0].get_facecolors()[:, :3]
-    hues = hues / hues.max(axis=1, keepdims=True)
-    expected = np.array([[0xCF, 0xC9, 0xBF], [0x7F, 0xA9, 0xCF]])
-    expected = expected / expected.max(axis=1, keepdims=True)
-    distance = np.abs(hues[:, None] - expected).max(axis=2)
-    assert sorted(distance.argmin(axis=1)) == [0, 1]
-    assert distance.min(axis=1).max() < 1e-6
+    hues = ax.collections[0].get_facecolors()[:, :3]  # shaded alike, as both lie in a plane
+    light, dark = (np.array(to_rgb(ORDER_COLORS[p])) for p in (0, 3))
+    shade = hues.max() / light.max()
+    assert {tuple(hue.round(6)) for hue in hues} == {
+        tuple((shade * color).round(6)) for color in (light, dark)
+    }
     cloud = plot_orders(vertices, None, order)
     assert [text.get_text() for text in cloud.get_legend().get_texts()] == texts
+
+
+def test_the_colors_of_the_orders_grow_darker():
+    luminance = np.array([to_rgb(color) for color in ORDER_COLORS]) @ (0.2126, 0.7152, 0.0722)
+    assert (np.diff(luminance) < -0.05).all()
+
+
+def test_axes_that_are_given_leave_pyplot_alone(sphere, tmp_path, monkeypatch):
+    """No figure is registered, and the backend is not touched: importing pyplot would choose one."""
+    vertices, faces = sphere
+    lb = LaplaceBeltrami.from_cotangent(vertices, faces)
+    monkeypatch.setitem(sys.modules, "matplotlib.pyplot", None)
+    figure = Figure()
+    assert plot_surface(vertices, faces, vertices[:, 0], ax=(ax := figure.subplots())) is ax
+    draw_comparison(lb, faces, spectra({"a": lb}, 4), tmp_path / "a.png", "title")
+    assert (tmp_path / "a.png").read_bytes().startswith(b"\x89PNG")
 
 
 @pytest.mark.parametrize(("dim", "expected"), [(2, "4.0"), (1, "2.0")])

@@ -73,20 +73,14 @@ def draw_comparison(
 
     Raises ImportError without matplotlib, OSError where the file cannot be written.
     """
-    import matplotlib as mpl
-
-    mpl.use("Agg")
-    import matplotlib.pyplot as plt
+    from matplotlib.figure import Figure  # without pyplot, which would choose a backend
 
     seen = lb.points.shape[1] == 3 and lb.dim == 2
-    size = (11, 5.5) if seen else (6, 4.5)
-    figure, axes = plt.subplots(
-        1, 2 if seen else 1, figsize=size, layout="constrained", squeeze=False
-    )
+    figure = Figure(figsize=(11, 5.5) if seen else (6, 4.5), layout="constrained")
+    axes = figure.subplots(1, 2 if seen else 1, squeeze=False)
     plot_spectrum(values, axes[0, -1])
     if seen:
         order = lb.report.order.to(torch.int64)
         plot_orders(lb.points.double(), faces, order, ax=axes[0, 0], view=view)
     figure.suptitle(title)
     figure.savefig(path, dpi=130)
-    plt.close(figure)

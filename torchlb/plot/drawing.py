@@ -13,25 +13,9 @@ import torch
 
 from torchlb.errors import InputError
 
-__all__ = [
-    "INK",
-    "VIEW",
-    "Eye",
-    "axes_of",
-    "cloud_of",
-    "color_map",
-    "draw_arrows",
-    "draw_dots",
-    "finish",
-    "isolines_of",
-    "mesh_of",
-    "paint",
-    "plain",
-    "values_of",
-]
-
 Eye = tuple[float, float]
 """Elevation above the plane of x and y, and azimuth from x, of the eye, in degrees."""
+Views = Eye | Sequence[Eye]
 
 VIEW: Eye = (25.0, -55.0)
 LIGHT = (-0.35, 0.45, 0.82)
@@ -43,12 +27,16 @@ INK = "0.1"
 
 
 def axes_of(ax: Any) -> Any:
-    """The given axes, or new ones."""
+    """The given axes, or new ones of pyplot, which nothing else here needs."""
     try:
-        import matplotlib.pyplot as plt
+        import matplotlib as mpl  # noqa: F401
     except ImportError as error:
         raise ImportError("pictures need matplotlib: pip install torchlb[plot]") from error
-    return plt.subplots(figsize=(6.4, 4.8), layout="constrained")[1] if ax is None else ax
+    if ax is not None:
+        return ax
+    import matplotlib.pyplot as plt
+
+    return plt.subplots(figsize=(6.4, 4.8), layout="constrained")[1]
 
 
 def _numpy(values: Any) -> np.ndarray:
@@ -135,7 +123,7 @@ def _project(points: np.ndarray, view: Eye) -> np.ndarray:
     return points @ np.stack([right, np.cross(eye, right), eye], axis=1)
 
 
-def _stacked(points: np.ndarray, view: Eye | Sequence[Eye]) -> list[tuple[np.ndarray, Eye]]:
+def _stacked(points: np.ndarray, view: Views) -> list[tuple[np.ndarray, Eye]]:
     """The projections for all eyes, each below the one before. A shape in the plane z = 0 is seen from above."""
     if not points[:, 2].any():
         view = (90.0, -90.0)
@@ -156,7 +144,7 @@ def paint(
     points: np.ndarray,
     faces: np.ndarray,
     colors: np.ndarray,
-    view: Eye | Sequence[Eye],
+    view: Views,
     isolines: tuple[np.ndarray, np.ndarray] | None = None,
 ) -> None:
     """Shaded triangles, and segments on them as `isolines_of` gives them, back to front."""
@@ -175,21 +163,17 @@ def paint(
         if isolines is not None:
             edges, share = isolines
             ends = flat[edges[..., 0]] * (1 - share) + flat[edges[..., 1]] * share  # (S, 2, 3)
-            # Above the triangles beside.
-            above = np.linalg.norm(corners[:, 1] - corners[:, 0], axis=1).mean()
+            above = np.linalg.norm(
+                corners[:, 1] - corners[:, 0], axis=1
+            ).mean()  # the triangles beside
             polygons += list(ends[..., :2])
             depth = np.append(depth, ends[..., 2].mean(axis=1) + above)
             shaded = np.append(shaded, plain(INK, len(ends)), axis=0)
             width = np.append(width, np.full(len(ends), 0.8))
         order = depth.argsort()
-        collection = PolyCollection(
-            [polygons[i] for i in order],
-            facecolors=shaded[order],
-            edgecolors=shaded[order],
-            linewidths=width[order],
-            rasterized=True,
-        )
-        ax.add_collection(collection)
+        style: dict[str, Any] = {"facecolors": shaded[order], "edgecolors": shaded[order]}
+        drawn = [polygons[i] for i in order]
+        ax.add_collection(PolyCollection(drawn, linewidths=width[order], rasterized=True, **style))
 
 
 def isolines_of(
@@ -222,7 +206,7 @@ def _faded(colors: np.ndarray, flat: np.ndarray) -> np.ndarray:
 
 
 def draw_dots(
-    ax: Any, points: np.ndarray, colors: np.ndarray, view: Eye | Sequence[Eye], size: float | None
+    ax: Any, points: np.ndarray, colors: np.ndarray, view: Views, size: float | None
 ) -> None:
     """A disk for each point, back to front, paler with distance."""
     area = float(np.clip(60000 / len(points), 2, 60)) if size is None else size
@@ -251,7 +235,7 @@ def draw_arrows(
     faces: np.ndarray | None,
     field: np.ndarray,
     colors: np.ndarray,
-    view: Eye | Sequence[Eye],
+    view: Views,
     count: int,
 ) -> None:
     """Arrows at `count` points, back to front: those that no triangle hides, or paler with distance on a cloud."""
@@ -276,8 +260,7 @@ def _visible(flat: np.ndarray, faces: np.ndarray, chosen: np.ndarray) -> np.ndar
     """Which of the chosen points no triangle hides: none covers it in the picture and is nearer to the eye."""
     a, b, c = (flat[faces[:, i]] for i in range(3))
     normal = np.cross(b - a, c - a)
-    # A triangle seen from the side hides nothing.
-    area = np.where(normal[:, 2] == 0, np.nan, normal[:, 2])
+    area = np.where(normal[:, 2] == 0, np.nan, normal[:, 2])  # seen from the side it hides nothing
     slack = 1e-6 * np.ptp(flat[:, 2])  # its own triangles cover a point, too
     visible = np.ones(len(chosen), dtype=bool)
     for i, point in enumerate(flat[chosen]):
@@ -294,8 +277,8 @@ def finish(
     shades: Any = None,
     extend: str = "neither",
     label: str | None = None,
-) -> None:
-    """Equal aspect, no frame, a title and a colour bar."""
+) -> Any:
+    """The axes with equal aspect, without frame, with a title and a colour bar."""
     ax.autoscale_view()
     ax.set_aspect("equal")
     ax.set_axis_off()
@@ -303,3 +286,4 @@ def finish(
         ax.figure.colorbar(shades, ax=ax, shrink=0.6, pad=0.03, extend=extend, label=label or "")
     if title:
         ax.set_title(title)
+    return ax

@@ -1,7 +1,8 @@
-"""Pictures with matplotlib (`pip install torchlb[plot]`): scalars, vectors, orders on a surface or cloud; convergence.
+"""Scalars, vectors and orders on a surface or cloud, and convergence, as pictures of matplotlib.
 
 Surfaces are drawn by the painter's algorithm: triangles projected, shaded and filled from back to front. That takes a
-second for 20,000 of them, and no graphics card.
+second for 20,000 of them, and no graphics card. Each function draws on the axes given, or on new ones of
+`matplotlib.pyplot`, and returns them; without matplotlib it raises ImportError. Nothing global is set.
 """
 
 from __future__ import annotations
@@ -17,7 +18,7 @@ from torchlb.errors import InputError
 from torchlb.plot.drawing import (
     INK,
     VIEW,
-    Eye,
+    Views,
     axes_of,
     cloud_of,
     color_map,
@@ -38,8 +39,8 @@ Faces = Int[Tensor, "F 3"] | Int[np.ndarray, "F 3"]
 Cloud = Float[Tensor, "N n"] | Float[np.ndarray, "N n"]
 Scalar = Num[Tensor, " N"] | Num[np.ndarray, " N"]
 Vectors = Float[Tensor, "N n"] | Float[np.ndarray, "N n"]
-ORDER_COLORS = ("#cfc9bf", "#dcae6b", "#c4c56a", "#7fa9cf", "#67b39c", "#3f689b", "#a184b8")
-"""By order reached, low-order rows first, the last for all beyond. Muted: no order is an alarm."""
+ORDER_COLORS = ("#ece7dc", "#cfd6cf", "#abc1c4", "#7fa5b5", "#5485a0", "#33648a", "#1b446d")
+"""By order reached, low-order rows first, the last for all beyond: darker means higher, and grey tells them, too."""
 LINE_COLORS = ("#d55e00", "#56b4e9", "#0072b2", "#000000", "#e69f00", "#009e73", "#cc79a7")
 MARKERS = "osD^vP*"
 PALE = "0.88"
@@ -57,7 +58,7 @@ def plot_surface(
     symmetric: bool | None = None,
     limits: tuple[float, float] | None = None,
     levels: Sequence[float] | Float[np.ndarray, " L"] = (),
-    view: Eye | Sequence[Eye] = VIEW,
+    view: Views = VIEW,
     label: str | None = None,
 ) -> Any:
     """A scalar on a triangulated surface, shaded, with a colour bar.
@@ -78,14 +79,7 @@ def plot_surface(
         is seen from above.
     label : of the colour bar, such as the unit.
 
-    Returns
-    -------
-    The axes.
-
-    Raises
-    ------
-    ImportError : without matplotlib.
-    ValueError : for values or faces that do not fit the vertices.
+    Returns the axes. Raises ValueError for values or faces that do not fit the vertices.
     """
     ax = axes_of(ax)
     points, corners = mesh_of(vertices, faces)
@@ -93,8 +87,7 @@ def plot_surface(
     shades, extend = color_map(numbers, cmap, symmetric, limits)
     isolines = isolines_of(numbers, corners, levels) if len(levels) else None
     paint(ax, points, corners, shades.to_rgba(numbers[corners].mean(axis=1)), view, isolines)
-    finish(ax, title, shades, extend, label)
-    return ax
+    return finish(ax, title, shades, extend, label)
 
 
 def plot_points(
@@ -106,7 +99,7 @@ def plot_points(
     cmap: str | None = None,
     symmetric: bool | None = None,
     limits: tuple[float, float] | None = None,
-    view: Eye | Sequence[Eye] = VIEW,
+    view: Views = VIEW,
     label: str | None = None,
     size: float | None = None,
 ) -> Any:
@@ -119,14 +112,7 @@ def plot_points(
     size : area of a disk, in square points (1/72 inch); by default smaller the more there are.
     ax, title, cmap, symmetric, limits, view, label : as for `plot_surface`.
 
-    Returns
-    -------
-    The axes.
-
-    Raises
-    ------
-    ImportError : without matplotlib.
-    ValueError : for points of another dimension, or values that do not fit them.
+    Returns the axes. Raises ValueError for points of another dimension, or values that do not fit them.
     """
     ax = axes_of(ax)
     places = cloud_of(points)
@@ -134,8 +120,7 @@ def plot_points(
     # The middle of "coolwarm" is no white.
     shades, extend = color_map(numbers, cmap, symmetric, limits, "coolwarm")
     draw_dots(ax, places, shades.to_rgba(numbers), view, size)
-    finish(ax, title, shades, extend, label)
-    return ax
+    return finish(ax, title, shades, extend, label)
 
 
 def plot_vectors(
@@ -149,7 +134,7 @@ def plot_vectors(
     cmap: str | None = None,
     symmetric: bool | None = None,
     limits: tuple[float, float] | None = None,
-    view: Eye | Sequence[Eye] = VIEW,
+    view: Views = VIEW,
     label: str | None = None,
     count: int = 400,
 ) -> Any:
@@ -166,14 +151,7 @@ def plot_vectors(
     count : number of arrows, on all sides of the shape.
     ax, title, cmap, symmetric, limits, view, label : as for `plot_surface`.
 
-    Returns
-    -------
-    The axes.
-
-    Raises
-    ------
-    ImportError : without matplotlib.
-    ValueError : for vectors, values or faces that do not fit the vertices.
+    Returns the axes. Raises ValueError for vectors, values or faces that do not fit the vertices.
     """
     ax = axes_of(ax)
     places, field = cloud_of(vertices), cloud_of(vectors, "vectors")
@@ -188,8 +166,7 @@ def plot_vectors(
     _fill(ax, places, corners, ground, view)
     inks = shades.to_rgba(lengths) if values is None else plain(INK, len(places))
     draw_arrows(ax, places, corners, field, inks, view, count)
-    finish(ax, title, shades, extend, label)
-    return ax
+    return finish(ax, title, shades, extend, label)
 
 
 def plot_orders(
@@ -199,7 +176,7 @@ def plot_orders(
     *,
     ax: Any = None,
     title: str | None = "order reached",
-    view: Eye | Sequence[Eye] = VIEW,
+    view: Views = VIEW,
 ) -> Any:
     """Map of the order that each point reached (`lb.report.order`), with the number of points in the legend.
 
@@ -207,17 +184,10 @@ def plot_orders(
     ----------
     vertices : (N, 3); also (N, 2) for a cloud.
     faces : (F, 3), or None for a cloud. A triangle takes the lowest order of its corners.
-    order : (N,), 0 for a low-order row.
+    order : (N,), 0 for a low-order row. Darker is higher.
     ax, title, view : as for `plot_surface`.
 
-    Returns
-    -------
-    The axes.
-
-    Raises
-    ------
-    ImportError : without matplotlib.
-    ValueError : for orders or faces that do not fit the vertices.
+    Returns the axes. Raises ValueError for orders or faces that do not fit the vertices.
     """
     ax = axes_of(ax)
     from matplotlib import colors
@@ -230,23 +200,17 @@ def plot_orders(
     corners = None if faces is None else mesh_of(vertices, faces)[1]
     shown = reached if corners is None else reached[corners].min(axis=1)  # by dot or triangle
     _fill(ax, places, corners, palette[shown.clip(0, last)], view)
-    counts = np.bincount(reached)
-    handles = [
-        Patch(color=palette[min(p, last)], label=f"{f'order {p}' if p else 'low order'}: {count:,}")
-        for p, count in reversed(list(enumerate(counts)))
-        if count
-    ]
+    handles = []
+    for p, count in reversed(list(enumerate(np.bincount(reached)))):
+        if count:
+            label = f"order {p}: {count:,}" if p else f"low order: {count:,}"
+            handles.append(Patch(facecolor=palette[min(p, last)], edgecolor="0.6", label=label))
     ax.legend(handles=handles, loc="center left", bbox_to_anchor=(1.0, 0.5), frameon=False)
-    finish(ax, title)
-    return ax
+    return finish(ax, title)
 
 
 def _fill(
-    ax: Any,
-    points: np.ndarray,
-    faces: np.ndarray | None,
-    colors: np.ndarray,
-    view: Eye | Sequence[Eye],
+    ax: Any, points: np.ndarray, faces: np.ndarray | None, colors: np.ndarray, view: Views
 ) -> None:
     """A surface by the colours of its triangles, or a cloud by those of its points."""
     if faces is None:
@@ -276,23 +240,15 @@ def plot_convergence(
     ax, title : as for `plot_surface`.
     ylabel : of the vertical axis.
 
-    Returns
-    -------
-    The axes.
-
-    Raises
-    ------
-    ImportError : without matplotlib.
-    ValueError : for no errors that are positive, or another number of them than of sizes.
+    Returns the axes. Raises ValueError for no errors that are positive, or another number of them than of sizes.
     """
     ax = axes_of(ax)
     orders = []
     for i, (name, line) in enumerate(errors.items()):
         n, error = np.asarray(sizes, dtype=float), np.asarray(line, dtype=float)
         if n.shape != error.shape:
-            raise InputError(
-                f"errors[{name!r}]: expected {len(n)}, one for a size, got {len(error)}"
-            )
+            expected = f"expected {len(n)}, one for a size"
+            raise InputError(f"errors[{name!r}]: {expected}, got {len(error)}")
         good = np.isfinite(error) & (error > 0)
         n, error = n[good], error[good]
         label = name
