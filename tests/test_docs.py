@@ -39,6 +39,7 @@ def test_pages_with_code_are_found():
 VERTICES, FACES = Sphere().mesh(60)
 NAN = VERTICES.clone()
 NAN[3, 1] = float("nan")
+GRID = torch.arange(100).view(10, 10)
 
 
 def unstable():
@@ -66,6 +67,17 @@ TRIGGERS = {
     "… points share": lambda: LaplaceBeltrami.from_points(torch.cat([VERTICES, VERTICES[:2]])),
     "… are NaN": lambda: LaplaceBeltrami.from_points(NAN),
     "… have indices": lambda: LaplaceBeltrami.from_mesh(VERTICES, FACES + 1),
+    "… these look like quads": lambda: LaplaceBeltrami.from_mesh(
+        torch.rand(100, 3), GRID[:-1, :-1].reshape(-1, 1) + torch.tensor([0, 1, 11, 10])
+    ),
+    "… have the corners": lambda: LaplaceBeltrami.from_mesh(
+        VERTICES, torch.cat([FACES, FACES[:1]])
+    ),
+    "… are wound": lambda: LaplaceBeltrami.from_mesh(
+        VERTICES, torch.cat([FACES[:1].flip(1), FACES[1:]])
+    ),
+    "… are taken for": lambda: LaplaceBeltrami.from_points(torch.rand(400, 2)),
+    "… float32 has": lambda: LaplaceBeltrami.from_points((VERTICES + 1e6).float()),
     "… points are fewer": lambda: LaplaceBeltrami.from_points(VERTICES[:9]),
     "num_neighbors:": lambda: LaplaceBeltrami.from_points(VERTICES, num_neighbors=4),
     "NOT STABLE": unstable,
@@ -102,6 +114,7 @@ def test_a_quoted_message_is_one_that_comes(message, tmp_path, monkeypatch):
     pattern = ".*".join(re.escape(part) for part in message.split("…"))
     with warnings.catch_warnings():
         warnings.simplefilter("error", torchlb.StabilityWarning)
+        warnings.filterwarnings("error", "(faces|points): ")
         with pytest.raises((ValueError, TypeError, RuntimeError, UserWarning)) as caught:
             trigger()
     assert re.search(pattern, str(caught.value), re.DOTALL), str(caught.value)
