@@ -10,6 +10,7 @@ import pytest
 import torch
 
 import torchlb
+import torchlb.interop.trimesh
 from torchlb import DiffusionNet, LaplaceBeltrami
 from torchlb.surfaces import Circle, Sphere
 
