@@ -1,5 +1,6 @@
 """Heat flow by every method against the dense exponential, its conservation laws, and its derivatives."""
 
+import copy
 import functools
 import math
 from typing import get_args
@@ -11,6 +12,7 @@ from torch.autograd import gradcheck
 
 from torchlb import Diffusion, DiffusionError, InputError, LaplaceBeltrami, heat_flow
 from torchlb.linalg.exponential import chebyshev_coefficients, hyperbola
+from torchlb.linalg.spectral_bounds import Bounds
 from torchlb.nn.diffusion import Method, checked_method
 from torchlb.surfaces import Circle, Sphere, Torus, UnitDisk
 
@@ -214,6 +216,12 @@ def test_deflated_diffusion_takes_any_spectral_radius(monkeypatch):
         assert (one - other).norm() <= 1e-5 * one.norm()
 
 
+def test_former_names_of_methods_are_taken_with_a_warning():
+    for former, method in (("full", "deflated"), ("rational", "contour")):
+        with pytest.warns(DeprecationWarning, match=f"'{former}' is called '{method}' now"):
+            assert checked_method(former) == method
+
+
 def test_learned_times_stay_positive_and_are_learned():
     """A flow for t = 0.2 is found from t = 0.01, by unconstrained minimisation."""
     lb = BUILDERS["points"]()
@@ -249,6 +257,13 @@ def test_what_cannot_work_is_said():
         Diffusion(2)(f, lb)
     with pytest.raises(DiffusionError, match=r"takes .* products"):
         heat_flow(lb, f, 1e9, method="chebyshev")
+    unknown = copy.deepcopy(lb)
+    unknown.set_bounds(Bounds(float(lb.spectral_bounds.radius), None))
+    with pytest.raises(DiffusionError, match=r"no ellipse.*use method='contour'"):
+        heat_flow(unknown, f, 0.1, method="chebyshev")
+    torch.testing.assert_close(
+        heat_flow(unknown, f, 0.1, k=40), heat_flow(lb, f, 0.1, k=40), rtol=0, atol=1e-6
+    )
     two = torch.cat([Sphere().points(200), Sphere().points(200) + 5])
     with pytest.raises(DiffusionError, match="ask for another k"):
         heat_flow(LaplaceBeltrami.from_points(two), rough(400), 1.0, k=1)

@@ -158,8 +158,25 @@ def test_outputs_at_every_place(mesh):
     mean = torch.einsum("n,bnc->bc", lb.mass, y) / lb.mass.sum()
     torch.testing.assert_close(nets["global_mean"](x, lb), mean)
     torch.testing.assert_close(nets["global_mean"](x[0], lb), mean[0])
-    with pytest.raises(ValueError, match="needs faces, got None"):
+    with pytest.raises(InputError, match="needs faces, got None"):
         nets["faces"](x, lb)
+    with pytest.raises(InputError, match="expected indices from 0 to 299, got 300"):
+        nets["faces"](x, lb, faces + 1)
+
+
+def test_faces_of_a_batch_are_moved_by_its_offsets():
+    """Output s of the batch is that of shape s; faces as they were, of either order of sizes, are refused."""
+    meshes = [Torus().mesh(60), Sphere().mesh(100)]
+    net = DiffusionNet(3, 5, width=WIDTH, outputs_at="faces", k=20).double().eval()
+    for pair in (meshes, meshes[::-1]):
+        shapes = [LaplaceBeltrami.from_cotangent(*mesh) for mesh in pair]
+        batch, x = LaplaceBeltrami.batch(shapes), torch.cat([lb.points for lb in shapes])
+        faces = [f for _, f in pair]
+        moved = torch.cat([f + start for f, start in zip(faces, batch.offsets, strict=False)])
+        alone = [net(lb.points, lb, f) for lb, f in zip(shapes, faces, strict=True)]
+        torch.testing.assert_close(net(x, batch, moved), torch.cat(alone), rtol=1e-5, atol=1e-5)
+        with pytest.raises(InputError, match=r"have to be moved by lb.offsets\[s\]"):
+            net(x, batch, torch.cat(faces))
 
 
 def test_block_is_its_formula(mesh):

@@ -1,18 +1,21 @@
 """What every layer has to bear: batches of shapes, compilers, half precision, copies, workers, devices."""
 
 import copy
+import json
 import shutil
 import subprocess
 import sys
 
 import pytest
 import torch
+import torch._dynamo.testing
 from torch.utils.data import DataLoader
 
 from torchlb import (
     Diffusion,
     DiffusionNet,
     GradientFeatures,
+    InputError,
     LaplaceBeltrami,
     SpectralConv,
     diffusion_map,
@@ -179,14 +182,43 @@ def compiled_and_not(name, batched):
     return results
 
 
+def graphs_of_sizes(name, batched):
+    """Number of graphs compiled for ten shapes, or batches of two, of ten sizes; all outputs are the layer's own."""
+    torch._dynamo.reset()
+    layer, backend = layer_of(name), torch._dynamo.testing.CompileCounterWithBackend("aot_eager")
+    compiled = torch.compile(layer, backend=backend, fullgraph=True)
+    meshes = [Sphere().mesh(n) for n in range(60, 180, 12)]
+    clouds = [LaplaceBeltrami.from_mesh(v.float(), f, order=1) for v, f in meshes]
+    for lb in clouds:
+        lb.eigenbasis(K)
+    for i, alone in enumerate(clouds):
+        lb = LaplaceBeltrami.batch([alone, clouds[i - 1]]) if batched else alone
+        x = features(lb)
+        torch.testing.assert_close(compiled(x, lb), layer(x, lb), rtol=1e-3, atol=1e-4)
+    return backend.frame_count
+
+
+def run_apart(*arguments):
+    """Run this file as a program: Dynamo cannot trace the types that the test run checks at every call."""
+    command = [sys.executable, __file__, *arguments]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr[-3000:]
+    return done.stdout
+
+
 @needs_compiler
 @pytest.mark.slow
 @pytest.mark.parametrize(("name", "batched"), [("classifier", True), ("convolution", False)])
 def test_compiled_without_graph_breaks_it_gives_the_same(name, batched):
-    # In a process of its own: Dynamo cannot trace the types that the test run checks at every call.
-    command = [sys.executable, __file__, name, *["batched"][: int(batched)]]
-    done = subprocess.run(command, capture_output=True, text=True, check=False)
-    assert done.returncode == 0, done.stderr[-3000:]
+    run_apart(name, *["batched"][: int(batched)])
+
+
+@pytest.mark.slow
+def test_compiled_for_two_sizes_it_takes_all():
+    """At most four graphs for ten sizes: the first, that of any size, and two for other sizes of the basis."""
+    graphs = json.loads(run_apart("sizes"))
+    assert len(graphs) == 5
+    assert max(graphs.values()) <= 4, graphs
 
 
 @every_layer
@@ -216,6 +248,32 @@ def test_float32_is_close_to_float64(name):
     y = copy.deepcopy(layer).float()(features(double).float(), single)
     assert y.dtype == torch.float32
     assert (y - expected).abs().max() <= 1e-3 * expected.abs().max()
+
+
+@every_layer
+def test_one_rule_of_types(name):
+    """The parameters' type is that of x, which the result has; the operator may have any. Else an error names both."""
+    double = LaplaceBeltrami.from_mesh(*Torus().mesh(100))
+    layer, x = layer_of(name), features(double).float()
+    y = layer(x, double)
+    assert y.dtype == torch.float32
+    single = copy.deepcopy(double).float()
+    torch.testing.assert_close(y, layer(x, single), rtol=1e-3, atol=1e-4)
+    double_layer = copy.deepcopy(layer).double()
+    assert double_layer(x.double(), single).dtype == torch.float64
+    for wrong, features_of_other in ((layer, x.double()), (double_layer, x), (layer, x.bfloat16())):
+        with pytest.raises(
+            InputError, match=r"type of the layer's parameters, torch.float\d\d, got"
+        ):
+            wrong(features_of_other, double)
+
+
+@pytest.mark.parametrize("name", ["deflated", "spectral", "convolution", "net"])
+def test_a_stored_basis_that_is_too_short_is_named(name):
+    lb = LaplaceBeltrami.from_cotangent(*Sphere().mesh(60))
+    held = lb.float().eigenbasis(8, closed=True).eigenvectors.shape[1]
+    with pytest.warns(UserWarning, match=f"basis of {held} pairs, a layer asks for k = {K}"):
+        layer_of(name)(features(lb), lb)
 
 
 @every_layer
@@ -278,6 +336,15 @@ def test_on_cuda_it_gives_the_same(eight, name):
         assert all(p.grad.isfinite().all() for p in there.parameters())
 
 
-if __name__ == "__main__":
+if __name__ == "__main__" and sys.argv[1] == "sizes":
+    kinds = [
+        ("net", False),
+        ("spectral", False),
+        ("chebyshev", False),
+        ("convolution", True),
+        ("classifier", True),
+    ]
+    print(json.dumps({name: graphs_of_sizes(name, batched) for name, batched in kinds}))
+elif __name__ == "__main__":
     compiled, plain = compiled_and_not(sys.argv[1], "batched" in sys.argv)
     torch.testing.assert_close(compiled, plain, rtol=1e-3, atol=1e-4)

@@ -51,7 +51,7 @@ def heat(
     values: Float[Tensor, " nnz"],
     x: Float[Tensor, "N C"],
     time: Float[Tensor, " C"],
-    extent: tuple[float, float],
+    bounds: Float[Tensor, 2],
     expansion: str,
     tolerance: float,
     sizes: Sequence[int],
@@ -63,19 +63,20 @@ def heat(
     pattern : [crow, col, crow_t, col_t, order_t] of L and its transpose.
     values : of L, 1/ℓ²; no gradient goes there.
     time : t ≥ 0, ℓ².
-    extent : (R, b): the spectrum lies in the ellipse of half axes R/2, b around −R/2.
+    bounds : (R, b), in float64 on the CPU: the spectrum lies in the ellipse of half axes R/2, b around −R/2; b is NaN
+        where no ellipse is known. A tensor, since numbers would be compiled anew for every operator.
     expansion : "chebyshev", "contour" or "either".
     tolerance : of the result, relative to x.
     sizes : numbers of rows of the diagonal blocks of L; (N,) for one shape.
     """
-    options = list(extent), expansion, tolerance, list(sizes)
+    options = bounds, expansion, tolerance, list(sizes)
     return _heat(list(pattern), values, x, time, *options, False)
 
 
 @torch.library.custom_op(
     "torchlb::heat",
     mutates_args=(),
-    schema="(Tensor[] pattern, Tensor values, Tensor x, Tensor time, float[] extent, str expansion, "
+    schema="(Tensor[] pattern, Tensor values, Tensor x, Tensor time, Tensor bounds, str expansion, "
     "float tolerance, SymInt[] sizes, bool transposed) -> Tensor",
 )
 def _heat(
@@ -83,15 +84,15 @@ def _heat(
     values: Tensor,
     x: Tensor,
     time: Tensor,
-    extent: Sequence[float],
+    bounds: Tensor,
     expansion: str,
     tolerance: float,
     sizes: Sequence[int],
     transposed: bool,
 ) -> Tensor:
-    expansion, dtype = _choose_expansion(expansion, x, time, extent, tolerance)
+    expansion, dtype = _choose_expansion(expansion, x, time, bounds, tolerance)
     y = torch.zeros_like(x, dtype=dtype, memory_format=torch.contiguous_format)
-    options = extent, expansion, tolerance, sizes, transposed
+    options = bounds, expansion, tolerance, sizes, transposed
     for where, vector, coefficient, _ in _terms(pattern, values, x.to(dtype), time, *options):
         _add_scaled(y, where, vector, coefficient)
     return y.to(x.dtype)
@@ -100,7 +101,7 @@ def _heat(
 @torch.library.custom_op(
     "torchlb::heat_backward",
     mutates_args=(),
-    schema="(Tensor[] pattern, Tensor values, Tensor x, Tensor time, float[] extent, str expansion, "
+    schema="(Tensor[] pattern, Tensor values, Tensor x, Tensor time, Tensor bounds, str expansion, "
     "float tolerance, SymInt[] sizes, bool transposed, Tensor grad) -> (Tensor, Tensor)",
 )
 def _heat_backward(
@@ -108,17 +109,17 @@ def _heat_backward(
     values: Tensor,
     x: Tensor,
     time: Tensor,
-    extent: Sequence[float],
+    bounds: Tensor,
     expansion: str,
     tolerance: float,
     sizes: Sequence[int],
     transposed: bool,
     grad: Tensor,
 ) -> tuple[Tensor, Tensor]:
-    expansion, dtype = _choose_expansion(expansion, x, time, extent, tolerance)
+    expansion, dtype = _choose_expansion(expansion, x, time, bounds, tolerance)
     grad_x = torch.zeros_like(x, dtype=dtype, memory_format=torch.contiguous_format)
     grad_t = torch.zeros_like(time)
-    options = extent, expansion, tolerance, sizes, not transposed
+    options = bounds, expansion, tolerance, sizes, not transposed
     terms = _terms(pattern, values, grad.to(dtype), time, *options)
     for where, vector, coefficient, derivative in terms:
         _add_scaled(grad_x, where, vector, coefficient)
@@ -128,7 +129,7 @@ def _heat_backward(
 
 
 def _choose_expansion(
-    expansion: str, x: Tensor, time: Tensor, extent: Sequence[float], tolerance: float
+    expansion: str, x: Tensor, time: Tensor, bounds: Tensor, tolerance: float
 ) -> tuple[str, torch.dtype]:
     """What "either" stands for, and the type to sum in; here, since outside the operation times have no values yet.
 
@@ -136,7 +137,10 @@ def _choose_expansion(
     """
     if expansion == "either":
         longest = float(time.max()) if len(time) else 0.0
-        few = _estimate(longest, extent[0] / 2, extent[1], tolerance) < PRODUCTS
+        radius, height = bounds.tolist()
+        few = (
+            _estimate(longest, radius / 2, height, tolerance) < PRODUCTS
+        )  # never so where it is NaN
         expansion = "chebyshev" if few else "contour"
     return expansion, torch.float64 if expansion == "contour" else x.dtype
 
@@ -188,7 +192,7 @@ def _terms(
     values: Tensor,
     x: Tensor,
     time: Tensor,
-    extent: Sequence[float],
+    bounds: Tensor,
     expansion: str,
     tolerance: float,
     sizes: Sequence[int],
@@ -199,8 +203,8 @@ def _terms(
     if len(times) == 0 or len(x) == 0:
         return iter(())
     if expansion == "chebyshev":
-        return _chebyshev(pattern, values, x, times, extent, tolerance, sizes, transposed)
-    return _contour(pattern, values, x, times, extent[0], tolerance, transposed)
+        return _chebyshev(pattern, values, x, times, bounds, tolerance, sizes, transposed)
+    return _contour(pattern, values, x, times, float(bounds[0]), tolerance, transposed)
 
 
 def _estimate(longest: float, a: float, b: float, tolerance: float) -> float:
@@ -220,8 +224,12 @@ def chebyshev_coefficients(
     >>> c.tolist(), d, r
     ([[1.0], [0.0]], 0.5, 1.0)
     """
-    a = radius / 2
-    b = min(height, 0.9 * a)
+    a, b = radius / 2, height
+    if math.isnan(b):
+        raise DiffusionError(
+            "method='chebyshev': no ellipse in the left half plane holds the spectrum, as on an operator that is not "
+            "stable; build it with certify=True, or use method='contour'"
+        )
     d = np.sqrt(a * a - b * b)
     r = (a + b) / d
     longest = float(times.max())
@@ -254,16 +262,17 @@ def _chebyshev(
     values: Tensor,
     x: Tensor,
     times: np.ndarray,
-    extent: Sequence[float],
+    bounds: Tensor,
     tolerance: float,
     sizes: Sequence[int],
     transposed: bool,
 ) -> Iterator[Term]:
-    c, slope, d, r = chebyshev_coefficients(times, extent[0], extent[1], tolerance)
+    radius, height = bounds.tolist()
+    c, slope, d, r = chebyshev_coefficients(times, radius, height, tolerance)
     crow, col, crow_t, col_t, order_t = pattern
     if transposed:
         crow, col, values = crow_t, col_t, values[order_t]
-    shift = extent[0] / (r * d)
+    shift = radius / (r * d)
     for rows, matrix in _blocks(crow, col, values * (2 / (r * d)), x, sizes):
         where = rows, slice(None)
         before = x[rows]

@@ -144,18 +144,9 @@ def _expanded(
     lb: LaplaceBeltrami, x: Tensor, time: Tensor, expansion: str, tolerance: float
 ) -> Tensor:
     """e^{tΔ}x by one of the expansions; the surfaces of a stack (B, N, C) become channels."""
-    radius, height = lb.spectral_bounds
-    if height is None:
-        if expansion == "chebyshev":
-            raise DiffusionError(
-                "method='chebyshev': no ellipse in the left half plane holds the spectrum, as on an operator that "
-                "is not stable; build it with certify=True, or use method='contour'"
-            )
-        expansion = "contour"
-    extent = radius, height or 0.0
     pattern = [lb.crow, lb.col, lb.crow_t, lb.col_t, lb.order_t]
     values = lb.values.to(x.dtype)
-    options = extent, expansion, tolerance, lb.sizes or (lb.num_points,)
+    options = lb.bounds, expansion, tolerance, lb.sizes or (lb.num_points,)
     if x.ndim == 2:
         return heat(pattern, values, x, time, *options)
     columns = x.transpose(0, 1).flatten(1)

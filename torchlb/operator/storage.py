@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import asdict
 from math import isnan
 from typing import Any
@@ -56,7 +57,7 @@ class OperatorStorage(nn.Module):
         self.kind = "empty"
         self.options: dict[str, Any] = {}
         self.certificate: Certificate | None = None
-        self.sizes: tuple[int, ...] | None = None
+        self._sizes: list[Tensor] | None = None
         self._bounds: Tensor | None = None
         for name in BUFFERS:
             self.register_buffer(name, torch.zeros(0))
@@ -69,6 +70,22 @@ class OperatorStorage(nn.Module):
             self.register_buffer(name, torch.zeros(0, dtype=torch.int64), persistent=False)
         for name in BASIS:
             self.register_buffer(f"basis_{name}", torch.zeros(0), persistent=False)
+
+    def __getattr__(self, name: str) -> Any:
+        """A buffer. Not by way of `nn.Module`, for whose buffers `torch.compile` makes a graph of every size."""
+        buffers = self.__dict__.get("_buffers", {})
+        return buffers[name] if name in buffers else super().__getattr__(name)
+
+    @property
+    def sizes(self) -> tuple[int, ...] | None:
+        """Numbers of points of the shapes of a `batch`; None for a single shape."""
+        return None if self._sizes is None else tuple(t.shape[0] for t in self._sizes)
+
+    @sizes.setter
+    def sizes(
+        self, sizes: Sequence[int] | None
+    ) -> None:  # in shapes of tensors: numbers are compiled in
+        self._sizes = None if sizes is None else [torch.empty(n, 0) for n in sizes]
 
     @property
     def num_points(self) -> int:
