@@ -2,6 +2,7 @@
 
 import os
 
+import jaxtyping
 import pytest
 import torch
 
@@ -18,3 +19,9 @@ def seed():
     torch.manual_seed(0)
     yield
     assert torch.get_default_dtype() == torch.float32
+
+
+@pytest.fixture
+def unchecked(monkeypatch):
+    """Without the tests' own checks of types: as a user calls it."""
+    monkeypatch.setattr(jaxtyping.config, "jaxtyping_disable", True)

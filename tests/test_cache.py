@@ -28,8 +28,14 @@ from torchlb import (
 from torchlb.surfaces import Sphere
 
 ROOT = Path(__file__).parents[1]
-VERTICES, FACES = Sphere().mesh(100)
-VERTICES = VERTICES * (1 + 1 / 3)  # not representable in float32
+
+
+@pytest.fixture(scope="module", autouse=True)
+def shape():
+    """Made when the first test runs, not when tests are collected."""
+    global VERTICES, FACES
+    VERTICES, FACES = Sphere().mesh(100)
+    VERTICES = VERTICES * (1 + 1 / 3)  # not representable in float32
 
 
 @pytest.fixture
@@ -343,7 +349,7 @@ def test_a_writer_killed_in_the_middle_leaves_the_file_as_it_was(tmp_path):
         assert all(name == "lb.npz" or name.endswith(".tmp") for name in files_of(tmp_path))
 
 
-def test_errors(tmp_path):
+def test_errors(tmp_path, unchecked):
     with pytest.raises(FileNotFoundError):
         load_operator(tmp_path / "missing.npz")
     with pytest.raises(ValueError, match=r"expected one of .*stencil.*got 'graph'"):
@@ -359,9 +365,70 @@ def test_errors(tmp_path):
     assert files_of(tmp_path) == []
 
 
-def test_a_newer_format_is_refused_by_name(tmp_path, monkeypatch):
-    monkeypatch.setattr(torchlb.io.cache, "FORMAT", 2)
-    save_operator(LaplaceBeltrami(), tmp_path / "lb.npz")
-    monkeypatch.undo()
-    with pytest.raises(OperatorFileError, match="format 2, this torchlb reads 1"):
-        load_operator(tmp_path / "lb.npz")
+def read_only(monkeypatch):
+    """A folder that nobody may write to, root neither."""
+
+    def refuse(path, *_, **__):
+        raise PermissionError(13, "Permission denied", str(path))
+
+    monkeypatch.setattr(torchlb.io.cache, "open", refuse, raising=False)
+
+
+def test_a_cache_that_cannot_be_written_loses_nothing(tmp_path, monkeypatch):
+    """Neither a finished build, nor the eigenpairs that an entry lacks; the file stays as it was."""
+    cache = {"cache": tmp_path, "operator": "cotangent"}
+    expected = load_or_build(VERTICES, FACES, **cache)
+    path = tmp_path / files_of(tmp_path)[0]
+    before = path.read_bytes()
+    read_only(monkeypatch)
+    with pytest.warns(CacheWarning, match=f"{path.name}.*not written.*Permission denied"):
+        more = load_or_build(VERTICES, FACES, k=8, **cache)
+    assert len(more.eigenbasis(8).eigenvalues) == 8
+    assert path.read_bytes() == before
+    path.unlink()
+    with pytest.warns(CacheWarning, match="not written"):
+        assert_same(load_or_build(VERTICES, FACES, **cache), expected)
+    assert files_of(tmp_path) == []
+
+
+def test_a_cache_is_a_folder(tmp_path):
+    (tmp_path / "file").write_text("no folder")
+    with pytest.raises(ValueError, match="expected a folder, "):
+        load_or_build(VERTICES, FACES, cache=tmp_path / "file", operator="cotangent")
+
+
+def test_the_home_directory_has_a_short_name(tmp_path, monkeypatch):
+    monkeypatch.setenv("HOME", str(tmp_path))
+    lb = load_or_build(VERTICES, FACES, cache="~/operators", operator="cotangent")
+    save_operator(lb, "~/one.npz")
+    assert_same(load_operator("~/one.npz"), lb)
+    assert files_of(tmp_path) == ["one.npz", "operators"]
+
+
+def of_format_1(path):
+    """The file as an older torchlb wrote it: the names of its arrays are not today's."""
+    with np.load(path) as archive:
+        arrays = dict(archive)
+    header = json.loads(str(arrays.pop("header")))
+    header |= {"format": 1, "version": "0.0.9", "types": {"dominance": "float32"}}
+    np.savez(path, dominance=np.zeros(3), header=np.array(json.dumps(header)))
+
+
+def test_a_file_of_an_older_format_is_refused_by_name_and_built_again(tmp_path):
+    arguments = {"cache": tmp_path, "operator": "cotangent"}
+    lb = load_or_build(VERTICES, FACES, **arguments)
+    path = tmp_path / files_of(tmp_path)[0]
+    of_format_1(path)
+    message = r"written by torchlb 0\.0\.9 in format 1, and torchlb .* reads format 2; build"
+    with pytest.raises(OperatorFileError, match=message):
+        load_operator(path)
+    with pytest.warns(CacheWarning, match=f"{message}.*computed again and replaced"):
+        assert_same(load_or_build(VERTICES, FACES, **arguments), lb)
+    assert_same(load_operator(path), lb)
+
+
+def test_any_byte_order(tmp_path, no_building):
+    first = load_or_build(VERTICES, FACES, cache=tmp_path, order=1)
+    no_building()
+    vertices, faces = VERTICES.numpy().astype(">f8"), FACES.numpy().astype(">i4")
+    assert_same(load_or_build(vertices, faces, cache=tmp_path, order=1), first)

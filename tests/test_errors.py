@@ -1,6 +1,5 @@
 """Every bad input is refused with what came, where, and what to do."""
 
-import jaxtyping
 import numpy as np
 import pytest
 import torch
@@ -15,12 +14,6 @@ from torchlb.surfaces import CliffordTorus, Sphere
 
 POINTS = Sphere().points(100)
 VERTICES, FACES = Sphere().mesh(100)
-
-
-@pytest.fixture
-def unchecked(monkeypatch):
-    """Without the tests' own checks of types: as a user calls it."""
-    monkeypatch.setattr(jaxtyping.config, "jaxtyping_disable", True)
 
 
 def spoiled(index, value):

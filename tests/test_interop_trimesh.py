@@ -40,7 +40,7 @@ def test_there_and_back():
     assert cloud.metadata["mass"].shape == (200,)
 
 
-def test_errors_of_conversion():
+def test_errors_of_conversion(unchecked):
     lb = from_trimesh(MESH, order=1)
     with pytest.raises(ValueError, match="mass: expected 200 rows"):
         to_trimesh(lb, FACES, mass=lb.mass[:5])

@@ -221,7 +221,7 @@ def test_what_killed_writers_left_is_removed_after_a_day(tmp_path):
     assert new.exists()
 
 
-def test_what_would_fail_for_every_shape_is_refused_at_once(tmp_path):
+def test_what_would_fail_for_every_shape_is_refused_at_once(unchecked, tmp_path):
     (tmp_path / "empty").mkdir()
     out = tmp_path / "out"
     with pytest.raises(ValueError, match="no such folder"):

@@ -11,7 +11,7 @@ import time
 import warnings
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 import click
 from click.core import ParameterSource
@@ -23,7 +23,7 @@ from torchlb.io.files import read_shape
 from torchlb.io.precompute import concerns_the_shape, precompute_operators
 from torchlb.operator.build import WEIGHTS
 from torchlb.operator.cleaning import clean_mesh
-from torchlb.operator.dispatch import OPERATORS, build_operator
+from torchlb.operator.dispatch import Operator, build_operator
 from torchlb.operator.laplace_beltrami import LaplaceBeltrami
 from torchlb.plot.comparison import draw_comparison, spectra, spectrum_table
 from torchlb.version import __version__
@@ -137,7 +137,9 @@ def compare(mesh: Path, k: int, out: Path | None, clean: bool, **options: Any) -
 @click.option(
     "--out", type=click.Path(file_okay=False, path_type=Path), required=True, help="Cache to fill."
 )
-@click.option("--operator", type=click.Choice(OPERATORS), default="stencil", show_default=True)
+@click.option(
+    "--operator", type=click.Choice(get_args(Operator)), default="stencil", show_default=True
+)
 @click.option("-k", type=click.IntRange(min=0), default=0, show_default=True, help="Eigenpairs.")
 @click.option(
     "--workers", type=int, default=-1, show_default=True, help="Processes; -1: all cores."
@@ -147,7 +149,7 @@ def compare(mesh: Path, k: int, out: Path | None, clean: bool, **options: Any) -
 def precompute(
     folder: Path,
     out: Path,
-    operator: str,
+    operator: Operator,
     k: int,
     workers: int,
     quiet: bool,

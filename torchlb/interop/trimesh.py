@@ -5,18 +5,17 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-import trimesh
 from torch import Tensor
 
 from torchlb.errors import InputError
 from torchlb.io.files import SUFFIXES, arrays_of, read_shape
-from torchlb.operator.dispatch import build_operator
+from torchlb.operator.dispatch import Operator, build_operator
 from torchlb.operator.laplace_beltrami import LaplaceBeltrami
 
 __all__ = ["SUFFIXES", "from_trimesh", "read_shape", "to_trimesh"]
 
 
-def from_trimesh(shape: Any, *, operator: str = "stencil", **options: Any) -> LaplaceBeltrami:
+def from_trimesh(shape: Any, *, operator: Operator = "stencil", **options: Any) -> LaplaceBeltrami:
     """Operator of a `trimesh.Trimesh`, `trimesh.PointCloud` or `trimesh.Scene`, in float64.
 
     Parameters
@@ -31,6 +30,7 @@ def from_trimesh(shape: Any, *, operator: str = "stencil", **options: Any) -> La
 
     Examples
     --------
+    >>> import trimesh
     >>> from_trimesh(trimesh.creation.icosphere(subdivisions=2), order=3).num_points
     162
     """
@@ -52,6 +52,8 @@ def to_trimesh(lb: LaplaceBeltrami, faces: Any = None, **attributes: Any) -> Any
     ------
     ValueError : for points of another dimension, or an attribute of another length.
     """
+    import trimesh
+
     if lb.points.ndim != 2 or lb.points.shape[1] != 3:
         raise InputError(f"expected points in R³, got shape {tuple(lb.points.shape)}")
     arrays = {name: _array(value) for name, value in attributes.items()}

@@ -20,23 +20,23 @@ import torch
 from torch import Tensor
 
 from torchlb.errors import CacheWarning, InputError, OperatorFileError, warn
-from torchlb.operator.dispatch import build_operator, builder_of, complete_options
+from torchlb.operator.cleaning import ArrayLike, as_tensor, float_type
+from torchlb.operator.dispatch import Operator, build_operator, builder_of, complete_options
 from torchlb.operator.laplace_beltrami import LaplaceBeltrami
 from torchlb.version import __version__
 
 __all__ = ["describe_file", "load_operator", "load_or_build", "operator_key", "save_operator"]
 
-FORMAT = 1
-"""Of the file. It changes when an older torchlb could not read it."""
-Options = dict[str, Any]
+FORMAT = 2
+"""Of the file. It changes when another torchlb could not read it."""
 
 
 def load_or_build(
-    vertices: Any,
-    faces: Any = None,
+    vertices: ArrayLike,
+    faces: ArrayLike | None = None,
     *,
     cache: str | Path,
-    operator: str = "stencil",
+    operator: Operator = "stencil",
     k: int = 0,
     overwrite: bool = False,
     progress: bool = True,
@@ -52,7 +52,7 @@ def load_or_build(
     ----------
     vertices : (N, n) tensor or array, ℓ.
     faces : (F, 3) indices; None or empty for a point cloud.
-    cache : folder; made if missing.
+    cache : folder; made if missing, "~" is the home directory.
     operator : "stencil" (`from_mesh` or `from_points`) or "cotangent" (`from_cotangent`).
     k : number of eigenpairs to have in the file. A file with fewer is completed; one with more serves.
     overwrite : whether to build it anew even so.
@@ -60,7 +60,8 @@ def load_or_build(
     **options : of the builder, such as ``order=5``.
 
     Returns what the builder returns, in the floating type of `vertices`, on the CPU, and raises what it raises; an
-    OSError if the folder cannot be read or written. A `CacheWarning` tells of a damaged file, which is replaced.
+    InputError if `cache` is a file, an OSError if the folder cannot be read. A `CacheWarning` tells of a file that is
+    damaged or of another torchlb, which is replaced, and of a folder that cannot be written.
 
     Examples
     --------
@@ -76,20 +77,25 @@ def load_or_build(
     builder, points, corners = builder_of(vertices, faces, operator)
     options = complete_options(builder, options)
     key = _key(operator, points, corners, options)
-    path = Path(cache) / f"{key}.npz"
+    path = Path(cache).expanduser() / f"{key}.npz"
+    if path.parent.exists() and not path.parent.is_dir():
+        raise InputError(f"cache: expected a folder, {path.parent} is a file")
     lb = None if overwrite else _cached(path, key)
     if lb is None or _num_eigenpairs(lb) < min(k, lb.num_points):
         if lb is None:
             lb = build_operator(points, corners, operator=operator, progress=progress, **options)
         if k > 0:
             lb.eigenbasis(k, store=True)
-        save_operator(lb, path, key=key)
-    dtype = torch.as_tensor(vertices).dtype
-    return lb.to(dtype if dtype.is_floating_point else torch.get_default_dtype())
+        _store(lb, path, key)
+    return lb.to(float_type(vertices))
 
 
 def operator_key(
-    vertices: Any, faces: Any = None, *, operator: str = "stencil", **options: Any
+    vertices: ArrayLike,
+    faces: ArrayLike | None = None,
+    *,
+    operator: Operator = "stencil",
+    **options: Any,
 ) -> str:
     """Name of an operator in a cache: SHA-256 over positions, faces, options and version, 64 hexadecimal digits.
 
@@ -105,14 +111,14 @@ def operator_key(
     return _key(operator, points, corners, complete_options(builder, options))
 
 
-def _key(operator: str, points: Tensor, faces: Tensor | None, options: Options) -> str:
+def _key(operator: str, points: Tensor, faces: Tensor | None, options: dict[str, Any]) -> str:
     """SHA-256 of a canonical form: JSON for what is small, little-endian bytes for arrays."""
     digest = hashlib.sha256()
     arrays = {"points": points, "faces": faces}
-    plain: Options = {"operator": operator, "version": __version__}
+    plain: dict[str, Any] = {"operator": operator, "version": __version__}
     for name, value in options.items():
         if isinstance(value, Tensor | np.ndarray | list | tuple):
-            arrays[f"option {name}"] = torch.as_tensor(value)
+            arrays[f"option {name}"] = as_tensor(value)
         else:
             plain[f"option {name}"] = value.item() if isinstance(value, np.generic) else value
     digest.update(json.dumps(plain, sort_keys=True).encode())
@@ -136,12 +142,20 @@ def _cached(path: Path, key: str) -> LaplaceBeltrami | None:
         lb, header = _read(path)
         if header["key"] != key:
             raise OperatorFileError(f"{path}: holds another operator than its name says")
+        return lb
     except FileNotFoundError:
         return None
     except OperatorFileError as error:
         warn(f"{error}. It is computed again and replaced", CacheWarning)
         return None
-    return lb
+
+
+def _store(lb: LaplaceBeltrami, path: Path, key: str) -> None:
+    """Into the cache, or with a warning not: what was computed is not lost over it."""
+    try:
+        save_operator(lb, path, key=key)
+    except OSError as error:
+        warn(f"{path}: not written ({error}), so the next call computes it again", CacheWarning)
 
 
 def save_operator(lb: LaplaceBeltrami, path: str | Path, *, key: str = "") -> None:
@@ -158,7 +172,7 @@ def save_operator(lb: LaplaceBeltrami, path: str | Path, *, key: str = "") -> No
     ------
     OSError : where the file cannot be written; nothing is left of it then.
     """
-    path = Path(path)
+    path = Path(path).expanduser()
     state = lb.state_dict()
     header = {"format": FORMAT, "version": __version__, "key": key}
     header |= {"state": state.pop("_extra_state"), "types": {}}
@@ -198,7 +212,7 @@ def load_operator(path: str | Path) -> LaplaceBeltrami:
     Raises
     ------
     FileNotFoundError : if there is none.
-    OperatorFileError : if it is something else, or damaged.
+    OperatorFileError : if it is something else, damaged, or of a torchlb with another format.
     """
     return _read(Path(path))[0]
 
@@ -214,22 +228,25 @@ def describe_file(path: str | Path) -> dict[str, Any]:
 
 def _read(path: Path) -> tuple[LaplaceBeltrami, dict[str, Any]]:
     """Operator and header of a file, in full: every checksum is looked at."""
+    path = path.expanduser()
     try:
         with np.load(path, allow_pickle=False) as archive:
             header = json.loads(str(archive["header"]))
             if header["format"] != FORMAT:
-                raise InputError(f"format {header['format']}, this torchlb reads {FORMAT}")
-            names = set(archive.files) - {"header"}
-            if names != header["types"].keys():
+                raise OperatorFileError(
+                    f"{path}: written by torchlb {header['version']} in format {header['format']}, and torchlb "
+                    f"{__version__} reads format {FORMAT}; build the operator again"
+                )
+            types = header["types"]
+            if types.keys() != set(archive.files) - {"header"}:
                 raise InputError("its parts are not those that it lists")
             state: dict[str, Any] = {
-                name: torch.from_numpy(archive[name]).to(getattr(torch, header["types"][name]))
-                for name in names
+                name: torch.from_numpy(archive[name]).to(getattr(torch, types[name]))
+                for name in types
             }
-        state["_extra_state"] = header["state"]
         lb = LaplaceBeltrami()
-        lb.load_state_dict(state)
-    except (FileNotFoundError, PermissionError, IsADirectoryError):
+        lb.load_state_dict(state | {"_extra_state": header["state"]})
+    except (FileNotFoundError, PermissionError, IsADirectoryError, OperatorFileError):
         raise
     except Exception as error:  # a damaged archive fails in a dozen ways
         raise OperatorFileError(

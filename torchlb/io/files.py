@@ -7,11 +7,11 @@ from typing import Any
 
 import numpy as np
 import torch
-import trimesh
 from jaxtyping import Float, Int
 from torch import Tensor
 
 from torchlb.errors import InputError
+from torchlb.operator.cleaning import as_tensor
 
 __all__ = ["SUFFIXES", "arrays_of", "read_shape"]
 
@@ -22,6 +22,8 @@ Shape = tuple[Float[Tensor, "N n"], Int[Tensor, "F v"] | None]
 
 def arrays_of(shape: Any) -> Shape:
     """Vertices, and faces or None, of what trimesh read."""
+    import trimesh
+
     if isinstance(shape, trimesh.Scene):
         shape = trimesh.util.concatenate(shape.dump())
     if not hasattr(shape, "vertices"):
@@ -45,15 +47,17 @@ def read_shape(path: str | Path) -> Shape:
     FileNotFoundError : if there is none.
     ValueError : if it is no shape; the message names the file.
     """
-    path = Path(path)
+    path = Path(path).expanduser()
     if not path.is_file():
         raise FileNotFoundError(f"{path}: no such file")
     try:
         if path.suffix == ".npy":
-            vertices, faces = torch.from_numpy(np.load(path, allow_pickle=False)), None
+            vertices, faces = as_tensor(np.load(path, allow_pickle=False)), None
         elif path.suffix == ".npz":
             vertices, faces = _npz(path)
         else:
+            import trimesh
+
             loaded = trimesh.load(path, process=False, maintain_order=True, skip_materials=True)
             vertices, faces = arrays_of(loaded)
         if vertices.ndim != 2 or vertices.numel() == 0:
@@ -73,6 +77,6 @@ def _npz(path: Path) -> Shape:
         names = [name for name in ("vertices", "points", "pos") if name in archive.files]
         if not names:
             raise InputError(f"neither vertices nor points among {archive.files}")
-        vertices = torch.from_numpy(archive[names[0]])
-        faces = torch.from_numpy(archive["faces"]).long() if "faces" in archive.files else None
+        vertices = as_tensor(archive[names[0]])
+        faces = as_tensor(archive["faces"]).long() if "faces" in archive.files else None
     return vertices, None if faces is None or faces.numel() == 0 else faces

@@ -18,7 +18,6 @@ from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import Any
 
-import joblib
 import torch
 from tqdm import tqdm
 
@@ -26,7 +25,7 @@ from torchlb.errors import InputError
 from torchlb.io.cache import load_or_build, operator_key
 from torchlb.io.files import SUFFIXES, read_shape
 from torchlb.operator.cleaning import clean_mesh
-from torchlb.operator.dispatch import check_options_of
+from torchlb.operator.dispatch import Operator, check_options_of
 
 __all__ = ["PrecomputeReport", "ShapeResult", "concerns_the_shape", "precompute_operators"]
 
@@ -99,7 +98,7 @@ class _Task:
     name: str
     source: Any
     cache: str
-    operator: str
+    operator: Operator
     k: int
     clean: bool
     options: dict[str, Any]
@@ -109,7 +108,7 @@ def precompute_operators(
     shapes: str | Path | Iterable[Any],
     out: str | Path,
     *,
-    operator: str = "stencil",
+    operator: Operator = "stencil",
     k: int = 0,
     workers: int = -1,
     clean: bool = False,
@@ -127,7 +126,7 @@ def precompute_operators(
     workers : processes, each with one thread; −1 for one per core. Within ``joblib.parallel_config(backend="dask")``
         the workers are those of the Dask client.
     clean : whether meshes go through `clean_mesh` first; the data set then has to do the same.
-    progress : whether to show a bar.
+    progress : whether to show a bar, on a terminal.
     **options : of `LaplaceBeltrami.from_mesh` or `from_points`.
 
     Returns
@@ -139,7 +138,7 @@ def precompute_operators(
     ValueError, TypeError : for options that are none, a folder that is missing or has no shapes, before any work.
     """
     check_options_of(operator, options)
-    cache = Path(out)
+    cache = Path(out).expanduser()
     tasks = [
         _Task(name, source, str(cache.resolve()), operator, k, clean, options)
         for name, source in _sources(shapes, cache)
@@ -148,7 +147,7 @@ def precompute_operators(
     _remove_stale(cache)
     results: dict[int, ShapeResult] = {}
     try:
-        with tqdm(total=len(tasks), unit="shape", disable=not progress) as bar:
+        with tqdm(total=len(tasks), unit="shape", disable=None if progress else True) as bar:
             for index, result in _run(tasks, workers):
                 results[index] = result
                 bar.set_postfix(failed=sum(r.status == "failed" for r in results.values()))
@@ -162,7 +161,7 @@ def precompute_operators(
 def _sources(shapes: str | Path | Iterable[Any], cache: Path) -> list[tuple[str, Any]]:
     """Name and file, or arrays, of every shape."""
     if isinstance(shapes, str | Path):
-        folder = Path(shapes)
+        folder = Path(shapes).expanduser()
         if not folder.is_dir():
             raise InputError(
                 f"{folder}: no such folder; give a folder, or a list of files or of arrays"
@@ -181,7 +180,7 @@ def _sources(shapes: str | Path | Iterable[Any], cache: Path) -> list[tuple[str,
     named = []
     for i, shape in enumerate(shapes):
         if isinstance(shape, str | Path):
-            named.append((str(shape), Path(shape).resolve()))
+            named.append((str(shape), Path(shape).expanduser().resolve()))
         elif isinstance(shape, tuple | list) and len(shape) == 2:
             named.append((f"shape {i}", tuple(shape)))
         else:
@@ -193,6 +192,8 @@ def _sources(shapes: str | Path | Iterable[Any], cache: Path) -> list[tuple[str,
 
 def _run(tasks: Sequence[_Task], workers: int) -> Iterator[tuple[int, ShapeResult]]:
     """Results as they come. Where a worker dies, those that may have killed it run again, each by itself."""
+    import joblib
+
     pending = dict(enumerate(tasks))
     while pending:
         try:
@@ -212,6 +213,8 @@ def _run(tasks: Sequence[_Task], workers: int) -> Iterator[tuple[int, ShapeResul
 
 
 def _parallel(workers: int, tasks: dict[int, _Task]) -> Iterable[tuple[int, ShapeResult]]:
+    import joblib
+
     backend, _ = joblib.parallel.get_active_backend()
     lazy = getattr(backend, "supports_return_generator", False)
     settings: dict[str, Any] = {
@@ -269,7 +272,10 @@ def _stored(task: _Task, vertices: Any, faces: Any) -> tuple[str, int, str]:
         progress=False,
         **task.options,
     )
-    return "cached" if _identity(path) == before else "built", lb.num_points, str(path)
+    after = _identity(path)
+    if after is None:
+        raise OSError("its operator was built and could not be written")
+    return "cached" if after == before else "built", lb.num_points, str(path)
 
 
 def _identity(path: Path) -> tuple[int, int] | None:

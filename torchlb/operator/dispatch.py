@@ -4,26 +4,27 @@ from __future__ import annotations
 
 import inspect
 from collections.abc import Callable
-from typing import Any
+from typing import Any, Literal, get_args
 
 import numpy as np
 from torch import Tensor
 
 from torchlb.errors import InputError
 from torchlb.operator.checks import check_faces, check_points
+from torchlb.operator.cleaning import ArrayLike
 from torchlb.operator.laplace_beltrami import LaplaceBeltrami
 
-__all__ = ["OPERATORS", "build_operator", "builder_of", "check_options_of", "complete_options"]
+__all__ = ["Operator", "build_operator", "builder_of", "check_options_of", "complete_options"]
 
-OPERATORS = ("stencil", "cotangent")
-Options = dict[str, Any]
+Operator = Literal["stencil", "cotangent"]
+Builder = Callable[..., LaplaceBeltrami]
 
 
 def build_operator(
-    vertices: Any,
-    faces: Any = None,
+    vertices: ArrayLike,
+    faces: ArrayLike | None = None,
     *,
-    operator: str = "stencil",
+    operator: Operator = "stencil",
     progress: bool = True,
     **options: Any,
 ) -> LaplaceBeltrami:
@@ -40,11 +41,10 @@ def build_operator(
 
 
 def builder_of(
-    vertices: Any, faces: Any, operator: str
-) -> tuple[Callable[..., LaplaceBeltrami], Tensor, Tensor | None]:
+    vertices: ArrayLike, faces: ArrayLike | None, operator: str
+) -> tuple[Builder, Tensor, Tensor | None]:
     """The classmethod that builds the operator, and its input checked: float64 positions, int64 faces or None."""
-    if operator not in OPERATORS:
-        raise InputError(f"operator: expected one of {list(OPERATORS)}, got {operator!r}")
+    _check_operator(operator)
     if faces is None or np.prod(np.shape(faces)) == 0:
         if operator == "cotangent":
             raise InputError("the cotangent operator needs faces; operator='stencil' does not")
@@ -56,34 +56,36 @@ def builder_of(
     return LaplaceBeltrami.from_mesh, points, corners
 
 
-def _defaults(builder: Callable[..., LaplaceBeltrami]) -> Options:
+def complete_options(builder: Builder, options: dict[str, Any]) -> dict[str, Any]:
+    """All options with their defaults, but `progress`, which changes nothing; TypeError for one that is none."""
+    known = _defaults(builder)
+    _check_names(builder.__name__, options, known)
+    return known | options
+
+
+def check_options_of(operator: str, options: dict[str, Any]) -> None:
+    """ValueError or TypeError for what is no operator, or an option of it for neither meshes nor clouds."""
+    _check_operator(operator)
+    known = _defaults(LaplaceBeltrami.from_mesh) | _defaults(LaplaceBeltrami.from_points)
+    known = _defaults(LaplaceBeltrami.from_cotangent) if operator == "cotangent" else known
+    _check_names(f"operator {operator!r}", options, known)
+
+
+def _check_operator(operator: str) -> None:
+    if operator not in get_args(Operator):
+        raise InputError(f"operator: expected one of {list(get_args(Operator))}, got {operator!r}")
+
+
+def _defaults(builder: Builder) -> dict[str, Any]:
     parameters = inspect.signature(builder).parameters.values()
     known = {p.name: p.default for p in parameters if p.kind is p.KEYWORD_ONLY}
     known.pop("progress", None)
     return known
 
 
-def complete_options(builder: Callable[..., LaplaceBeltrami], options: Options) -> Options:
-    """All options with their defaults, but `progress`, which changes nothing; TypeError for one that is none."""
-    known = _defaults(builder)
+def _check_names(owner: str, options: dict[str, Any], known: dict[str, Any]) -> None:
     unknown = options.keys() - known.keys()
     if unknown:
         raise TypeError(
-            f"{builder.__name__} has no option {', '.join(sorted(unknown))}; its options are "
-            f"{', '.join(known) or 'none'}"
-        )
-    return known | options
-
-
-def check_options_of(operator: str, options: Options) -> None:
-    """ValueError or TypeError for what is no operator, or an option of it for neither meshes nor clouds."""
-    if operator not in OPERATORS:
-        raise InputError(f"operator: expected one of {list(OPERATORS)}, got {operator!r}")
-    known = _defaults(LaplaceBeltrami.from_mesh) | _defaults(LaplaceBeltrami.from_points)
-    known = _defaults(LaplaceBeltrami.from_cotangent) if operator == "cotangent" else known
-    unknown = options.keys() - known.keys()
-    if unknown:
-        raise TypeError(
-            f"operator {operator!r} has no option {', '.join(sorted(unknown))}; its options are "
-            f"{', '.join(known) or 'none'}"
+            f"{owner} has no option {', '.join(sorted(unknown))}; its options are {', '.join(known) or 'none'}"
         )
