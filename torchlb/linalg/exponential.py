@@ -73,27 +73,17 @@ def heat(
     return _heat(list(pattern), values, x, time, *options, False)
 
 
-@torch.library.custom_op(
-    "torchlb::heat",
-    mutates_args=(),
-    schema="(Tensor[] pattern, Tensor values, Tensor x, Tensor time, Tensor bounds, str expansion, "
-    "float tolerance, SymInt[] sizes, bool transposed) -> Tensor",
+SCHEMA = (
+    "(Tensor[] pattern, Tensor values, Tensor x, Tensor time, Tensor bounds, str expansion, "
+    "float tolerance, SymInt[] sizes, bool transposed"
 )
-def _heat(
-    pattern: Sequence[Tensor],
-    values: Tensor,
-    x: Tensor,
-    time: Tensor,
-    bounds: Tensor,
-    expansion: str,
-    tolerance: float,
-    sizes: Sequence[int],
-    transposed: bool,
-) -> Tensor:
-    expansion, dtype = _choose_expansion(expansion, x, time, bounds, tolerance)
+
+
+@torch.library.custom_op("torchlb::heat", mutates_args=(), schema=SCHEMA + ") -> Tensor")
+def _heat(pattern: Any, values: Tensor, x: Tensor, time: Tensor, *options: Any) -> Tensor:
+    dtype, terms = _terms(pattern, values, x, time, *options)
     y = torch.zeros_like(x, dtype=dtype, memory_format=torch.contiguous_format)
-    options = bounds, expansion, tolerance, sizes, transposed
-    for where, vector, coefficient, _ in _terms(pattern, values, x.to(dtype), time, *options):
+    for where, vector, coefficient, _ in terms:
         _add_scaled(y, where, vector, coefficient)
     return y.to(x.dtype)
 
@@ -101,48 +91,21 @@ def _heat(
 @torch.library.custom_op(
     "torchlb::heat_backward",
     mutates_args=(),
-    schema="(Tensor[] pattern, Tensor values, Tensor x, Tensor time, Tensor bounds, str expansion, "
-    "float tolerance, SymInt[] sizes, bool transposed, Tensor grad) -> (Tensor, Tensor)",
+    schema=SCHEMA + ", Tensor grad) -> (Tensor, Tensor)",
 )
 def _heat_backward(
-    pattern: Sequence[Tensor],
-    values: Tensor,
-    x: Tensor,
-    time: Tensor,
-    bounds: Tensor,
-    expansion: str,
-    tolerance: float,
-    sizes: Sequence[int],
-    transposed: bool,
-    grad: Tensor,
+    pattern: Any, values: Tensor, x: Tensor, time: Tensor, *options: Any
 ) -> tuple[Tensor, Tensor]:
-    expansion, dtype = _choose_expansion(expansion, x, time, bounds, tolerance)
+    bounds, expansion, tolerance, sizes, transposed, grad = options
+    rest = bounds, expansion, tolerance, sizes, not transposed
+    dtype, terms = _terms(pattern, values, grad, time, *rest)
     grad_x = torch.zeros_like(x, dtype=dtype, memory_format=torch.contiguous_format)
     grad_t = torch.zeros_like(time)
-    options = bounds, expansion, tolerance, sizes, not transposed
-    terms = _terms(pattern, values, grad.to(dtype), time, *options)
     for where, vector, coefficient, derivative in terms:
         _add_scaled(grad_x, where, vector, coefficient)
         along = (vector * x[where]).sum(0)
         grad_t[where[1]] += _real(along * _like(derivative, vector)).to(time)
     return grad_x.to(x.dtype), grad_t
-
-
-def _choose_expansion(
-    expansion: str, x: Tensor, time: Tensor, bounds: Tensor, tolerance: float
-) -> tuple[str, torch.dtype]:
-    """What "either" stands for, and the type to sum in; here, since outside the operation times have no values yet.
-
-    The contour sum cancels: its terms are some hundred times larger than it.
-    """
-    if expansion == "either":
-        longest = float(time.max()) if len(time) else 0.0
-        radius, height = bounds.tolist()
-        few = (
-            _estimate(longest, radius / 2, height, tolerance) < PRODUCTS
-        )  # never so where it is NaN
-        expansion = "chebyshev" if few else "contour"
-    return expansion, torch.float64 if expansion == "contour" else x.dtype
 
 
 @_heat.register_fake
@@ -197,14 +160,23 @@ def _terms(
     tolerance: float,
     sizes: Sequence[int],
     transposed: bool,
-) -> Iterator[Term]:
-    """The terms ((rows, columns), v_k, c_k, c_k') of the expansion, with L or its transpose."""
+) -> tuple[torch.dtype, Iterator[Term]]:
+    """The terms ((rows, columns), v_k, c_k, c_k') of the expansion, with L or its transpose, and the type to sum in.
+
+    "either" is settled here: outside the operation times have no values yet. The contour sum cancels, its terms are
+    some hundred times larger than it.
+    """
     times = time.detach().double().cpu().numpy()
     if len(times) == 0 or len(x) == 0:
-        return iter(())
-    if expansion == "chebyshev":
-        return _chebyshev(pattern, values, x, times, bounds, tolerance, sizes, transposed)
-    return _contour(pattern, values, x, times, float(bounds[0]), tolerance, transposed)
+        return x.dtype, iter(())
+    radius, height = bounds.tolist()
+    products = _estimate(float(times.max()), radius / 2, height, tolerance)  # NaN without a height
+    if expansion == "chebyshev" or (expansion == "either" and products < PRODUCTS):
+        options = times, radius, height, tolerance, sizes, transposed
+        return x.dtype, _chebyshev(pattern, values, x, *options)
+    return torch.float64, _contour(
+        pattern, values, x.double(), times, radius, tolerance, transposed
+    )
 
 
 def _estimate(longest: float, a: float, b: float, tolerance: float) -> float:
@@ -262,12 +234,12 @@ def _chebyshev(
     values: Tensor,
     x: Tensor,
     times: np.ndarray,
-    bounds: Tensor,
+    radius: float,
+    height: float,
     tolerance: float,
     sizes: Sequence[int],
     transposed: bool,
 ) -> Iterator[Term]:
-    radius, height = bounds.tolist()
     c, slope, d, r = chebyshev_coefficients(times, radius, height, tolerance)
     crow, col, crow_t, col_t, order_t = pattern
     if transposed:
