@@ -177,6 +177,53 @@ def test_the_keys_survive_a_file(tmp_path):
     assert_same(to_operator(back), to_operator(data))
 
 
+@pytest.mark.parametrize("key", ["norm", "normal"])
+def test_the_normals_that_pyg_writes_are_used(key):
+    points = Sphere().points(100)
+    lb = to_operator(LaplaceBeltramiTransform(order=1)(data_of(points, **{key: -points})))
+    assert (lb.normals * points).sum(1).max() < 0
+
+
+@pytest.mark.parametrize(
+    "change",
+    [T.RandomScale((2, 2)), T.RandomRotate((30, 30), axis=2), T.RandomJitter(0.01)],
+    ids=["scaled", "turned", "moved"],
+)
+def test_an_operator_of_other_points_is_refused(change):
+    """One of three shapes is enough; a translation, which changes no derivative, is none."""
+    shapes = [LaplaceBeltramiTransform(order=1)(data) for data in DATA]
+    to_operator(Batch.from_data_list([T.Center()(data) for data in shapes]))
+    shapes[1] = change(copy.copy(shapes[1]))
+    with pytest.raises(ValueError, match=r"moved by up to .* apply it last"):
+        to_operator(Batch.from_data_list(shapes))
+    with pytest.raises(ValueError, match=r"pos: .* apply it last"):
+        to_operator(shapes[1])
+
+
+def test_edges_without_faces_are_named():
+    data = T.FaceToEdge()(copy.copy(DATA[0]))
+    with pytest.warns(UserWarning, match="edges but no face.*remove_faces=False"):
+        LaplaceBeltramiTransform(order=1)(data)
+
+
+def test_a_bad_shape_can_be_skipped():
+    points = Sphere().points(100)
+    transform = LaplaceBeltramiTransform(order=1, on_error="skip")
+    with pytest.warns(UserWarning, match="stays without an operator: points: 10 points share"):
+        done = [transform(data_of(p)) for p in (torch.cat([points, points[:5]]), points)]
+    assert ["lb_values" in data for data in done] == [False, True]
+
+
+def test_a_batch_searches_nothing(monkeypatch):
+    """The spectral bounds come with the data, and a batch joins them."""
+    batch = Batch.from_data_list([LaplaceBeltramiTransform(order=1, k=4)(d) for d in DATA])
+    expected = LaplaceBeltrami.batch([direct(i) for i in range(3)]).spectral_bounds
+    monkeypatch.setattr("torchlb.operator.storage.spectral_bounds", None)
+    lb = to_operator(batch)
+    assert lb.spectral_bounds == expected
+    Diffusion(2, k=4)(torch.randn(batch.num_nodes, 2), lb.float())
+
+
 def test_errors():
     transform = LaplaceBeltramiTransform(order=1)
     with pytest.raises(ValueError, match="expected data with pos"):
@@ -184,6 +231,8 @@ def test_errors():
     with pytest.raises(ValueError, match="went through LaplaceBeltramiTransform"):
         to_operator(DATA[0])
     data = transform(DATA[0])
+    with pytest.raises(ValueError, match="PyG's Data do not carry it"):
+        _ = to_operator(data).report
     data.pos = data.pos[:50]
     with pytest.raises(ValueError, match="50 points, but an operator of 120"):
         to_operator(data)

@@ -8,8 +8,9 @@ lb = to_operator(batch)  # block diagonal: every layer of torchlb takes it
 from __future__ import annotations
 
 import json
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import torch
 from jaxtyping import Int
@@ -18,11 +19,11 @@ from torch_geometric.data import Batch, Data
 from torch_geometric.data.datapipes import functional_transform
 from torch_geometric.transforms import BaseTransform
 
-from torchlb.errors import InputError
+from torchlb.errors import InputError, TorchlbError, warn
 from torchlb.io.cache import load_or_build
 from torchlb.linalg.spectral_bounds import Bounds, join_bounds
 from torchlb.operator.batching import join_certificates
-from torchlb.operator.dispatch import build_operator
+from torchlb.operator.dispatch import Operator, build_operator
 from torchlb.operator.laplace_beltrami import LaplaceBeltrami
 from torchlb.spectral.eigenbasis import Eigenbasis, stack_eigenbases
 from torchlb.stability.certificate import Certificate
@@ -45,6 +46,7 @@ class LaplaceBeltramiTransform(BaseTransform):
     lb_order_t         (nnz,)       the entries sorted by column, within the shape: the transpose, for the backward pass
     lb_mass            (N,)         quadrature weights, ℓ^d
     lb_frames          (N, n, d)    orthonormal tangent vectors
+    lb_pos             (N, n)       the points, by which `to_operator` sees whether `pos` was changed since
     lb_normals         (N, n)       unit normals of a hypersurface
     lb_basis           (…,)         with k > 0: all parts of the eigenbasis in one vector, for `to_operator`
     lb_basis_size      (1, 2)       number of eigenpairs, and whether its span is invariant
@@ -52,51 +54,73 @@ class LaplaceBeltramiTransform(BaseTransform):
     =================  ===========  ============================================================================
 
     Every key has a last or first axis that concatenates, and the one whose name contains "index" is shifted by the
-    number of nodes; nothing depends on a subclass of `Data`. The report is left out. A motion of the points leaves
-    values, gradients and mass valid, and turns frames and normals; any other change of `pos` needs the transform anew.
+    number of nodes; nothing depends on a subclass of `Data`. The report is left out. A translation of `pos` changes
+    nothing; rotation, scaling, jitter and sampling belong before the transform.
 
     Parameters
     ----------
     operator : "stencil" or "cotangent".
     k : number of eigenpairs for spectral layers; 0 for none, which `to_operator(batch).eigenbasis` would solve anew.
     cache : folder, so that each shape is computed once (`load_or_build`); None to compute at every call.
-    normals : key of the normals of a cloud (PyG's transforms write "norm" or "normal"), which orient it; None to
-        ignore them. A shape without that key has them estimated.
+    normals : key, or keys of which the first present counts, of the normals of a cloud, which orient it (PyG's own
+        transforms write "norm" or "normal"); None to ignore them. A shape without has them estimated.
+    on_error : "raise", or "skip": a warning says why a shape has no operator, and its data come back without the
+        keys, so that ``[d for d in map(transform, shapes) if "lb_values" in d]`` goes on with the others.
     **options : of `LaplaceBeltrami.from_mesh` (for data with `face`) or `from_points` (without).
 
     Raises
     ------
     ValueError : when called, for data without `pos`, and for bad shapes.
+
+    `FaceToEdge` drops `face`, and the shape is a cloud then; a warning says so where there are no normals either.
     """
 
     def __init__(
         self,
         *,
-        operator: str = "stencil",
+        operator: Operator = "stencil",
         k: int = 0,
         cache: str | Path | None = None,
-        normals: str | None = "norm",
+        normals: str | Sequence[str] | None = ("norm", "normal"),
+        on_error: Literal["raise", "skip"] = "raise",
         **options: Any,
     ) -> None:
-        self.operator, self.k, self.cache, self.normals = operator, k, cache, normals
+        if on_error not in ("raise", "skip"):
+            raise InputError(f"on_error: expected 'raise' or 'skip', got {on_error!r}")
+        self.operator, self.k, self.cache, self.on_error = operator, k, cache, on_error
+        self.normals = (normals,) if isinstance(normals, str) else normals or ()
         self.options = options
 
     def forward(self, data: Data) -> Data:
         """The data with the keys added; `pos` (N, n) and, for a mesh, `face` (d + 1, F) are read."""
         if data.pos is None:
             raise InputError(f"expected data with pos, got {data}")
-        pos: Tensor = data.pos
+        try:
+            keys = _keys(self._operator(data), self.k)
+        except TorchlbError as error:
+            if self.on_error == "raise":
+                raise
+            warn(f"{data} stays without an operator: {error}")
+            return data
+        for key, value in keys.items():
+            data[key] = value.to(data.pos.device) if isinstance(value, Tensor) else value
+        return data
+
+    def _operator(self, data: Data) -> LaplaceBeltrami:
+        """Out of the cache or built, of the mesh or the cloud."""
         faces = None if data.get("face") is None else data["face"].T
         options: dict[str, Any] = {"operator": self.operator, "progress": False, **self.options}
-        if faces is None and self.normals is not None and data.get(self.normals) is not None:
-            options.setdefault("normals", data[self.normals])
+        normals = [data[key] for key in self.normals if data.get(key) is not None]
+        if faces is None and normals:
+            options.setdefault("normals", normals[0])
+        elif faces is None and data.get("edge_index") is not None:
+            warn(
+                f"{data} has edges but no face, so that the operator is that of a cloud; a mesh keeps its faces with "
+                "FaceToEdge(remove_faces=False), or with this transform first"
+            )
         if self.cache is None:
-            lb = build_operator(pos, faces, **options)
-        else:
-            lb = load_or_build(pos, faces, cache=self.cache, k=self.k, **options)
-        for key, value in _keys(lb, self.k).items():
-            data[key] = value.to(pos.device) if isinstance(value, Tensor) else value
-        return data
+            return build_operator(data["pos"], faces, **options)
+        return load_or_build(data["pos"], faces, cache=self.cache, k=self.k, **options)
 
     def __repr__(self) -> str:
         shown = {"operator": self.operator, "k": self.k, "cache": self.cache, **self.options}
@@ -113,6 +137,7 @@ def _keys(lb: LaplaceBeltrami, k: int) -> dict[str, Any]:
         "lb_order_t": lb.order_t,
         "lb_mass": lb.mass,
         "lb_frames": lb.frames,
+        "lb_pos": lb.points,
         "lb_info": json.dumps(lb.get_extra_state()),
     }
     if len(lb.normals):
@@ -135,18 +160,14 @@ def to_operator(data: Any) -> LaplaceBeltrami:
 
     Raises
     ------
-    ValueError : for data without the keys, or whose nodes were changed since.
+    ValueError : for data without the keys, or whose `pos` was changed since by more than a translation.
     """
     if "lb_edge_index" not in data:
         raise InputError(f"expected data that went through LaplaceBeltramiTransform, got {data}")
     batched = isinstance(data, Batch)
     infos = [json.loads(text) for text in (data["lb_info"] if batched else [data["lb_info"]])]
     sizes = data["ptr"].diff() if batched else data.lb_mass.new_tensor([len(data.lb_mass)]).long()
-    if int(sizes.sum()) != len(data.lb_mass) or len(data.pos) != len(data.lb_mass):
-        raise InputError(
-            f"{len(data.pos)} points, but an operator of {len(data.lb_mass)}: nodes were added or taken away after "
-            "LaplaceBeltramiTransform; apply it last"
-        )
+    _check_unchanged(data, sizes)
     lb = LaplaceBeltrami()
     _fill(lb, data, sizes)
     if batched:
@@ -175,6 +196,24 @@ def _fill(lb: LaplaceBeltrami, data: Any, sizes: Int[Tensor, " S"]) -> None:
     lb.values, lb.gradient_values = data.lb_values, data.lb_gradient.T.contiguous()
     lb.mass, lb.points, lb.frames = data.lb_mass, data.pos.to(data.lb_mass), data.lb_frames
     lb.normals = data.lb_normals if "lb_normals" in data else lb.points[:0]
+
+
+def _check_unchanged(data: Any, sizes: Int[Tensor, " S"]) -> None:
+    """ValueError unless `pos` is what the operator was built from, but for a translation of each shape."""
+    built, pos = data.lb_pos, data.pos
+    if len(pos) != len(built) or int(sizes.sum()) != len(built):
+        raise InputError(
+            f"{len(pos)} points, but an operator of {len(built)}: nodes were added or taken away after "
+            "LaplaceBeltramiTransform; apply it last"
+        )
+    moved = (pos - built).split(sizes.tolist())
+    by = max((float((d - d[:1]).abs().max()) for d in moved if len(d)), default=0.0)
+    scale = max(float(pos.abs().max()), float(built.abs().max())) if len(pos) else 0.0
+    if by > 64 * max(torch.finfo(t.dtype).eps for t in (pos, built)) * scale:
+        raise InputError(
+            f"pos: its points moved by up to {by:.3g} against each other since LaplaceBeltramiTransform, whose "
+            "operator is that of the old ones; scale, rotate, jitter or deform first, and apply it last"
+        )
 
 
 def _starts(index: Int[Tensor, " nnz"], size: int) -> Int[Tensor, " size_plus_1"]:

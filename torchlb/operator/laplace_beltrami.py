@@ -216,6 +216,8 @@ class LaplaceBeltrami(OperatorStorage):
     @property
     def report(self) -> StencilReport:
         """What order each point reached, and why not more; print it."""
+        if len(self.report_order) != self.num_points:
+            raise InputError("report: PyG's Data do not carry it; it is with the operator as built")
         fields = {name: getattr(self, f"report_{name}") for name in REPORT_FIELDS}
         return StencilReport(self.options.get("order", 0), self.dim, **fields)
 
