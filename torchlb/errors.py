@@ -12,6 +12,7 @@ __all__ = [
     "EigenbasisError",
     "InputError",
     "OperatorFileError",
+    "StabilityError",
     "StabilityWarning",
     "StencilError",
     "TorchlbError",
@@ -30,6 +31,10 @@ class InputError(TorchlbError):
 
 class StencilError(TorchlbError):
     """No acceptable stencil exists for some points; the message names them and the remedy."""
+
+
+class StabilityError(TorchlbError):
+    """Nothing can be said of stability: the operator is singular beyond its constants."""
 
 
 class EigenbasisError(TorchlbError):

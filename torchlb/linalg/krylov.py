@@ -7,8 +7,9 @@ whose multigrid cycle B ≈ W⁻¹ makes their number of iterations almost indep
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from functools import cached_property
+from typing import TypeVar
 
 import numpy as np
 import pyamg
@@ -17,8 +18,18 @@ from scipy import sparse
 from scipy.sparse import csgraph
 from scipy.sparse.linalg import LinearOperator, gmres
 
-__all__ = ["imbalance", "negative_directions", "null_density", "prefers_krylov", "rescaled"]
+from torchlb.errors import warn
 
+__all__ = [
+    "backward_error",
+    "krylov_or_factors",
+    "negative_directions",
+    "null_density",
+    "prefers_krylov",
+    "rescaled",
+]
+
+Result = TypeVar("Result")
 LARGEST_FACTORED = 100_000
 """Beyond this many points Krylov methods come before the sparse factors, whose memory grows faster than the points."""
 SHIFT = 1e-9
@@ -26,7 +37,7 @@ SHIFT = 1e-9
 GROUND = 1e-4
 """The same for the null vector itself, where B must not blow up the constants: 100 iterations instead of 1,000."""
 ROUGH, FINE = 1e-5, 1e-12
-"""Imbalance of a null vector that is `NEGATIVE` somewhere, which is all that is asked then, and of any other."""
+"""Backward error of a null vector that is `NEGATIVE` somewhere, which is all that is asked then, and of any other."""
 NEGATIVE = -1e-3
 RESTART, CYCLES, STEP = 50, 20, 1e-6
 """Iterations of GMRES between restarts, bound on the restarts, and what one of them asks for at most."""
@@ -42,13 +53,28 @@ def prefers_krylov(size: int) -> bool:
     return size > LARGEST_FACTORED
 
 
+def krylov_or_factors(
+    size: int, krylov: Callable[[], Result | None], factors: Callable[[], Result]
+) -> Result:
+    """By sparse factors; beyond `LARGEST_FACTORED` points only if Krylov methods fail, which a warning says."""
+    if prefers_krylov(size):
+        found = krylov()
+        if found is not None:
+            return found
+        warn(
+            f"certificate: Krylov methods did not converge on {size} points, as where spacings change abruptly. Sparse "
+            "factors take over, at many times the memory and time; certify=False does without"
+        )
+    return factors()
+
+
 class LowOrder:
     """The M-matrix of a symmetric matrix: its positive entries as weights, and what is lost.
 
     Parameters
     ----------
     symmetric : (N, N).
-    loss : of each point, what the diagonal has beyond the weights of its row; negative numbers are taken for rounding.
+    loss : of each point, what the diagonal has beyond the weights of its row; negative numbers are rounding.
     """
 
     def __init__(self, symmetric: sparse.csr_array, loss: Float[np.ndarray, " N"]) -> None:
@@ -95,12 +121,12 @@ def rescaled(
     return density * (np.bincount(component, area) / total)[component]
 
 
-def imbalance(
+def backward_error(
     matrix: sparse.csr_array,
     vector: Float[np.ndarray, " N"],
     lost: Float[np.ndarray, " N"] | float = 0.0,
 ) -> float:
-    """Largest |Ax + lost| over the sum of its terms |A||x|, row by row, so that each is judged by its own scale."""
+    """Componentwise backward error, the largest |Ax + lost| / |A||x| of a row: each is judged by its own scale."""
     terms = abs(matrix) @ np.abs(vector)
     left = np.abs(matrix @ vector + lost)
     return float(np.max(left / np.where(terms > 0, terms, 1.0)))
@@ -128,7 +154,7 @@ def null_density(
     for _ in range(CYCLES):
         density = rescaled(density, area, component, free)
         residual = -lost - weighted @ density
-        error = imbalance(weighted, density, lost)
+        error = backward_error(weighted, density, lost)
         if error <= (ROUGH if density.min() < NEGATIVE else FINE):
             return density
         if not np.isfinite(error):

@@ -68,7 +68,8 @@ def join_certificates(certificates: Sequence[Certificate | None]) -> Certificate
         holds=all(c.holds for c in known),
         min_pi=min(c.min_pi for c in known),
         max_s=max((c.max_s for c in known), key=lambda s: (isnan(s), s)),
-        rounds=max(c.rounds for c in known),
-        stepped_down=sum(c.stepped_down for c in known),
         components=sum(c.components for c in known),
+        rounds=max(c.rounds for c in known),
+        lowered=sum(c.lowered for c in known),
+        widened=sum(c.widened for c in known),
     )

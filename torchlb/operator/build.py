@@ -166,5 +166,12 @@ def _finished(geometry: Shape, kind: str, options: Options, progress: bool) -> B
     rows = build_stencil(ladder, progress=progress)
     if not options.certify:
         return Built(rows, geometry, kind, asdict(options), None)
-    rows, mass, certificate = certify(ladder, rows, geometry.areas, progress=progress)
+    rows, mass, certificate = certify(
+        rows,
+        geometry.areas,
+        ladder.rows,
+        len(ladder.candidates),
+        outflow=not geometry.condition.conserves,
+        progress=progress,
+    )
     return Built(rows, replace(geometry, areas=mass), kind, asdict(options), certificate)

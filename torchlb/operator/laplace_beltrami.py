@@ -21,6 +21,7 @@ from torchlb.operator.storage import REPORT_FIELDS, OperatorStorage
 from torchlb.spectral.eigenbasis import Eigenbasis, check_num_pairs, stack_eigenbases
 from torchlb.spectral.eigensolver import blockwise_eigenbasis
 from torchlb.stability.certificate import Certificate
+from torchlb.stability.null_vector import has_outflow
 
 __all__ = ["LaplaceBeltrami"]
 
@@ -299,7 +300,9 @@ class LaplaceBeltrami(OperatorStorage):
             n = self.num_points
             matrix = to_scipy(self.crow, self.col, self.values, (n, n))
             rounding = torch.finfo(self.values.dtype).eps
-            self._keep(blockwise_eigenbasis(matrix, self.mass, k, self.sizes, rounding=rounding))
+            outflow = bool(has_outflow(matrix, rounding).any())
+            options = {"outflow": outflow, "rounding": rounding}
+            self._keep(blockwise_eigenbasis(matrix, self.mass, k, self.sizes, **options))
         if store:
             self._keep(None, store=True)
         modes = (self.basis_decay_rates, self.basis_modal_transform)

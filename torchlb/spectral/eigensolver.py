@@ -20,11 +20,16 @@ from scipy.sparse import csgraph
 from scipy.sparse.linalg import ArpackError, LinearOperator, eigs, eigsh
 from torch import Tensor
 
-from torchlb.errors import EigenbasisError
+from torchlb.errors import EigenbasisError, StabilityError
 from torchlb.linalg.factor import factorized
-from torchlb.linalg.krylov import imbalance
+from torchlb.linalg.krylov import backward_error
 from torchlb.spectral.eigenbasis import Eigenbasis, stack_eigenbases
-from torchlb.stability.null_vector import CONSERVED, LOSS, left_null_vector
+from torchlb.stability.null_vector import (
+    CONSERVED,
+    has_outflow,
+    left_null_vector,
+    shared_outflow,
+)
 
 __all__ = ["blockwise_eigenbasis", "solve_eigenbasis"]
 
@@ -38,6 +43,8 @@ SYMMETRY = 1e-12
 CONDITION = 1e8
 """Of the eigenvectors of B; beyond it e^{−tB} through them has no digits left in float32."""
 
+SINGULAR = "eigenbasis: the operator on {} points is singular beyond its constants; build it with certify=True"
+
 
 def blockwise_eigenbasis(
     matrix: sparse.csr_array,
@@ -45,16 +52,16 @@ def blockwise_eigenbasis(
     k: int,
     sizes: tuple[int, ...] | None,
     *,
+    outflow: bool = False,
     rounding: float = 0.0,
 ) -> Eigenbasis:
     """As `solve_eigenbasis`, of every diagonal block of the given sizes by itself; None: of the whole."""
+    options = {"outflow": outflow, "rounding": rounding}
     if sizes is None:
-        return solve_eigenbasis(matrix, mass, k, rounding=rounding)
+        return solve_eigenbasis(matrix, mass, k, **options)
     ends = np.cumsum(sizes)
     blocks = [slice(end - size, end) for end, size in zip(ends, sizes, strict=True)]
-    return stack_eigenbases(
-        [solve_eigenbasis(matrix[b, b], mass[b], k, rounding=rounding) for b in blocks]
-    )
+    return stack_eigenbases([solve_eigenbasis(matrix[b, b], mass[b], k, **options) for b in blocks])
 
 
 @dataclass
@@ -64,7 +71,7 @@ class _Part:
     index: np.ndarray
     matrix: sparse.csr_array
     root: np.ndarray
-    null_left: np.ndarray | None  # times √mass/|√mass| it is 1; None where heat is lost
+    null_left: np.ndarray | None  # times √mass/|√mass| it is 1; None where there is outflow
     right: tuple[np.ndarray, np.ndarray]
     left: tuple[np.ndarray, np.ndarray]
     symmetric: bool
@@ -75,16 +82,22 @@ class _Part:
 
 
 def solve_eigenbasis(
-    matrix: sparse.csr_array, mass: Float[Tensor, " N"], k: int, *, rounding: float = 0.0
+    matrix: sparse.csr_array,
+    mass: Float[Tensor, " N"],
+    k: int,
+    *,
+    outflow: bool = False,
+    rounding: float = 0.0,
 ) -> Eigenbasis:
     """The k smallest eigenpairs of −Δ, and a few more where pairs would be split: an invariant span, in float64.
 
     Parameters
     ----------
-    matrix : Δ, (N, N), of either kind. Its rows sum to zero up to `rounding`, relative, which is removed, or lose heat
-        (next to a Dirichlet boundary).
+    matrix : Δ, (N, N), of either kind.
     mass : inner product; π of the certificate, or the mass of a symmetric operator.
     k : number of pairs; all N if there are fewer.
+    outflow : whether rows may have a sum below zero, as beside a Dirichlet boundary. All others sum to zero up to
+        `rounding`, relative, which is removed.
 
     Raises
     ------
@@ -92,21 +105,25 @@ def solve_eigenbasis(
     """
     a = -sparse.csr_array(matrix, dtype=np.float64, copy=True)
     a.eliminate_zeros()
-    total = a.sum(axis=1)
-    losing = np.abs(total) > max(LOSS, 64 * rounding) * abs(a).sum(axis=1)
-    a = sparse.csr_array(a - sparse.diags_array(np.where(losing, 0.0, total)))
+    open_rows = has_outflow(a, rounding) if outflow else np.zeros(len(mass), dtype=bool)
+    a = sparse.csr_array(a - sparse.diags_array(np.where(open_rows, 0.0, a.sum(axis=1))))
     pi = mass.detach().cpu().double().numpy()
     count, component = csgraph.connected_components(a, directed=True, connection="weak")
-    lossy = np.bincount(component, losing, minlength=count) > 0
+    conserving = np.bincount(component, open_rows, minlength=count) == 0
     null_left = pi.copy()
-    if imbalance(sparse.csr_array(a.T), np.where(lossy[component], 0.0, pi)) > CONSERVED:
-        null_left = left_null_vector(sparse.csr_array(-a), torch.from_numpy(pi.copy()))[0].numpy()
-    wanted = max(min(k, len(pi)) - int((~lossy).sum()), 0)
+    if backward_error(sparse.csr_array(a.T), np.where(conserving[component], pi, 0.0)) > CONSERVED:
+        areas, delta = torch.from_numpy(pi.copy()), sparse.csr_array(-a)
+        try:
+            q = shared_outflow(delta, areas) if outflow else None
+            null_left = left_null_vector(delta, areas, q)[0].numpy()
+        except StabilityError as error:
+            raise EigenbasisError(SINGULAR.format(len(pi))) from error
+    wanted = max(min(k, len(pi)) - int(conserving.sum()), 0)
     tolerance = max(SYMMETRY, 8 * rounding)
     parts = []
     for c in range(count):
         index = np.flatnonzero(component == c)
-        null = None if lossy[c] else null_left[index]
+        null = null_left[index] if conserving[c] else None
         parts.append(_part(a[index][:, index], index, pi[index], null, wanted, tolerance))
     cut = _cut(parts, wanted)
     solved = [_ritz(part, cut) for part in parts]
@@ -173,9 +190,7 @@ def _inverted(
     try:
         lu = factorized(sparse.csc_array(a + shift * sparse.eye_array(size)), 1e-2)
     except RuntimeError as error:
-        raise EigenbasisError(
-            f"eigenbasis: the operator on {size} points is singular beyond its constants; build it with certify=True"
-        ) from error
+        raise EigenbasisError(SINGULAR.format(size)) from error
     count = min(wanted + max(6, wanted // 16), size - 3)
     start = np.random.default_rng(0).standard_normal(size)
     found = []
@@ -236,8 +251,8 @@ def _ritz(part: _Part, cut: float) -> Solved:
     """Rayleigh–Ritz on one component: eigenvalues, zero first, Φ, W, decay rates, modal transform, all scaled."""
     zero = part.root / linalg.norm(part.root)
     u = _real_span(part.right, cut)
-    closed = part.null_left is not None
-    u = np.linalg.qr(u - zero[:, None] * (zero @ u))[0] if closed else u
+    conserving = part.null_left is not None
+    u = np.linalg.qr(u - zero[:, None] * (zero @ u))[0] if conserving else u
     h = u.T @ (part.matrix @ u)
     values, q = linalg.eigh((h + h.T) / 2) if u.shape[1] else (np.zeros(0), np.zeros((0, 0)))
     if (values <= 0).any():
@@ -245,7 +260,7 @@ def _ritz(part: _Part, cut: float) -> Solved:
             f"eigenbasis: −Δ has the eigenvalue {values.min():.3g} on a component of {len(zero)} points, where it "
             "should be positive: the operator is not stable; build it with certify=True"
         )
-    if not closed and u.size:
+    if not conserving and u.size:
         # π is no null vector there, and Ritz values would be off by the square of the skew part.
         values = np.sort(np.linalg.eigvals(h).real)
     u = u @ q
@@ -265,7 +280,7 @@ def _ritz(part: _Part, cut: float) -> Solved:
         )
     w = z @ linalg.inv(overlap)
     b = w.T @ (part.matrix @ phi)
-    if closed:
+    if conserving:
         b[:, 0] = 0.0  # constants, exactly
     rates, transform = _exact_modes(b)
     return values, phi, w, rates, transform
@@ -297,8 +312,8 @@ def _exact_modes(b: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 def _merged(parts: list[_Part], solved: list[Solved], pi: np.ndarray, k: int) -> Eigenbasis:
     """The components side by side: their constants recombined so that the first is global, the rest ascending."""
-    closed_parts = np.array([part.null_left is not None for part in parts])
-    count = int(closed_parts.sum())
+    conserving = np.array([part.null_left is not None for part in parts])
+    count = int(conserving.sum())
     sizes = [len(s[0]) for s in solved]
     start = np.cumsum([0, *sizes])
     total = int(start[-1])
@@ -310,26 +325,26 @@ def _merged(parts: list[_Part], solved: list[Solved], pi: np.ndarray, k: int) ->
         phi[part.index, place] = f / part.root[:, None]
         left[part.index, place] = w * part.root[:, None]
         transform[:, place, place] = m
-    zeros = start[:-1][closed_parts]
+    zeros = start[:-1][conserving]
     order = np.concatenate([zeros, np.setdiff1d(np.arange(total), zeros)])
     order[count:] = order[count:][np.argsort(values[order[count:]], kind="stable")]
     values, phi, left = values[order], phi[:, order], left[:, order]
     v, others = transform[0][order], transform[1:, :, order]
     if count:
-        closed_index = [part.index for part in parts if part.null_left is not None]
-        root = np.sqrt(np.array([pi[index].sum() for index in closed_index]))
+        index = [part.index for part in parts if part.null_left is not None]
+        root = np.sqrt(np.array([pi[index].sum() for index in index]))
         t = np.linalg.qr(np.column_stack([root, np.eye(count)[:, : count - 1]]))[0]
         t *= np.sign(t[0, 0])
         phi[:, :count], left[:, :count] = phi[:, :count] @ t, left[:, :count] @ t
         v[:count], others[:, :, :count] = t.T @ v[:count], others[:, :, :count] @ t
-        phi[np.concatenate(closed_index), 0] = 1 / linalg.norm(root)
-    closed: dict[str, Any] = {}
+        phi[np.concatenate(index), 0] = 1 / linalg.norm(root)
+    modes: dict[str, Any] = {}
     if count <= k and np.isfinite(transform).all():
-        closed = {
+        modes = {
             "decay_rates": torch.from_numpy(rates),
             "modal_transform": torch.from_numpy(np.stack([v, *others])),
         }
     keep = slice(None) if count <= k else slice(k)
     arrays = (values[keep], phi[:, keep], pi, left[:, keep])
     tensors: Any = [torch.from_numpy(np.ascontiguousarray(x)) for x in arrays]
-    return Eigenbasis(*tensors, **closed)
+    return Eigenbasis(*tensors, **modes)

@@ -1,8 +1,8 @@
-r"""The certificate of stability, and the walk down the ladder until it holds (`method.md`, section 5).
+r"""The certificate of stability (`method.md`, section 5).
 
 Let π be the left null vector, πᵀL = 0, one per connected component. If π > 0 and S = ½(ΠL + LᵀΠ) ≤ 0, then
 d/dt |u|²_π = 2 uᵀSu ≤ 0 along u' = Lu: diffusion contracts in the norm of π, implicit schemes are stable at any step,
-and Σ π_i u_i is conserved. Rows that stand in the way take the next rung of their ladder, until it holds.
+and Σ π_i u_i is conserved.
 """
 
 from __future__ import annotations
@@ -10,14 +10,13 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-import torch
 from jaxtyping import Float
 from scipy import sparse
 from torch import Tensor
 
 from torchlb.linalg.factor import factorized
-from torchlb.linalg.krylov import negative_directions, prefers_krylov
-from torchlb.stability.null_vector import CONSERVED, left_null_vector
+from torchlb.linalg.krylov import krylov_or_factors, negative_directions
+from torchlb.stability.null_vector import CONSERVED, left_null_vector, shared_outflow
 
 __all__ = ["Certificate", "check_certificate"]
 STRICTNESS = 1e-12
@@ -25,9 +24,6 @@ STRICTNESS = 1e-12
 POSITIVE = 1e-10
 """Share of its area that π must reach at every point; what is below has no inflow but rounding."""
 MAX_VECTORS = 128
-FEED_SHARE = 0.2
-PEAK = 0.02
-"""Share of the largest feed of a direction from which on a row can be a peak of its own."""
 
 
 @dataclass(frozen=True)
@@ -40,61 +36,81 @@ class Certificate:
     min_pi : smallest π_i in units of the point's area; positive if the certificate holds.
     max_s : lower bound of the largest eigenvalue of D^{-1/2} S D^{-1/2}, D the size of each row; 0.0 if there is no
         positive one, beyond rounding. NaN if π is not positive or no null vector, where S means nothing.
-    rounds : of stepping down that it took.
-    stepped_down : number of rows below the rung that they passed on their own.
     components : number of connected components, each with its own π.
+    rounds : of widening and lowering that it took.
+    lowered : number of rows of a lower order than the one that they passed at on their own.
+    widened : number of rows of the same order with more points or another rule of weights.
     """
 
     holds: bool
     min_pi: float
     max_s: float
-    rounds: int
-    stepped_down: int
     components: int
+    rounds: int = 0
+    lowered: int = 0
+    widened: int = 0
 
     def __str__(self) -> str:
         """One line."""
-        verdict = "holds" if self.holds else "does NOT hold"
+        verdict = "holds" if self.holds else f"does NOT hold, max S = {self.max_s:.1e} of its size"
+        pieces = f", {self.components} components" if self.components > 1 else ""
         return (
-            f"certificate {verdict}: min π = {self.min_pi:.3g} of the area, max S = {self.max_s:.1e} of its size, "
-            f"{self.rounds} rounds, {self.stepped_down} rows stepped down, {self.components} components"
+            f"certificate {verdict}: min π = {self.min_pi:.3g} of the area; "
+            f"{self.rounds} rounds, {self.widened} rows widened, {self.lowered} lowered{pieces}"
         )
+
+
+def check_certificate(
+    matrix: sparse.csr_array, areas: Float[Tensor, " N"], *, outflow: bool = False
+) -> tuple[Float[Tensor, " N"], Certificate, Float[np.ndarray, "N k"]]:
+    """π, the certificate, and what each row contributes to the vᵀSv > 0 that speak against it.
+
+    Parameters
+    ----------
+    matrix : L, (N, N), 1/ℓ².
+    areas : of the points, ℓ^d.
+    outflow : whether rows may have L1 < 0, as beside a Dirichlet boundary.
+    """
+    q = shared_outflow(matrix, areas) if outflow else None
+    mass, component, error = left_null_vector(matrix, areas, q)
+    smallest = float((mass / areas).min())
+    contracts, max_s, feed = False, np.nan, np.zeros((len(areas), 0))
+    if smallest > 0 and error <= CONSERVED:
+        contracts, max_s, feed = dissipation(matrix, mass)
+    holds = smallest > POSITIVE and contracts
+    return mass, Certificate(holds, smallest, max_s, int(component.max()) + 1), feed
 
 
 def dissipation(
     matrix: sparse.csr_array, mass: Float[Tensor, " N"]
-) -> tuple[float, Float[Tensor, "N k"]]:
-    """How far S is from S ≤ 0, in units of the size of its rows, and what feeds it.
+) -> tuple[bool, float, Float[np.ndarray, "N k"]]:
+    """Whether S ≤ 0, how far it is from that in units of the size of its rows, and what feeds it.
 
     A = εD − S, D the diagonal of the absolute sums of the terms in each row of S, is positive iff A = LDLᵀ has no
     negative pivot (Sylvester's law of inertia). So each point is judged by its own scale, which may be 1e6 times
     finer here than there. Each negative pivot d_j brings its own proof, v = L^{-T} e_j with vᵀAv = d_j < 0: what is
     already eliminated relaxes around j, so v lives where S fails. It is A^{-1} applied to d_j times column j of the
-    factor, one solve. Row i feeds vᵀSv > 0 by π_i v_i (Lv)_i, which sums to it.
+    factor, one solve. Row i contributes π_i v_i (Lv)_i to vᵀSv > 0.
 
     Beyond `krylov.LARGEST_FACTORED` points the v are those that conjugate gradients come upon.
 
     Returns
     -------
+    negative : whether S ≤ 0, up to rounding.
     max_s : largest vᵀSv / vᵀDv, a lower bound of the largest eigenvalue; 0.0 if there is no v.
-    feed : (N, k), the shares of the rows in each vᵀSv; k = 0 if there is none.
+    feed : (N, k), the contributions of the rows to each vᵀSv; k = 0 if there is none.
     """
     weighted = sparse.csr_array(sparse.diags_array(mass.numpy()) @ matrix)
     symmetric = (weighted + weighted.T) / 2
     size = (abs(weighted).sum(axis=0) + abs(weighted).sum(axis=1)) / 2
     size = np.where(size > 0, size, 1.0)
     shifted = sparse.csr_array(STRICTNESS * sparse.diags_array(size) - symmetric)
-    vectors = negative_directions(shifted) if prefers_krylov(len(size)) else None
-    localized = vectors is None
-    if vectors is None:
-        vectors = _negative_pivots(shifted)
-    if vectors.shape[1] == 0:
-        return 0.0, torch.zeros(len(size), 0)
+    vectors = krylov_or_factors(
+        len(size), lambda: negative_directions(shifted), lambda: _negative_pivots(shifted)
+    )
     feed = vectors * (weighted @ vectors)
     rayleigh = feed.sum(axis=0) / (size @ vectors**2)
-    if not localized:
-        feed = raised_peaks(feed, matrix, FEED_SHARE)
-    return float(rayleigh.max()), torch.from_numpy(feed)
+    return vectors.shape[1] == 0, float(rayleigh.max(initial=0.0)), feed
 
 
 def _negative_pivots(matrix: sparse.csr_array) -> Float[np.ndarray, "N k"]:
@@ -102,41 +118,5 @@ def _negative_pivots(matrix: sparse.csr_array) -> Float[np.ndarray, "N k"]:
     lu = factorized(sparse.csc_array(matrix), 0.0)
     pivots = lu.U.diagonal()
     negative = np.flatnonzero(pivots < 0)[:MAX_VECTORS]
-    if len(negative) == 0:
-        return np.empty((len(pivots), 0))
     columns = (lu.L[:, negative] * pivots[negative]).toarray()
     return lu.solve(columns[lu.perm_r])
-
-
-def check_certificate(
-    matrix: sparse.csr_array, areas: Float[Tensor, " N"], rounds: int = 0, stepped: int = 0
-) -> tuple[Float[Tensor, " N"], Certificate, Float[Tensor, "N k"]]:
-    """π, the certificate as it stands, and the rows' shares in the positive eigenvalues of S."""
-    mass, component, error = left_null_vector(matrix, areas)
-    smallest = float((mass / areas).min())
-    max_s, feed = np.nan, torch.zeros(len(areas), 0)
-    if smallest > 0 and error <= CONSERVED:
-        max_s, feed = dissipation(matrix, mass)
-    holds = smallest > POSITIVE and max_s == 0
-    result = Certificate(holds, smallest, max_s, rounds, stepped, int(component.max()) + 1)
-    return mass, result, feed
-
-
-def raised_peaks(
-    feed: Float[np.ndarray, "N k"], matrix: sparse.csr_array, share: float
-) -> Float[np.ndarray, "N k"]:
-    """The feed, every place where a direction fails made as high as its worst.
-
-    On many points a direction is a sum of many local ones, by chance with different weights. Row i belongs to a peak if
-    its feed is at least `share` of the largest in row and column i of the matrix, and the sum there is positive.
-    """
-    joined = sparse.csr_array(abs(matrix) + abs(matrix).T)
-    joined.data[:] = 1.0
-    raised = feed.copy()
-    for column, own in zip(raised.T, feed.T, strict=True):
-        positive = np.maximum(own, 0)
-        around = np.maximum.reduceat(positive[joined.indices], joined.indptr[:-1])
-        worst = own.max()
-        peak = (own > PEAK * worst) & (own >= share * around) & (joined @ own > 0)
-        column[peak] = worst
-    return raised

@@ -1,9 +1,13 @@
-"""Rows lower their order until the certificate holds (`method.md`, section 5)."""
+"""Rows are widened or lower their order until the certificate holds: solve, estimate, mark, lower.
+
+Each round solves for π and for directions in which S > 0 (`certificate`), marks the rows that stand in the way, and
+lets each of them take a later one of its candidates (`method.md`, section 5).
+"""
 
 from __future__ import annotations
 
-import warnings
-from dataclasses import replace
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -13,28 +17,64 @@ from scipy.sparse import csgraph
 from torch import Tensor
 from tqdm import tqdm
 
-from torchlb.errors import StabilityWarning
+from torchlb.errors import StabilityWarning, warn
 from torchlb.linalg.krylov import prefers_krylov
 from torchlb.linalg.sparse import to_scipy
-from torchlb.stability.certificate import FEED_SHARE, Certificate, check_certificate
-from torchlb.stencils.assemble import Ladder
+from torchlb.stability.certificate import Certificate, check_certificate
 from torchlb.stencils.rows import Reason, Rows
 
-__all__ = ["certify"]
+__all__ = ["Schedule", "certify"]
 MARGIN = 0.02
-"""A point whose π is below this share of its area asks the rows around it to step down while they can."""
-MAX_ROUNDS = 80
-PATIENCE = 20
-"""Rounds after which rows step down to the bottom at once; twice as many beyond `krylov.LARGEST_FACTORED` points."""
-SINGLE_STEPS = 4
-"""Times that a row steps down by one candidate; from then on its way doubles with every second time."""
-WEIGHT_SHARE = 0.1
+"""A point of smaller weight, π below this share of its area, has the rows around it marked while they can change."""
+SHARE = 0.2
+"""Of the largest entry or contribution around, from which on a row is marked."""
+PEAK = 0.02
+"""Share of the largest contribution to a direction from which on a row can be a peak of its own."""
+Lower = Callable[[Int[Tensor, " J"], Int[Tensor, " J"]], Rows]
+
+
+@dataclass(frozen=True)
+class Schedule:
+    """How far a marked row goes on along its candidates, and for how long.
+
+    Attributes
+    ----------
+    single : times that it goes on by one candidate; from then on its way doubles with every second time.
+    most : rounds, after which the operator is left as it is, with a warning.
+    """
+
+    single: int = 4
+    most: int = 80
+
+    def way(self, times: Int[Tensor, " N"]) -> Int[Tensor, " N"]:
+        """Candidates beyond its first that a row starts from when it is marked for the `times`-th time.
+
+        >>> Schedule().way(torch.arange(13)).tolist()
+        [0, 1, 2, 3, 4, 6, 8, 12, 16, 23, 32, 46, 64]
+        """
+        doubled = self.single * 2 ** ((times - self.single) / 2)
+        return torch.where(times <= self.single, times, doubled.ceil().long())
 
 
 def certify(
-    ladder: Ladder, rows: Rows, areas: Float[Tensor, " N"], *, progress: bool = True
+    rows: Rows,
+    areas: Float[Tensor, " N"],
+    lower: Lower,
+    bottom: int,
+    *,
+    outflow: bool = False,
+    schedule: Schedule = Schedule(),
+    progress: bool = True,
 ) -> tuple[Rows, Float[Tensor, " N"], Certificate]:
-    """Step rows down their ladders until the certificate holds.
+    """Widen rows, or lower their order, until the certificate holds.
+
+    Parameters
+    ----------
+    rows : each at the first of its candidates that passed.
+    areas : of the points, ℓ^d.
+    lower : (points, first candidates) → their rows, each at the first candidate from there on that passes.
+    bottom : number of candidates: what `Rows.candidate` is for low-order rows, which cannot change any more.
+    outflow : whether rows may have L1 < 0, as beside a Dirichlet boundary.
 
     Returns
     -------
@@ -42,45 +82,41 @@ def certify(
     mass : π, (N,), ℓ^d.
     certificate : what was reached; a `StabilityWarning` is issued if it does not hold.
     """
-    count = len(areas)
-    first = rows.candidate.clone()
-    steps = torch.zeros(count, dtype=torch.int64)
-    rounds, bottom = 0, len(ladder.candidates)
-    patience = 2 * PATIENCE if prefers_krylov(count) else PATIENCE
-    with tqdm(desc="certificate", delay=2, disable=not progress, leave=False) as bar:
+    first, count, rounds = rows, len(areas), 0
+    times = torch.zeros(count, dtype=torch.int64)
+    with tqdm(desc="certificate", delay=2, disable=None if progress else True, leave=False) as bar:
         while True:
             bar.update()
             matrix = to_scipy(rows.crow, rows.col, rows.laplacian, (count, count))
             free = rows.candidate < bottom
-            astray = _into_sinks(matrix)
-            astray = astray[free[astray]]
-            if len(astray) > 0 and rounds < MAX_ROUNDS:
-                rounds += 1
-                rows = _step_down(ladder, rows, astray, torch.full_like(astray, bottom))
-                continue
-            stepped = int((rows.candidate > first).sum())
-            mass, result, feed = check_certificate(matrix, areas, rounds, stepped)
-            bar.set_postfix_str(f"min π {result.min_pi:.2g}, {stepped} rows down", refresh=False)
-            blamed = _responsible(matrix, mass / areas, feed, free)
-            movable = blamed[free[blamed]]
-            reach = 0
-            while len(movable) == 0 and not result.holds and reach < len(blamed):
-                reach = len(blamed)
-                blamed = _around(matrix, blamed)
-                movable = blamed[free[blamed]]
-            if len(movable) == 0 or rounds == MAX_ROUNDS:
-                break
+            marked, start = _into_closed_classes(matrix) & free, torch.full_like(times, bottom)
+            if not marked.any() or rounds == schedule.most:  # else π is all in those classes
+                mass, result, feed = check_certificate(matrix, areas, outflow=outflow)
+                marked = _marked(matrix, mass / areas, feed, free, spread=not result.holds)
+                if not marked.any() or rounds == schedule.most:
+                    break
+                times += marked
+                start = first.candidate + schedule.way(times)
             rounds += 1
-            steps[movable] += 1
-            way = _way_down(steps[movable]) if rounds <= patience else bottom
-            rows = _step_down(ladder, rows, movable, first[movable] + way)
+            rows = _lowered(rows, first, marked, start.clamp_max(bottom), lower)
+            bar.set_postfix_str(f"{int(marked.sum())} rows marked", refresh=False)
+    below = rows.order < first.order
+    widened = (rows.candidate > first.candidate) & ~below
+    counts = {"lowered": int(below.sum()), "widened": int(widened.sum()), "rounds": rounds}
+    result = replace(result, **counts)
     if not result.holds:
-        _warn(result, mass / areas, feed)
+        worst = (mass / areas).argsort() if feed.shape[1] == 0 else (-feed.max(1)).argsort()
+        names = ", ".join(map(str, worst[:8].tolist()))
+        stopped = ", where rounds end" if rounds == schedule.most else ""
+        warn(
+            f"{result}{stopped}; the worst points: {names}. Lower `order`, or repair the surface there.",
+            StabilityWarning,
+        )
     return rows, mass, result
 
 
-def _into_sinks(matrix: sparse.csr_array) -> Int[Tensor, " J"]:
-    """Rows that refer to a sink: to a few points that refer to each other alone.
+def _into_closed_classes(matrix: sparse.csr_array) -> Bool[Tensor, " N"]:
+    """Rows that lead into a closed class: a few points that refer to each other alone.
 
     What flows in never leaves, so all of π is there, and nothing can be told from its zeros elsewhere. The largest
     class of points that refer to each other, on a connected component, is none.
@@ -89,85 +125,92 @@ def _into_sinks(matrix: sparse.csr_array) -> Int[Tensor, " J"]:
     matrix.eliminate_zeros()
     _, component = csgraph.connected_components(matrix, directed=False)
     count, label = csgraph.connected_components(matrix, connection="strong")
-    if count == component.max() + 1:
-        return torch.empty(0, dtype=torch.int64)
-    row, col = sparse.coo_array(matrix).coords
-    leaving = label[row] != label[col]
-    sink = np.ones(count, dtype=bool)
-    sink[label[row[leaving]]] = False
-    by_size = np.bincount(label)[label].argsort(kind="stable")
-    largest = np.zeros(component.max() + 1, dtype=np.int64)
-    largest[component[by_size]] = label[by_size]  # the last one written stays
-    sink[largest] = False
-    return torch.from_numpy(np.unique(row[leaving & sink[label[col]]]).astype(np.int64))
+    leading = np.zeros(len(label), dtype=bool)
+    if count > component.max() + 1:
+        row, col = sparse.coo_array(matrix).coords
+        leaving = label[row] != label[col]
+        closed = np.ones(count, dtype=bool)
+        closed[label[row[leaving]]] = False
+        by_size = np.bincount(label)[label].argsort(kind="stable")
+        largest = np.zeros(component.max() + 1, dtype=np.int64)
+        largest[component[by_size]] = label[by_size]  # the last one written stays
+        closed[largest] = False
+        leading[row[leaving & closed[label[col]]]] = True
+    return torch.from_numpy(leading)
 
 
-def _responsible(
+def _marked(
     matrix: sparse.csr_array,
     density: Float[Tensor, " N"],
-    feed: Float[Tensor, "N k"],
+    feed: Float[np.ndarray, "N k"],
     free: Bool[Tensor, " N"],
-) -> Int[Tensor, " J"]:
-    """Rows to step down.
+    *,
+    spread: bool,
+) -> Bool[Tensor, " N"]:
+    """Rows to widen or lower: those that make π small or feed S > 0.
 
-    Where π is small: the rows with a negative weight into the point, unless slight, and its own if π is positive, as
-    π_i |L_ii| is what flows in, or if those are at the bottom. Also the points of its row if that is at the bottom
-    already, since they may leave it out of theirs, as on both sides of a crease. Where S fails: the rows that feed its
-    positive eigenvalues.
+    Where none of them is free, those around them are marked too, as low-order rows are symmetric only together, and
+    so on; only if `spread`.
     """
-    blamed = (feed > FEED_SHARE * feed.amax(0)).any(1) if feed.shape[1] else density.isnan()
-    small = (density <= MARGIN).numpy()
-    if small.any():
-        starved = np.flatnonzero(small)
-        columns = sparse.coo_array(sparse.csc_array(matrix)[:, starved])
-        row, col = columns.coords
-        inflow = np.where(row == starved[col], 0.0, columns.data)
-        worst = np.zeros(len(starved))
-        np.minimum.at(worst, col, inflow)
-        heavy = (inflow < WEIGHT_SHARE * worst[col]) & (inflow < 0)
-        blamed[torch.from_numpy(row[heavy].astype(np.int64))] = True
-        alone = not (blamed & free).any()
-        blamed |= torch.from_numpy(small) & ((density > 0) | alone)
-        at_bottom = starved[~free.numpy()[starved]]
-        blamed[torch.from_numpy(np.unique(matrix[at_bottom].indices).astype(np.int64))] = True
-    return blamed.nonzero()[:, 0]
-
-
-def _around(matrix: sparse.csr_array, rows: Int[Tensor, " J"]) -> Int[Tensor, " K"]:
-    """Rows that share an entry with the given ones, where those are at the bottom: they are symmetric only together."""
-    inward = sparse.csc_array(matrix)[:, rows.numpy()].indices
-    joined = np.concatenate([matrix[rows.numpy()].indices, inward])
-    return torch.from_numpy(np.unique(joined).astype(np.int64))
-
-
-def _way_down(steps: Int[Tensor, " J"]) -> Int[Tensor, " J"]:
-    """Rungs below the first that a row starts from when it is blamed for the steps-th time.
-
-    >>> _way_down(torch.arange(13)).tolist()
-    [0, 1, 2, 3, 4, 6, 8, 12, 16, 23, 32, 46, 64]
-    """
-    doubled = SINGLE_STEPS * 2 ** ((steps - SINGLE_STEPS) / 2)
-    return torch.where(steps <= SINGLE_STEPS, steps, doubled.ceil().long())
-
-
-def _step_down(ladder: Ladder, rows: Rows, movable: Tensor, start: Tensor) -> Rows:
-    """Rebuild the given rows from candidate `start` on, one candidate lower at least."""
-    start = torch.maximum(rows.candidate[movable] + 1, start).clamp_max(len(ladder.candidates))
-    rebuilt = ladder.rows(movable, start)
-    top = ladder.candidates[0].degree - 1
-    reason = torch.where(rebuilt.order < top, Reason.STABILITY, 0)
-    kept = rebuilt.hessian[:, : rows.hessian.shape[1]]
-    rebuilt = replace(rebuilt, reason=reason, hessian=kept)
-    place = torch.arange(len(rows.candidate))
-    place[movable] = len(rows.candidate) + torch.arange(len(movable))
-    return Rows.stack([rows, rebuilt])[place]
-
-
-def _warn(result: Certificate, density: Float[Tensor, " N"], feed: Float[Tensor, "N k"]) -> None:
-    order = feed.amax(1).argsort(descending=True) if feed.shape[1] else density.argsort()
-    names = ", ".join(map(str, order[:8].tolist()))
-    warnings.warn(
-        f"{result}; the worst points: {names}. Lower `order`, or repair the surface there.",
-        StabilityWarning,
-        stacklevel=4,
+    joined = sparse.csr_array(abs(matrix) + abs(matrix).T)
+    joined.data[:] = 1.0
+    marked = _around_small_weights(matrix, density.numpy(), free.numpy()) | _feeding(
+        joined, feed, peaks=prefers_krylov(len(feed))
     )
+    while spread and not (marked & free.numpy()).any():
+        wider = joined @ marked > 0
+        if (wider == marked).all():
+            break
+        marked = wider
+    return torch.from_numpy(marked) & free
+
+
+def _around_small_weights(
+    matrix: sparse.csr_array, density: Float[np.ndarray, " N"], free: Bool[np.ndarray, " N"]
+) -> Bool[np.ndarray, " N"]:
+    """Rows to mark for the points of small π.
+
+    Those with a negative weight into the point, unless slight. Its own if π is positive: π_i |L_ii| = Σ_{j≠i} π_j L_ji
+    is what flows in, so a smaller diagonal makes π_i larger, and cannot change its sign. And where its own is a
+    low-order row, those of its entries, which may leave the point out of theirs, as on both sides of a crease.
+    """
+    small = np.flatnonzero(density <= MARGIN)
+    columns = sparse.coo_array(sparse.csc_array(matrix)[:, small])
+    row, col = columns.coords
+    inflow = np.where(row == small[col], 0.0, columns.data)
+    worst = np.zeros(len(small))
+    np.minimum.at(worst, col, inflow)
+    marked = np.zeros(len(density), dtype=bool)
+    marked[row[(inflow < SHARE * worst[col]) & (inflow < 0)]] = True
+    marked[small[density[small] > 0]] = True
+    marked[matrix[small[~free[small]]].indices] = True
+    return marked
+
+
+def _feeding(
+    joined: sparse.csr_array, feed: Float[np.ndarray, "N k"], *, peaks: bool
+) -> Bool[np.ndarray, " N"]:
+    """Rows that contribute most to a direction with vᵀSv > 0, or with `peaks` most at any place where it is positive.
+
+    Directions from Krylov methods are sums of many local ones, by chance with different weights.
+    """
+    marked = (feed > SHARE * feed.max(axis=0)).any(axis=1)
+    for own in feed.T[: feed.shape[1] * peaks]:
+        high = np.flatnonzero(own > PEAK * own.max())
+        around = joined[high]
+        largest = np.maximum.reduceat(own[around.indices], around.indptr[:-1])
+        marked[high[(own[high] >= SHARE * largest) & (around @ own > 0)]] = True
+    return marked
+
+
+def _lowered(
+    rows: Rows, first: Rows, marked: Bool[Tensor, " N"], start: Int[Tensor, " N"], lower: Lower
+) -> Rows:
+    """The marked rows built anew from candidate `start` on, one later at least."""
+    index = marked.nonzero()[:, 0]
+    rebuilt = lower(index, start[index].maximum(rows.candidate[index] + 1))
+    reason = torch.where(rebuilt.order < first.order[index], Reason.STABILITY, first.reason[index])
+    kept = rebuilt.hessian[:, : rows.hessian.shape[1]]
+    place = torch.arange(len(first.order))
+    place[index] = len(place) + torch.arange(len(index))
+    return Rows.stack([rows, replace(rebuilt, reason=reason, hessian=kept)])[place]

@@ -1,4 +1,4 @@
-"""π with πᵀL = 0: by sparse factors, or by Krylov methods where those would be too large."""
+"""π with πᵀL = −q, q the outflow: by sparse factors, or by Krylov methods where those would be too large."""
 
 from __future__ import annotations
 
@@ -9,14 +9,14 @@ from scipy import sparse
 from scipy.sparse import csgraph
 from torch import Tensor
 
-from torchlb.errors import StencilError
+from torchlb.errors import StabilityError
 from torchlb.linalg.factor import factorized
-from torchlb.linalg.krylov import imbalance, null_density, prefers_krylov, rescaled
+from torchlb.linalg.krylov import backward_error, krylov_or_factors, null_density, rescaled
 
-__all__ = ["LOSS", "left_null_vector"]
+__all__ = ["has_outflow", "left_null_vector", "shared_outflow"]
 
-LOSS = 1e-9
-"""A row whose sum is above this share of its size loses heat; all others sum to zero up to rounding."""
+ROW_SUM = 1e-9
+"""Share of its size from which on a row sum is not rounding."""
 CONSERVED = 1e-11
 """π is a null vector if what flows in and out of each point agrees to this share."""
 SHIFT, SOLVES = 1e-9, 8
@@ -24,48 +24,68 @@ SHIFT, SOLVES = 1e-9, 8
 
 
 def left_null_vector(
-    matrix: sparse.csr_array, areas: Float[Tensor, " N"]
+    matrix: sparse.csr_array,
+    areas: Float[Tensor, " N"],
+    outflow: Float[np.ndarray, " N"] | None = None,
 ) -> tuple[Float[Tensor, " N"], np.ndarray, float]:
-    """π with πᵀL = 0, scaled on each component to the sum of the areas there.
+    """π with πᵀL = −q, scaled on each component to the sum of the areas there.
 
     Inverse iteration with the LU of (AL)ᵀ, A the areas, each diagonal entry shifted by its own share. Beyond
-    `krylov.LARGEST_FACTORED` points GMRES with multigrid of the low-order part. On a component with rows that lose heat
-    (L1 < 0, next to a Dirichlet boundary) π solves πᵀL = −q instead, q from `_shared`, and has the sum of the areas.
+    `krylov.LARGEST_FACTORED` points GMRES with multigrid of the low-order part.
+
+    Parameters
+    ----------
+    matrix : L, (N, N), 1/ℓ².
+    areas : diagonal of A, ℓ^d.
+    outflow : q ≥ 0, ℓ^(d−2), of the points where L1 < 0, as `shared_outflow` has it; None where L1 = 0.
 
     Returns
     -------
-    mass : π.
+    mass : π, ℓ^d.
     component : of each point.
-    error : largest imbalance of a point, see `imbalance`; `CONSERVED` is what rounding may leave.
+    error : componentwise backward error of π; `CONSERVED` is what rounding may leave.
+
+    Raises
+    ------
+    StabilityError : if there is no such π, as L is singular beyond its constants.
     """
     area = areas.numpy()
+    lost = np.zeros(len(area)) if outflow is None else outflow
     count, component = csgraph.connected_components(matrix, directed=True, connection="weak")
-    loss = -matrix.sum(axis=1)
-    losing = np.abs(loss) > LOSS * abs(matrix).sum(axis=1)
-    lossless = np.bincount(component, losing, minlength=count) == 0
-    lost = _shared(np.maximum(area * loss, 0), matrix, losing)
-    density = None
-    if prefers_krylov(len(area)):
-        density = null_density(matrix, area, lost, component, lossless)
-    if density is None:
-        density = _factored_density(matrix, area, lost, component, lossless)
-    error = imbalance(sparse.csr_array(matrix.T), area * density, lost)
-    density = rescaled(density, area, component, ~lossless)
+    free = np.bincount(component, lost, minlength=count) == 0
+    problem = (matrix, area, lost, component, free)
+    density = krylov_or_factors(
+        len(area), lambda: null_density(*problem), lambda: _factored_density(*problem)
+    )
+    if not np.isfinite(density).all():
+        raise StabilityError(SINGULAR)
+    error = backward_error(sparse.csr_array(matrix.T), area * density, lost)
+    density = rescaled(density, area, component, np.ones_like(free))
     return torch.from_numpy(area * density), component, error
 
 
-def _shared(
-    heat: Float[np.ndarray, " N"], matrix: sparse.csr_array, losing: Bool[np.ndarray, " N"]
-) -> Float[np.ndarray, " N"]:
-    """The heat of each losing row, in equal parts to those of them that it shares an entry with; none of the others.
+SINGULAR = (
+    "certificate: the operator is singular beyond its constants; is `dim` the dimension of the manifold? "
+    "Pass the right one, or certify=False to look at the raw operator"
+)
 
-    Where a row loses next to nothing π would be next to nothing, and rows would step down for it.
+
+def has_outflow(matrix: sparse.csr_array, rounding: float = 0.0) -> Bool[np.ndarray, " N"]:
+    """Rows whose sum is not zero, but for a relative `rounding` of their entries."""
+    return np.abs(matrix.sum(axis=1)) > max(ROW_SUM, 64 * rounding) * abs(matrix).sum(axis=1)
+
+
+def shared_outflow(matrix: sparse.csr_array, areas: Float[Tensor, " N"]) -> Float[np.ndarray, " N"]:
+    """What flows out at each row of non-zero sum, in equal parts to those of them that it shares an entry with.
+
+    Where next to nothing flows out of a row π would be next to nothing, and rows would be lowered for it.
     """
-    rows = np.flatnonzero(losing)
+    rows = np.flatnonzero(has_outflow(matrix))
+    own = np.maximum(-areas.numpy() * matrix.sum(axis=1), 0)[rows]
     joined = matrix[rows][:, rows].astype(bool)
     joined = sparse.csr_array((joined + joined.T).astype(float))
-    shared = np.zeros_like(heat)
-    shared[rows] = joined @ (heat[rows] / np.maximum(joined.sum(axis=1), 1))
+    shared = np.zeros(len(areas))
+    shared[rows] = joined @ (own / np.maximum(joined.sum(axis=1), 1))
     return shared
 
 
@@ -83,10 +103,7 @@ def _factored_density(
     try:
         lu = factorized(sparse.csc_array((weighted - sparse.diags_array(shift)).T), 1e-2)
     except RuntimeError as error:
-        raise StencilError(
-            "certificate: the operator is singular beyond its constants; is `dim` the dimension of the manifold? "
-            "Pass the right one, or certify=False to look at the raw operator"
-        ) from error
+        raise StabilityError(SINGULAR) from error
     density = np.ones(len(area))
     for _ in range(SOLVES):
         density = -lu.solve(lost + shift * density)
