@@ -287,7 +287,7 @@ def check_options(
         raise InputError(
             f"num_neighbors: {num_neighbors} are more than the {num_points} points; lower it, or leave it out"
         )
-    if num_points < needed:
+    if num_points < (min(needed, 4) if dim == 2 and ambient_dim == 3 else needed):
         fits = [p for p in range(1, order) if num_monomials(dim, p + 1) <= num_points]
         remedy = f"lower `order` to {max(fits)}" if fits else "add points"
         raise InputError(
