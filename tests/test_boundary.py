@@ -6,10 +6,15 @@ from functools import cache
 import numpy as np
 import pytest
 import torch
+from scipy import special
 
 from torchlb import LaplaceBeltrami
 from torchlb.geometry.boundary import boundary_of_mesh
 from torchlb.geometry.frames import mesh_frames
+from torchlb.linalg.sparse import to_scipy
+from torchlb.stencils.assemble import Stencils, assemble
+from torchlb.stencils.conditions import Neumann
+from torchlb.stencils.shape import mesh_shape
 from torchlb.surfaces import Hemisphere, Sphere, Torus, UnitDisk
 
 
@@ -262,3 +267,34 @@ def test_bad_boundaries_are_refused(bad):
 def test_bad_boundary_of_a_mesh_is_refused():
     with pytest.raises(ValueError, match="boundary"):
         LaplaceBeltrami.from_mesh(*UnitDisk().mesh(300), boundary="robin")
+
+
+class Robin(Neumann):
+    """∂_ν f + a f = 0."""
+
+    conserves = False
+
+    def __init__(self, share):
+        self.share = share
+
+
+@pytest.mark.parametrize("order", [3, 5])
+def test_a_robin_condition_is_one_class(order):
+    """Eigenvalues of the unit disk are the zeros of √λ J_n'(√λ) + a J_n(√λ), each twice for n > 0."""
+    a = 2.0
+    root = torch.linspace(0.1, 8, 10_000, dtype=torch.float64).numpy()
+    exact = []
+    for n in range(6):
+        value = root * special.jvp(n, root) + a * special.jv(n, root)
+        (at,) = np.nonzero(value[:-1] * value[1:] < 0)
+        step = value[at] / (value[at] - value[at + 1])  # linear in between: to 1e-8
+        exact += [*(root[at] + step * (root[1] - root[0])) ** 2] * (2 if n else 1)
+    exact = torch.tensor(sorted(exact)[:10])
+    shape = mesh_shape(*UnitDisk().mesh(700), order + 1, condition=Robin(a), progress=False)
+    rows = assemble(Stencils(shape, order), progress=False)
+    assert (rows.order == order).double().mean() > 0.95
+    matrix = to_scipy(rows.crow, rows.col, rows.laplacian, (700, 700)).toarray()
+    values = torch.linalg.eigvals(-torch.from_numpy(matrix))
+    assert values.real.min() > 0
+    values = values[values.real.argsort()][:10].real
+    assert ((values - exact) / exact).abs().max() < {3: 1e-3, 5: 1e-4}[order]

@@ -1,4 +1,4 @@
-"""The ladder: which rungs, in which order, and who takes which."""
+"""Candidate neighbourhoods: which, in which order, and who takes which."""
 
 from math import ceil
 
@@ -6,44 +6,45 @@ import pytest
 import torch
 
 from torchlb.fits.polynomials import num_monomials
+from torchlb.fits.rules import SIZE_FACTORS
 from torchlb.geometry.candidates import (
     CHUNK_BYTES,
-    SIZE_FACTORS,
     Candidate,
+    Search,
     chunks,
     list_candidates,
-    walk_ladder,
+    stencil_candidates,
 )
 from torchlb.geometry.neighbors import GraphBalls, nearest_graph, nearest_neighbors
 from torchlb.surfaces import Sphere
 
 
 @pytest.mark.parametrize("dim", [1, 2, 3])
-def test_rungs_go_by_degree_then_rule_then_size(dim):
+def test_candidates_go_by_degree_then_rule_then_size(dim):
     """K = ⌈factor · M⌉ with M = C(m + d, d), for the factors of the rule."""
-    rungs = list_candidates(dim, [4, 3, 2], ["polyharmonic", "least_squares"])
+    candidates = list_candidates(dim, [4, 3, 2], ["polyharmonic", "least_squares"])
     expected = [
-        Candidate(degree, ceil(factor * num_monomials(dim, degree) - 1e-9), rule)
+        Candidate(degree, ceil(factor * num_monomials(dim, degree) - 1e-9), rule, factor)
         for degree in (4, 3, 2)
         for rule in ("polyharmonic", "least_squares")
         for factor in SIZE_FACTORS[rule]
     ]
-    assert rungs == expected
-    assert all(rung.size >= num_monomials(dim, rung.degree) for rung in rungs)
+    assert candidates == expected
+    assert all(candidate.size >= num_monomials(dim, candidate.degree) for candidate in candidates)
 
 
-def test_a_given_size_replaces_those_of_the_ladder():
-    rungs = list_candidates(2, [4, 3], ["polyharmonic", "least_squares"], num_neighbors=31)
-    assert [rung.size for rung in rungs] == [31] * 4
-    assert [rung.degree for rung in rungs] == [4, 4, 3, 3]
+def test_a_given_size_replaces_the_listed_ones():
+    candidates = list_candidates(2, [4, 3], ["polyharmonic", "least_squares"], num_neighbors=31)
+    assert [candidate.size for candidate in candidates] == [31] * 4
+    assert [candidate.degree for candidate in candidates] == [4, 4, 3, 3]
 
 
 @pytest.mark.parametrize("degree", [2, 9])
 def test_chunks_cover_all_points_within_the_bound(degree):
-    rungs = list_candidates(2, [degree])
-    parts = chunks(100_000, rungs, 2)
+    candidates = list_candidates(2, [degree])
+    parts = chunks(100_000, candidates, 2)
     assert torch.equal(torch.cat(parts), torch.arange(100_000))
-    entry = 8 * max(rung.size for rung in rungs) * num_monomials(2, degree)
+    entry = 8 * max(candidate.size for candidate in candidates) * num_monomials(2, degree)
     assert max(len(part) for part in parts) * entry <= max(CHUNK_BYTES, 64 * entry)
 
 
@@ -54,32 +55,31 @@ def balls():
     return GraphBalls(points, nearest_graph(points, frames, nearest_neighbors(points, 24)), frames)
 
 
-RUNGS = list_candidates(2, [2], ["least_squares"])
+CANDIDATES = [Candidate(m, size, "least_squares") for m in (3, 2) for size in (16, 20, 30, 50)]
 
 
-def walk(balls, centers, willing, start=None, rungs=RUNGS):
-    """Who takes which rung (−1: none), if centre c passes from rung `willing[c]` on; and what was tried."""
+def found(balls, centers, willing, start=None, candidates=CANDIDATES, rejects=None):
+    """Who settles on which candidate (−1: none), if centre c does from `willing[c]` on; and what was tried."""
     taken = torch.full((len(centers),), -1)
     tried = []
-
-    def attempt(rows, index, rung):
-        number = rungs.index(rung)
-        assert index.shape == (len(rows), rung.size)
-        assert torch.equal(index[:, 0], rows)
-        tried.extend((number, int(row)) for row in rows)
-        return willing[rows] <= number, rows
-
-    for number, rows, result in walk_ladder(balls, centers, rungs, attempt, start):
-        assert torch.equal(centers[rows], result)
+    search = Search(balls, centers, candidates, start)
+    for number, rows, index in search:
+        assert index.shape == (len(rows), candidates[number].size)
+        assert torch.equal(index[:, 0], centers[rows])
         assert (taken[rows] == -1).all()
-        taken[rows] = number
+        tried.extend((number, int(c)) for c in centers[rows])
+        passed = rows[willing[centers[rows]] <= number]
+        taken[passed] = number
+        search.settle(passed)
+        if rejects is not None:
+            search.reject_degree(rows[rejects[centers[rows]] & (taken[rows] < 0)], number)
     return taken, tried
 
 
-def test_every_centre_takes_the_first_rung_that_passes(balls):
+def test_every_centre_takes_the_first_candidate_that_passes(balls):
     centers = torch.arange(3, 300, 7)
-    willing = torch.randint(0, len(RUNGS), (300,))
-    taken, tried = walk(balls, centers, willing)
+    willing = torch.randint(0, len(CANDIDATES), (300,))
+    taken, tried = found(balls, centers, willing)
     assert torch.equal(taken, willing[centers])
     # In order, each once, and none after it passed.
     assert sorted(tried) == sorted(
@@ -88,27 +88,49 @@ def test_every_centre_takes_the_first_rung_that_passes(balls):
     assert [number for number, _ in tried] == sorted(number for number, _ in tried)
 
 
-def test_start_keeps_rows_off_the_rungs_before_their_own(balls):
+def test_start_keeps_rows_off_the_candidates_before_their_own(balls):
     centers = torch.arange(20)
-    start = torch.arange(20) % (len(RUNGS) + 1)
-    taken, tried = walk(balls, centers, torch.zeros(300), start)
-    assert torch.equal(taken, torch.where(start < len(RUNGS), start, -1))
+    start = torch.arange(20) % (len(CANDIDATES) + 1)
+    taken, tried = found(balls, centers, torch.zeros(300), start)
+    assert torch.equal(taken, torch.where(start < len(CANDIDATES), start, -1))
     assert all(number >= start[row] for number, row in tried)
 
 
-def test_who_passes_nowhere_does_not_appear(balls):
-    taken, tried = walk(balls, torch.arange(10), torch.full((300,), 99))
+def test_who_rejects_a_degree_goes_on_with_the_next(balls):
+    """Four sizes of two degrees: after the first of degree 3 come those of degree 2, and after that nothing."""
+    rejects = torch.arange(300) % 2 == 0
+    taken, tried = found(balls, torch.arange(10), torch.full((300,), 99), rejects=rejects)
     assert (taken == -1).all()
-    assert len(tried) == 10 * len(RUNGS)
+    assert [number for number, center in tried if center == 4] == [0, 4]
+    assert [number for number, center in tried if center == 5] == list(range(8))
 
 
-def test_rungs_larger_than_the_ball_are_not_tried():
+def test_candidates_of_a_row():
+    """Degrees p + 1, then even ones; order 1 by positive weights, on a mesh only if asked for; splines before fits."""
+
+    def degrees(order, on_mesh, weights="least_squares"):
+        listed = stencil_candidates(2, order, weights, 100, on_mesh)
+        return [(c.degree, c.rule[0]) for c in listed]
+
+    assert degrees(5, on_mesh=True) == [(6, "l"), (4, "l")]
+    assert degrees(4, on_mesh=False) == [(5, "l"), (4, "l"), (2, "l"), (2, "p")]
+    assert degrees(1, on_mesh=True) == [(2, "l"), (2, "p")]
+    assert degrees(3, on_mesh=True, weights="polyharmonic") == [(4, "p"), (4, "l")]
+
+
+def test_who_passes_nowhere_does_not_appear(balls):
+    taken, tried = found(balls, torch.arange(10), torch.full((300,), 99))
+    assert (taken == -1).all()
+    assert len(tried) == 10 * len(CANDIDATES)
+
+
+def test_candidates_larger_than_the_ball_are_not_tried():
     """A graph of two components of 150 points: 200 neighbours do not exist."""
     points = torch.cat([Sphere().points(150), Sphere().points(150) + 10])
     frames = Sphere().frames(points[:150]).repeat(2, 1, 1)
     graph = nearest_graph(points, frames, nearest_neighbors(points, 24))
     balls = GraphBalls(points, graph, frames)
-    rungs = [Candidate(2, 200, "least_squares"), Candidate(2, 12, "least_squares")]
-    taken, tried = walk(balls, torch.arange(300), torch.zeros(300), rungs=rungs)
+    candidates = [Candidate(2, 200, "least_squares"), Candidate(2, 12, "least_squares")]
+    taken, tried = found(balls, torch.arange(300), torch.zeros(300), candidates=candidates)
     assert (taken == 1).all()
     assert {number for number, _ in tried} == {1}

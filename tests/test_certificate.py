@@ -18,7 +18,7 @@ from torchlb.geometry.neighbors import GraphBalls, nearest_graph, nearest_neighb
 from torchlb.stability.certificate import check_certificate
 from torchlb.stability.enforce import Schedule, certify
 from torchlb.stability.null_vector import left_null_vector, shared_outflow
-from torchlb.stencils.assemble import Ladder, build_stencil
+from torchlb.stencils.assemble import Stencils, assemble
 from torchlb.stencils.low_order import CloudLowOrder
 from torchlb.stencils.shape import cloud_shape
 from torchlb.surfaces import Hemisphere, Sphere, StarShaped, ThreeSphere, Torus, smooth_function
@@ -268,8 +268,8 @@ def test_only_the_rows_that_lead_into_a_closed_class_are_lowered():
     """Twelve points refer to each other alone and take all of π: everywhere else it is zero, which says nothing."""
     points = Sphere().points(800)
     geometry = cloud_shape(points, 2, 4)
-    ladder = Ladder(geometry, 3)
-    rows = build_stencil(ladder, progress=False)
+    stencils = Stencils(geometry, 3)
+    rows = assemble(stencils, progress=False)
     cap = points[:, 2].topk(12).indices
     capped = torch.zeros(800, dtype=torch.bool)
     capped[cap] = True
@@ -281,7 +281,7 @@ def test_only_the_rows_that_lead_into_a_closed_class_are_lowered():
     degree = torch.zeros(800).double().index_add(0, row[within], rows.laplacian[within])
     rows.laplacian[within & (row == rows.col)] = -degree[cap.sort().values]
     rows, mass, certificate = certify(
-        rows, geometry.areas, ladder.rows, len(ladder.candidates), progress=False
+        rows, geometry.areas, stencils.rows, len(stencils.candidates), progress=False
     )
     assert certificate.holds
     assert certificate.components == 1
@@ -312,7 +312,7 @@ def test_noise_keeps_the_operator_stable_and_its_spectrum(share, bound):
 
 
 def test_wider_stencils_of_a_fixed_size_average_noise():
-    """Nothing can widen them, so they are judged as the widest of the ladder: few fall, and the spectrum gains."""
+    """Nothing can widen them, so they are judged as the widest of the candidates: few fall, and the spectrum gains."""
     points = noisy_sphere(2000, 0.1)
     fixed = LaplaceBeltrami.from_points(points, order=3, num_neighbors=60)
     assert fixed.certificate.holds

@@ -42,16 +42,16 @@ def close(actual, expected):
     torch.testing.assert_close(actual, expected, **TOLERANCE[torch.float64])
 
 
-def poor_and_balls(surface, points):
+def initial_and_balls(surface, points):
     candidates = nearest_neighbors(points, 64 if surface.dim == 3 else 24)
-    poor = cloud_frames(points, candidates, surface.dim)
-    return poor, GraphBalls(points, nearest_graph(points, poor, candidates), poor)
+    initial = cloud_frames(points, candidates, surface.dim)
+    return initial, GraphBalls(points, nearest_graph(points, initial, candidates), initial)
 
 
 def refined(surface, points, degree):
-    poor, balls = poor_and_balls(surface, points)
-    rungs = list_candidates(surface.dim, range(degree, 0, -1))
-    return refine_frames(points, poor, balls, torch.arange(len(points)), rungs)
+    _, balls = initial_and_balls(surface, points)
+    candidates = list_candidates(surface.dim, range(degree, 0, -1))
+    return refine_frames(balls, torch.arange(len(points)), candidates)
 
 
 def tilt(frames, exact):
@@ -65,11 +65,11 @@ def slope_of(sizes, errors, dim=2):
 
 @each(MANIFOLDS)
 def test_frames_are_orthonormal(surface):
-    """EᵀE = I for poor, refined and exact frames in every dimension."""
+    """EᵀE = I for initial, refined and exact frames in every dimension."""
     points = points_of(surface, 400)
     eye = torch.eye(surface.dim, dtype=torch.float64)
     frames, order = refined(surface, points, 3)
-    for found in (poor_and_balls(surface, points)[0], frames):
+    for found in (initial_and_balls(surface, points)[0], frames):
         assert found.shape == (400, surface.ambient_dim, surface.dim)
         close(found.mT @ found, eye.expand(400, -1, -1))
     assert (order == 3).double().mean() > 0.95
@@ -95,12 +95,12 @@ def test_frames_have_order_q(surface, q, bound):
     ids=lambda case: type(case).__name__,
 )
 def test_frames_in_other_codimensions_and_dimensions(surface, factor):
-    """Degree 3 fits of 2000 points beat the poor frames: fivefold, on the coarser S³ (h = 0.2) twofold."""
+    """Degree 3 fits of 2000 points beat the initial frames: fivefold, on the coarser S³ (h = 0.2) twofold."""
     points = points_of(surface, 2000)
     exact = surface.frames(points)
-    poor, _ = poor_and_balls(surface, points)
+    initial, _ = initial_and_balls(surface, points)
     frames, _ = refined(surface, points, 3)
-    assert tilt(frames, exact).norm() < tilt(poor, exact).norm() / factor
+    assert tilt(frames, exact).norm() < tilt(initial, exact).norm() / factor
 
 
 @each([Sphere(), Torus()])

@@ -11,14 +11,12 @@ from torchlb.fits.polynomials import (
     exponents,
     gradient_functional,
     hessian_functional,
-    laplacian_functional,
     monomial_derivatives,
     monomials,
     num_monomials,
 )
 
-CASES = [(dim, degree) for dim in (1, 2, 3, 4) for degree in (1, 2, 3, 4, 6)]
-SECOND = [case for case in CASES if case[1] >= 2]
+CASES = [(1, 6), (2, 1), (2, 4), (2, 6), (3, 3), (4, 2)]
 
 
 def close(actual, expected):
@@ -37,48 +35,33 @@ def test_exponents_are_all_of_the_degrees_once_in_ascending_order(dim, degree):
     assert (total.min(), total.max(), alpha.min()) == (1, degree, 0 if dim > 1 else 1)
 
 
-@pytest.mark.parametrize("shape", [(), (5,), (2, 3)])
 @pytest.mark.parametrize(("dim", "degree"), CASES)
-def test_monomials_are_products_of_powers(dim, degree, shape):
+def test_monomials_are_products_of_powers(dim, degree):
     """y^α = Π_c y_c^α_c, for any batch."""
-    y = torch.randn(*shape, dim, dtype=torch.float64)
-    expected = (y[..., None, :] ** exponents(dim, degree)).prod(-1)
-    assert expected.shape == (*shape, num_monomials(dim, degree) - 1)
-    close(monomials(y, degree), expected)
+    for shape in [(), (5,), (2, 3)]:
+        y = torch.randn(*shape, dim, dtype=torch.float64)
+        expected = (y[..., None, :] ** exponents(dim, degree)).prod(-1)
+        assert expected.shape == (*shape, num_monomials(dim, degree) - 1)
+        close(monomials(y, degree), expected)
 
 
 @pytest.mark.parametrize(("dim", "degree"), CASES)
 def test_derivatives_are_those_of_autograd(dim, degree):
-    """∂_c y^α at random points and, where a power of zero could go wrong, at the origin."""
+    """∂_c y^α at random points and, where a power of zero could go wrong, at the origin: there the functional."""
     y = torch.cat([torch.randn(4, dim).double(), torch.zeros(1, dim).double()])
-    close(monomial_derivatives(y, degree), vmap(jacrev(lambda x: monomials(x, degree)))(y))
+    slopes = monomial_derivatives(y, degree)
+    close(slopes, vmap(jacrev(lambda x: monomials(x, degree)))(y))
+    close(gradient_functional(dim, degree), slopes[-1])
 
 
-@pytest.mark.parametrize(("dim", "degree"), CASES)
-def test_gradient_functional_is_the_jacobian_at_the_origin(dim, degree):
-    zero = torch.zeros(dim, dtype=torch.float64)
-    close(gradient_functional(dim, degree), monomial_derivatives(zero, degree))
-
-
-@pytest.mark.parametrize(("dim", "degree"), SECOND)
-def test_hessian_and_laplacian_functionals_are_second_derivatives_at_the_origin(dim, degree):
-    """Pairs a ≤ b in the order (1,1), (1,2), …, (d,d); Δ is the sum of those with a = b."""
-    zero = torch.zeros(dim, dtype=torch.float64)
-    second = hessian(lambda y: monomials(y, degree))(zero)
+@pytest.mark.parametrize(("dim", "degree"), [case for case in CASES if case[1] >= 2])
+def test_hessian_functionals_are_second_derivatives_at_the_origin(dim, degree):
+    """Pairs a ≤ b in the order (1,1), (1,2), …, (d,d)."""
+    second = hessian(lambda y: monomials(y, degree))(torch.zeros(dim, dtype=torch.float64))
     a, b = torch.triu_indices(dim, dim)
     close(hessian_functional(dim, degree), second[:, a, b])
-    trace = second.diagonal(dim1=1, dim2=2).sum(-1, keepdim=True)
-    close(laplacian_functional(dim, degree), trace)
 
 
-def test_second_moment_of_the_laplacian_is_two():
-    """Σ w y⊗y = 2 Id: the corrected moment."""
-    a, b = torch.triu_indices(3, 3)
-    moments = laplacian_functional(3, 2)[-6:, 0]
-    assert torch.equal(moments, 2.0 * (a == b))
-
-
-@pytest.mark.parametrize("functional", [hessian_functional, laplacian_functional])
-def test_second_derivatives_need_degree_two(functional):
+def test_second_derivatives_need_degree_two():
     with pytest.raises(ValueError, match="degree ≥ 2, got degree 1"):
-        functional(2, 1)
+        hessian_functional(2, 1)

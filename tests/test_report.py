@@ -7,7 +7,7 @@ import torch
 import trimesh
 
 from torchlb import LaplaceBeltrami
-from torchlb.fits.rules import typical_growth
+from torchlb.fits.rules import reference
 from torchlb.stencils.rows import Reason
 from torchlb.surfaces import Sphere, Torus
 
@@ -61,7 +61,7 @@ def test_numbers_are_those_of_the_matrix():
     offset = torch.einsum("ijn,ind->ijd", lb.points - lb.points[:, None], lb.frames)
     radius = (offset.norm(dim=-1) * (matrix != 0)).amax(1)
     torch.testing.assert_close(report.growth, radius**2 * total)
-    assert (report.growth <= 3 * typical_growth(2, 4)).all()
+    assert (report.growth <= 3 * reference(2, 4).growth).all()
     assert (report.condition >= 1).all()
 
 

@@ -8,12 +8,16 @@ from torch.func import hessian, jacrev
 from tolerances import TOLERANCE
 from torchlb.fits.polyharmonic import polyharmonic_weights
 from torchlb.fits.polynomials import monomials, num_monomials
-from torchlb.fits.rules import WEIGHT_RULES, typical_growth
-from torchlb.fits.weights import Weights, least_squares_weights, positive_weights, window
+from torchlb.fits.rules import WEIGHT_RULES, reference
+from torchlb.fits.weights import (
+    MAX_RESIDUAL,
+    Weights,
+    least_squares_weights,
+    positive_weights,
+    window,
+)
 
-DEGREES = {1: range(1, 7), 2: range(1, 7), 3: range(1, 5), 4: range(1, 4)}
-CASES = [(dim, degree) for dim, degrees in DEGREES.items() for degree in degrees]
-SECOND = [case for case in CASES if case[1] >= 2]
+CASES = [(1, 2), (1, 5), (2, 2), (2, 3), (2, 6), (3, 2), (3, 4), (4, 3)]
 RULES = {"least_squares": least_squares_weights, "polyharmonic": polyharmonic_weights}
 
 
@@ -46,6 +50,13 @@ def polynomial(dim, degree):
     return value
 
 
+def refused(weights):
+    """Whether rank is missing, and acceptance sees it without a test of its own: by the moments, or by growth."""
+    growth = weights.radius**2 * weights.laplacian.abs().sum(1)
+    missed = ~((weights.residual <= MAX_RESIDUAL) & (growth < 1e3))
+    return bool((missed & ~(weights.condition < 1e10)).all())
+
+
 def applied(weights, f, coords):
     """Σ_j w_j f(y_j), the centre first."""
     nodes = torch.cat([torch.zeros_like(coords[:, :1]), coords], dim=1)
@@ -53,7 +64,7 @@ def applied(weights, f, coords):
 
 
 @pytest.mark.parametrize("rule", RULES)
-@pytest.mark.parametrize(("dim", "degree"), SECOND)
+@pytest.mark.parametrize(("dim", "degree"), CASES)
 def test_derivatives_of_polynomials_are_exact(dim, degree, rule):
     """Δ, gradient and Hessian at the centre of a random polynomial of degree m, to rounding."""
     coords, f = cloud(dim, degree), polynomial(dim, degree)
@@ -65,8 +76,8 @@ def test_derivatives_of_polynomials_are_exact(dim, degree, rule):
     close(applied(weights.laplacian, f, coords), second.trace().expand(3), scale)
     close(applied(weights.gradient, f, coords), slope.expand(3, dim), scale)
     close(applied(weights.hessian, f, coords), second[a, b].expand(3, -1), scale)
-    assert (weights.deficit == 0).all()
-    # On clustered random nodes splines have weights of 1e4 and more, and their rounding; the ladder refuses those.
+    assert (weights.condition < 1e10).all()
+    # On clustered random nodes splines have weights of 1e4 and more, and their rounding; those are never accepted.
     assert weights.residual.max() < (1e-9 if rule == "polyharmonic" else 1e-11)
 
 
@@ -123,7 +134,7 @@ def test_five_points_of_a_square_lattice():
 def test_a_cross_without_corners_is_reported():
     """y₁y₂ vanishes on all its eight points."""
     unit = torch.tensor([[1.0, 0], [-1, 0], [0, 1], [0, -1]], dtype=torch.float64)
-    assert least_squares_weights(torch.cat([unit, 2 * unit])[None], 2).deficit.item() == 1
+    assert refused(least_squares_weights(torch.cat([unit, 2 * unit])[None], 2))
 
 
 @pytest.mark.parametrize("rule", WEIGHT_RULES)
@@ -138,7 +149,6 @@ def test_scaling(scale, rule):
         a, b = getattr(one, name), getattr(other, name) * scale**power
         assert (a - b).abs().max() <= tolerance * a.abs().max()
     close(other.condition, one.condition, one.condition)
-    assert torch.equal(other.deficit, one.deficit)
 
 
 @pytest.mark.parametrize("rule", RULES)
@@ -204,7 +214,7 @@ def test_positive_weights_are_positive_and_consistent(dim, degree):
     """w_j ≥ 0 for j ≠ i wherever a positive stencil is found, with all moments of degree ≤ m."""
     coords = cloud(dim, degree, batch=40, factor=6)
     weights = positive_weights(coords, degree)
-    good = weights.residual <= 1e-10
+    good = weights.residual <= MAX_RESIDUAL
     assert good.double().mean() > 0.9
     w, others = weights.laplacian[good], weights.laplacian[good, 1:]
     assert (others >= -1e-12 * others.abs().amax(1, keepdim=True)).all()
@@ -215,12 +225,12 @@ def test_positive_weights_are_positive_and_consistent(dim, degree):
 
 
 def test_positive_weights_give_up_where_there_are_none():
-    """All neighbours on one side: no positive weights have Σ w y = 0, and the residual or the deficit says so."""
+    """All neighbours on one side: no positive weights have Σ w y = 0, and the residual says so."""
     coords = cloud(2, 2, factor=6)
     coords[..., 0] = coords[..., 0].abs() + 0.05
     weights = positive_weights(coords, 2)
     negative = (weights.laplacian[:, 1:] < -1e-10 * weights.laplacian.abs().amax()).any(1)
-    assert (negative | (weights.residual > 1e-10) | (weights.deficit > 0)).all()
+    assert (negative | (weights.residual > MAX_RESIDUAL)).all()
 
 
 @pytest.mark.parametrize("rule", RULES)
@@ -228,7 +238,7 @@ def test_collinear_neighbours_are_reported(rule):
     """Points of a line do not determine y₂: the rank falls short and nothing is raised."""
     t = torch.linspace(-1, 1, 24, dtype=torch.float64)
     coords = torch.stack([t, 2 * t], dim=1)[None]
-    assert RULES[rule](coords, 2).deficit.item() > 0
+    assert refused(RULES[rule](coords, 2))
 
 
 def test_neighbours_on_a_circle():
@@ -237,23 +247,23 @@ def test_neighbours_on_a_circle():
     coords = 0.1 * torch.stack([angle.cos(), angle.sin()], 1)[None]
     expected = torch.full((12,), 1 / 3, dtype=torch.float64)
     close(least_squares_weights(coords, 2).laplacian[0, 1:] * 0.01, expected)
-    assert least_squares_weights(coords, 3).deficit.item() == 2
+    assert refused(least_squares_weights(coords, 3))
 
 
 @pytest.mark.parametrize("rule", WEIGHT_RULES)
-def test_misfit_is_what_polynomials_leave_of_the_heights(rule):
+def test_residual_of_heights_is_what_polynomials_leave_of_the_heights(rule):
     """Zero for heights of degree ≤ m; for noise of deviation σ about σ over the distances; of no unit."""
     degree, sigma = 2, 1e-3
     coords = cloud(2, degree, batch=100, factor=4)
     smooth = torch.stack([coords[..., 0] * coords[..., 1], coords.square().sum(-1)], -1)
     noise = sigma * torch.randn_like(smooth)
-    assert (WEIGHT_RULES[rule](coords, degree, heights=smooth).misfit <= 1e-12).all()
-    found = WEIGHT_RULES[rule](coords, degree, heights=smooth + noise).misfit
+    assert (WEIGHT_RULES[rule](coords, degree, heights=smooth).height_residual <= 1e-12).all()
+    found = WEIGHT_RULES[rule](coords, degree, heights=smooth + noise).height_residual
     assert (found > sigma).all()  # the distances are below 1
     assert (found < 10 * sigma).all()
-    scaled = WEIGHT_RULES[rule](7 * coords, degree, heights=7 * (smooth + noise)).misfit
+    scaled = WEIGHT_RULES[rule](7 * coords, degree, heights=7 * (smooth + noise)).height_residual
     torch.testing.assert_close(scaled, found)
-    assert (WEIGHT_RULES[rule](coords, degree).misfit == 0).all()
+    assert (WEIGHT_RULES[rule](coords, degree).height_residual == 0).all()
 
 
 def test_left_out_neighbours_have_no_weight():
@@ -291,6 +301,24 @@ def test_flux_data_stand_in_for_moments(degree):
         close(applied(weights.laplacian, even, coords), exact.expand(3), scale)
 
 
+def test_data_of_a_robin_condition_stand_in_for_moments():
+    """f = x² + x + 1/a has ∂_ν f + a f = 0 on x = 0 with ν = −e_x, and Δf = 2 from values alone; Σ w is not zero."""
+    a = 1.5
+    coords = cloud(2, 3)
+    coords[..., 0] = coords[..., 0].abs()
+    coords[:, :6, 0] = 0
+    flux = torch.zeros(3, coords.shape[1] + 1, 2, dtype=torch.float64)
+    flux[:, :7, 0] = -1
+    weights = least_squares_weights(coords, 3, flux=flux, share=a)
+
+    def f(y):
+        return y[..., 0] ** 2 + y[..., 0] + 1 / a
+
+    scale = weights.laplacian.abs().sum(1).max()
+    close(applied(weights.laplacian, f, coords), torch.full((3,), 2.0).double(), scale)
+    assert (weights.laplacian.sum(1).abs() > 1e-3 * scale).all()
+
+
 def test_condition_is_that_of_the_column_scaled_system():
     coords = cloud(2, 3, batch=1)
     weights = least_squares_weights(coords, 3)
@@ -300,15 +328,27 @@ def test_condition_is_that_of_the_column_scaled_system():
     close(weights.condition[0], expected, expected)
 
 
-def test_typical_growth_is_what_many_even_neighbours_give():
-    """ρ² Σ|w| over rings of a lattice of 700 points is near it; a lattice is scaled by its own radius."""
-    coords = grid(16)
-    coords = coords[:, coords[0].norm(dim=1) < 15]
+def test_reference_is_what_even_neighbours_give():
+    """ρ² Σ|w| and Σ|w_j|/|w_i| over many points of a Sobol sequence in the ball are within 10 % of the lattice's."""
+    cube = 2 * torch.quasirandom.SobolEngine(2).draw(4096).double() - 1
+    ball = cube[cube.norm(dim=1) <= 1][1:]
     for degree in (2, 4, 6):
-        weights = least_squares_weights(coords, degree)
-        growth = weights.radius**2 * weights.laplacian.abs().sum(1)
-        assert abs(growth.item() / typical_growth(2, degree) - 1) < 0.1
-    assert typical_growth(1, 2) < typical_growth(2, 2) < typical_growth(3, 2)
+        weights = least_squares_weights(ball[None, : 20 * num_monomials(2, degree)], degree)
+        center, others = weights.laplacian[0, 0].abs(), weights.laplacian[0, 1:].abs().sum()
+        growth, ratio = reference(2, degree)
+        assert abs(weights.radius.item() ** 2 * (center + others) / growth - 1) < 0.1
+        assert abs(others / center / ratio - 1) < 0.1
+
+
+def test_reference_of_splines_and_of_one_sided_stencils_is_larger():
+    """Splines grow about fourfold; with Neumann data 1, 3, 7 and 13 times at degrees 2, 4, 6, 8; more with d."""
+    inside = [reference(2, m).growth for m in (2, 4, 6, 8)]
+    edge = [reference(2, m, one_sided=True).growth for m in (2, 4, 6, 8)]
+    splines = [reference(2, m, "polyharmonic").growth for m in (2, 4, 6)]
+    assert [round(e / g) for e, g in zip(edge, inside, strict=True)] == [1, 3, 7, 13]
+    assert all(3.5 < s / g < 4.7 for s, g in zip(splines, inside, strict=False))
+    assert reference(2, 2, "positive") == reference(2, 2)
+    assert reference(1, 2).growth < reference(2, 2).growth < reference(3, 2).growth
 
 
 def test_weights_can_be_picked_and_stacked():

@@ -1,4 +1,4 @@
-"""Weights of polyharmonic splines with polynomials (`method.md`, section 2)."""
+"""Weights of polyharmonic splines (PHS) with polynomials (`method.md`, section 2)."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from torchlb.fits.weights import (
     Weights,
     _finish,
     _functionals,
-    _misfit,
+    _height_residual,
     _scaled_system,
 )
 
@@ -56,8 +56,10 @@ def polyharmonic_weights(
     weights = torch.linalg.lu_solve(factors, pivots, right)[:, :num_points]
     moments = values.mT @ weights[:, 1:]
     residual = (moments - functionals).abs().amax((1, 2)) / functionals.abs().max()
-    misfit = torch.zeros_like(radius) if heights is None else _misfit(q, root, coords, heights)
-    return _finish(weights, residual, radius, torch.linalg.svdvals(r), misfit, dim)
+    left = (
+        torch.zeros_like(radius) if heights is None else _height_residual(q, root, coords, heights)
+    )
+    return _finish(weights, residual, radius, torch.linalg.svdvals(r), left, dim)
 
 
 def _kernel_derivatives(

@@ -22,7 +22,6 @@ __all__ = [
     "exponents",
     "gradient_functional",
     "hessian_functional",
-    "laplacian_functional",
     "monomial_derivatives",
     "monomials",
     "num_monomials",
@@ -119,15 +118,3 @@ def hessian_functional(dim: int, degree: int) -> Float[Tensor, "M pairs"]:
         (alpha == unit[a] + unit[b]).all(-1).double() * (2.0 if a == b else 1.0) for a, b in pairs
     ]
     return torch.stack(columns, dim=-1)
-
-
-def laplacian_functional(dim: int, degree: int) -> Float[Tensor, "M 1"]:
-    """Δ y^α (0): 2 where α = 2 e_c, the corrected second moment of `method.md`, section 1.
-
-    >>> laplacian_functional(2, 2).T.tolist()
-    [[0.0, 0.0, 2.0, 0.0, 2.0]]
-    """
-    hessian = hessian_functional(dim, degree)
-    pairs = [(a, b) for a in range(dim) for b in range(a, dim)]
-    diagonal = [index for index, (a, b) in enumerate(pairs) if a == b]
-    return hessian[:, diagonal].sum(-1, keepdim=True)

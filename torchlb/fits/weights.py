@@ -9,7 +9,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from torchlb.fits.polynomials import (
@@ -19,9 +19,10 @@ from torchlb.fits.polynomials import (
     monomials,
 )
 
-__all__ = ["Weights", "least_squares_weights", "positive_weights", "window"]
+__all__ = ["MAX_RESIDUAL", "Weights", "least_squares_weights", "positive_weights", "window"]
 
-RANK_TOLERANCE = 1e-10
+MAX_RESIDUAL = 1e-10
+"""Moment equations are met if nothing larger is left; what a system without full rank leaves is."""
 
 
 @dataclass(frozen=True)
@@ -32,20 +33,20 @@ class Weights:
     ----------
     gradient : (B, K, d), 1/ℓ. Entry 0 along K is the centre, as below.
     hessian : (B, K, pairs), 1/ℓ²: ∂_a∂_b for a ≤ b; no columns below degree 2.
+    laplacian : (B, K), 1/ℓ²: Δ = Σ_c ∂_c²; zero below degree 2.
     radius : (B,), ℓ: distance ρ of the farthest neighbour in local coordinates.
-    condition : (B,): 2-norm condition of the column-scaled √ω V.
-    deficit : (B,): M − 1 less its numerical rank; 0 for a poised stencil.
+    condition : (B,): 2-norm condition of the column-scaled √ω V; above 1e10 without full rank.
     residual : (B,): largest violation of the moment equations, in units of the largest right-hand side.
-    misfit : (B,): what a polynomial leaves of the heights, in units of the distances; 0 where no heights were given.
+    height_residual : (B,): what a polynomial leaves of the heights over the distances; 0 where no heights were given.
     """
 
     gradient: Float[Tensor, "B K d"]
     hessian: Float[Tensor, "B K pairs"]
+    laplacian: Float[Tensor, "B K"]
     radius: Float[Tensor, " B"]
     condition: Float[Tensor, " B"]
-    deficit: Int[Tensor, " B"]
     residual: Float[Tensor, " B"]
-    misfit: Float[Tensor, " B"]
+    height_residual: Float[Tensor, " B"]
 
     def __getitem__(self, rows: Tensor) -> Weights:
         """The given stencils."""
@@ -55,13 +56,6 @@ class Weights:
     def stack(parts: Sequence[Weights]) -> Weights:
         """Batches of stencils of one size, one after the other."""
         return Weights(*(torch.cat([getattr(p, f.name) for p in parts]) for f in fields(Weights)))
-
-    @property
-    def laplacian(self) -> Float[Tensor, "B K"]:
-        """Weights of Δ = Σ_c ∂_c², 1/ℓ²."""
-        dim = self.gradient.shape[-1]
-        pairs = [a == b for a in range(dim) for b in range(a, dim)]
-        return self.hessian[..., pairs].sum(-1)
 
 
 def window(radius: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
@@ -86,24 +80,25 @@ def _finish(
     residual: Float[Tensor, " B"],
     radius: Float[Tensor, " B"],
     singular_values: Float[Tensor, "B M"],
-    misfit: Float[Tensor, " B"],
+    height_residual: Float[Tensor, " B"],
     dim: int,
 ) -> Weights:
     """Return from scaled coordinates to units of length."""
-    largest = singular_values[:, :1]
     rho = radius[:, None, None]
+    hessian = weights[..., dim:] / rho.square()
+    pure = [a == b for a in range(dim) for b in range(a, dim)][: hessian.shape[-1]]
     return Weights(
         gradient=weights[..., :dim] / rho,
-        hessian=weights[..., dim:] / rho.square(),
+        hessian=hessian,
+        laplacian=hessian[..., pure].sum(-1),
         radius=radius,
         condition=singular_values[:, 0] / singular_values[:, -1],
-        deficit=(singular_values <= RANK_TOLERANCE * largest).sum(1),
         residual=residual,
-        misfit=misfit,
+        height_residual=height_residual,
     )
 
 
-def _misfit(
+def _height_residual(
     basis: Float[Tensor, "B neighbors M"],
     root: Float[Tensor, "B neighbors"],
     coords: Float[Tensor, "B neighbors d"],
@@ -137,6 +132,7 @@ def least_squares_weights(
     degree: int,
     keep: Bool[Tensor, "B neighbors"] | None = None,
     flux: Float[Tensor, "B K d"] | None = None,
+    share: float = 0.0,
     heights: Float[Tensor, "B neighbors n"] | None = None,
 ) -> Weights:
     r"""Centre-constrained moving least squares.
@@ -148,18 +144,20 @@ def least_squares_weights(
               w_i = -\sum_{j \ne i} w_j .
 
     The polynomial passes through the centre's value; that is what makes the operator stable (`method.md`, section 2).
-    Solved by QR of √ω V in coordinates scaled by ρ: w = √ω Q R⁻ᵀ b. A stencil without full
-    rank comes out with a positive `deficit` and unusable weights; nothing is raised.
+    Solved by QR of √ω V in coordinates scaled by ρ: w = √ω Q R⁻ᵀ b. A stencil without full rank comes out with a
+    large `condition` and unusable weights; nothing is raised.
 
     Parameters
     ----------
     coords : (B, K − 1, d), ℓ: the neighbours without the centre, K − 1 ≥ M − 1.
     degree : m ≥ 1. Second derivatives come with m ≥ 2.
     keep : (B, K − 1), neighbours that may have a weight; all by default.
-    flux : (B, K, d), the conormal at each point of the stencil that lies on a Neumann boundary (centre first), zero at
-        the others. Adds an unknown v_b for the datum ∂_ν f(x_b) = 0: minimise Σ w²/ω + Σ v²/ω subject to
-        Σ w_j y_j^α + Σ v_b ∂_ν y^α(y_b) = (D y^α)(0) (`method.md`, section 6). Only w is returned.
-    heights : (B, K − 1, n), ℓ, of the neighbours over the tangent plane, for the `misfit`; not together with `flux`.
+    flux : (B, K, d), the conormal at each point of the stencil that lies on a boundary with the datum ∂_ν f + a f = 0
+        (centre first), zero at the others. Each adds an unknown v_b: minimise Σ w²/ω + Σ v²/ω subject to
+        Σ w_j y_j^α + Σ v_b (∂_ν + a) y^α(y_b) = (D y^α)(0), and w_i = −Σ w_j − a Σ v_b (`method.md`, section 6). Only
+        w is returned.
+    share : a, 1/ℓ.
+    heights : (B, K − 1, n), ℓ, of the neighbours over the tangent plane; not together with `flux`.
 
     >>> line = torch.tensor([[[-1.0], [1.0]]], dtype=torch.float64)
     >>> least_squares_weights(line, 2).laplacian.round(decimals=12).tolist()
@@ -168,8 +166,9 @@ def least_squares_weights(
     radius, scaled, values, root = _scaled_system(coords, degree)
     if keep is not None:
         root = root * keep
+    constant = torch.ones_like(root)
     if flux is not None:
-        values, root = _with_fluxes(scaled, values, root, flux, degree)
+        values, constant, root = _with_data(scaled, values, root, flux, share * radius, degree)
     functionals = _functionals(coords.shape[-1], degree).to(coords)
     system = root[..., None] * values
     scale = system.norm(dim=1).clamp_min(torch.finfo(coords.dtype).tiny)
@@ -177,49 +176,59 @@ def least_squares_weights(
     right = functionals / scale[..., None]
     solution = root[..., None] * (q @ torch.linalg.solve_triangular(r.mT, right, upper=False))
     residual = (values.mT @ solution - functionals).abs().amax((1, 2)) / functionals.abs().max()
-    neighbors = solution[:, : coords.shape[1]]
-    weights = torch.cat([-neighbors.sum(1, keepdim=True), neighbors], dim=1)
-    misfit = torch.zeros_like(radius) if heights is None else _misfit(q, root, coords, heights)
-    return _finish(weights, residual, radius, torch.linalg.svdvals(r), misfit, coords.shape[-1])
+    center = -(constant[..., None] * solution).sum(1, keepdim=True)
+    weights = torch.cat([center, solution[:, : coords.shape[1]]], dim=1)
+    left = (
+        torch.zeros_like(radius) if heights is None else _height_residual(q, root, coords, heights)
+    )
+    return _finish(weights, residual, radius, torch.linalg.svdvals(r), left, coords.shape[-1])
 
 
-def _with_fluxes(
+def _with_data(
     scaled: Float[Tensor, "B neighbors d"],
     values: Float[Tensor, "B neighbors M"],
     root: Float[Tensor, "B neighbors"],
     flux: Float[Tensor, "B K d"],
+    share: Float[Tensor, " B"],
     degree: int,
-) -> tuple[Tensor, Tensor]:
-    """The system with a further row ∂_ν y^α (and its √ω) for every point of the stencil; ω = 0 off the boundary."""
+) -> tuple[Tensor, Tensor, Tensor]:
+    """The system with a further row (∂_ν + a) y^α for every point of the stencil; what the rows make of 1; and √ω.
+
+    ω = 0 off the boundary; `share` is aρ, since coordinates are over ρ.
+    """
     nodes = torch.cat([torch.zeros_like(scaled[:, :1]), scaled], dim=1)
-    slopes = (monomial_derivatives(nodes, degree) * flux[:, :, None]).sum(-1)
     on_boundary = flux.square().sum(-1) > 0
+    share = share[:, None] * on_boundary
+    data = (monomial_derivatives(nodes, degree) * flux[:, :, None]).sum(-1)
+    data = data + share[..., None] * monomials(nodes, degree)
     weight = torch.cat([torch.ones_like(root[:, :1]), root], dim=1) * on_boundary
-    return torch.cat([values, slopes], dim=1), torch.cat([root, weight], dim=1)
+    constant = torch.cat([torch.ones_like(root), share], dim=1)
+    return torch.cat([values, data], dim=1), constant, torch.cat([root, weight], dim=1)
 
 
 def positive_weights(
     coords: Float[Tensor, "B neighbors d"],
     degree: int,
     flux: Float[Tensor, "B K d"] | None = None,
+    share: float = 0.0,
     heights: Float[Tensor, "B neighbors n"] | None = None,
 ) -> Weights:
     """Least squares over as many neighbours as can have weights Δ ≥ 0: a row of an M-matrix, and consistent.
 
     Neighbours with a negative weight are left out and the rest solved again until none is negative or the rank is
     lost. This finds a positive stencil nearly wherever one exists (non-negative least squares finds 0–3 % more).
-    Positive weights exist up to degree 3 only, since Σ w |y|⁴ = 0 excludes them beyond (`method.md`, section 10). The
-    misfit is that of all neighbours.
+    Positive weights exist up to degree 3 only, since Σ w |y|⁴ = 0 excludes them beyond. The residual of the heights is
+    that of all neighbours.
     """
     keep = torch.ones(coords.shape[:2], dtype=torch.bool)
-    weights = least_squares_weights(coords, degree, flux=flux, heights=heights)
-    misfit = weights.misfit
+    weights = least_squares_weights(coords, degree, None, flux, share, heights)
+    first = weights.height_residual
     for _ in range(coords.shape[1]):
         others = weights.laplacian[:, 1:]
         rounding = 1e-12 * others.abs().amax(1, keepdim=True)
-        negative = keep & (others < -rounding) & (weights.residual <= 1e-10)[:, None]
+        negative = keep & (others < -rounding) & (weights.residual <= MAX_RESIDUAL)[:, None]
         if not negative.any():
             break
         keep &= ~negative
-        weights = least_squares_weights(coords, degree, keep, flux)
-    return replace(weights, misfit=misfit)
+        weights = least_squares_weights(coords, degree, keep, flux, share)
+    return replace(weights, height_residual=first)

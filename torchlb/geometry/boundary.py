@@ -74,8 +74,8 @@ def boundary_of_mesh(
         number = torch.cumsum(mask, 0) - 1
         local, own = number[sides], vertices[members]
         graph = mesh_graph(local, len(members))
-        poor = mesh_frames(own, local)
-        tangents = _refined_tangents(own, poor, GraphBalls(own, graph, poor), degree)
+        balls = GraphBalls(own, graph, mesh_frames(own, local))
+        tangents = _refined_tangents(balls, degree)
     return _with_conormals(vertices, frames, mask, tangents)
 
 
@@ -93,9 +93,9 @@ def boundary_of_cloud(
     tangents = frames.new_zeros(len(members), points.shape[1], 0)
     if dim > 0:
         candidates = nearest_neighbors(own, min(8 * dim, len(own)))
-        poor = cloud_frames(own, candidates, dim)
-        balls = GraphBalls(own, nearest_graph(own, poor, candidates), poor)
-        tangents = _refined_tangents(own, poor, balls, degree)
+        initial = cloud_frames(own, candidates, dim)
+        balls = GraphBalls(own, nearest_graph(own, initial, candidates), initial)
+        tangents = _refined_tangents(balls, degree)
     return _with_conormals(points, frames, mask, tangents)
 
 
@@ -116,9 +116,9 @@ def detect_boundary(
     return torch.cat(masks)
 
 
-def _refined_tangents(own: Tensor, poor: Tensor, balls: GraphBalls, degree: int) -> Tensor:
-    rungs = list_candidates(poor.shape[-1], range(degree, 0, -1))
-    return refine_frames(own, poor, balls, torch.arange(len(own)), rungs)[0]
+def _refined_tangents(balls: GraphBalls, degree: int) -> Tensor:
+    candidates = list_candidates(balls.frames.shape[-1], range(degree, 0, -1))
+    return refine_frames(balls, torch.arange(len(balls.points)), candidates)[0]
 
 
 def _with_conormals(

@@ -1,44 +1,40 @@
-"""The ladder of candidate neighbourhoods of a point, best first, and the walk down it (`method.md`, section 4)."""
+"""Candidate neighbourhoods of a point, best first, and the search through them (`method.md`, section 4)."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from math import ceil
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import torch
 from jaxtyping import Int
 from torch import Tensor
 
 from torchlb.fits.polynomials import num_monomials
+from torchlb.fits.rules import SIZE_FACTORS
 from torchlb.geometry.neighbors import GraphBalls
 
-__all__ = ["CHUNK_BYTES", "SIZE_FACTORS", "Candidate", "chunks", "list_candidates", "walk_ladder"]
-
-SIZE_FACTORS = {
-    "least_squares": (1.6, 2.0, 2.5, 3.0, 4.0, 5.0, 7.0, 10.0),
-    "polyharmonic": (2.0, 2.5, 3.0),
-    "positive": (1.6, 2.5, 4.0, 7.0, 10.0),
-}
-"""Points of a stencil per polynomial, by the rule for its weights, in the order in which they are tried."""
+__all__ = ["CHUNK_BYTES", "Candidate", "Search", "chunks", "list_candidates", "stencil_candidates"]
 
 CHUNK_BYTES = 2**28
 """Bound on one array of a chunk of points: about four of them live at once."""
 
 
 class Candidate(NamedTuple):
-    """A candidate neighbourhood and what to do with it.
+    """A neighbourhood and what to do with it.
 
     Attributes
     ----------
     degree : of the polynomials.
     size : number of points K, the centre included.
     rule : for the weights, a key of `WEIGHT_RULES`.
+    factor : points per polynomial that the search has come to; 0 where the user has fixed the size.
     """
 
     degree: int
     size: int
     rule: str
+    factor: float = 0.0
 
 
 def list_candidates(
@@ -49,58 +45,99 @@ def list_candidates(
 ) -> list[Candidate]:
     """Candidates, best first: for each degree every rule, for each rule every size. `num_neighbors` fixes the size.
 
-    >>> [rung.size for rung in list_candidates(2, [2])]
+    >>> [candidate.size for candidate in list_candidates(2, [2])]
     [10, 12, 15, 18, 24, 30, 42, 60]
     >>> list_candidates(2, [3, 2], num_neighbors=20)[1]
-    Candidate(degree=2, size=20, rule='least_squares')
+    Candidate(degree=2, size=20, rule='least_squares', factor=0.0)
     """
-    rungs = []
+    found = []
     for degree in degrees:
         count = num_monomials(dim, degree)
         for rule in rules:
-            sizes = [ceil(factor * count - 1e-9) for factor in SIZE_FACTORS[rule]]
-            fixed = sizes if num_neighbors is None else [num_neighbors]
-            rungs += [Candidate(degree, size, rule) for size in fixed]
-    return rungs
+            if num_neighbors is not None:
+                found.append(Candidate(degree, num_neighbors, rule))
+                continue
+            sizes = [(ceil(factor * count - 1e-9), factor) for factor in SIZE_FACTORS[rule]]
+            found += [Candidate(degree, size, rule, factor) for size, factor in sizes]
+    return found
 
 
-def chunks(num_points: int, rungs: Sequence[Candidate], dim: int) -> tuple[Int[Tensor, " B"], ...]:
+def stencil_candidates(
+    dim: int, order: int, weights: str, num_neighbors: int | None, on_mesh: bool
+) -> list[Candidate]:
+    """The candidates for a row of order p: degree p + 1, then the even degrees below; then positive weights of order 1.
+
+    Rows of an even order are no better on evenly spread points than those of the odd order below, and rows of order 1
+    no better on a mesh than its triangles: there they are tried only if asked for. Least squares follow splines.
+
+    >>> [c.degree for c in stencil_candidates(2, 5, "least_squares", 60, on_mesh=False)]
+    [6, 4, 2, 2]
+    """
+    rules = list(dict.fromkeys([weights, "least_squares"]))
+    lowest = 4 if on_mesh else 2
+    degrees = [order + 1, *range(order // 2 * 2, lowest - 1, -2)]
+    positive = [2] if order == 1 or not on_mesh else []
+    return [
+        *list_candidates(dim, degrees, rules, num_neighbors),
+        *list_candidates(dim, positive, ["positive"], num_neighbors),
+    ]
+
+
+def chunks(
+    num_points: int, candidates: Sequence[Candidate], dim: int
+) -> tuple[Int[Tensor, " B"], ...]:
     """Consecutive centres, so many at a time that one (B, K, M) array stays below `CHUNK_BYTES`."""
-    size = max(rung.size for rung in rungs)
-    columns = num_monomials(dim, rungs[0].degree)
+    size = max(candidate.size for candidate in candidates)
+    columns = num_monomials(dim, candidates[0].degree)
     return torch.arange(num_points).split(max(64, CHUNK_BYTES // (8 * size * columns)))
 
 
-def walk_ladder(
-    balls: GraphBalls,
-    centers: Int[Tensor, " B"],
-    rungs: Sequence[Candidate],
-    attempt: Callable[[Tensor, Tensor, Candidate], tuple[Tensor, Any]],
-    start: Int[Tensor, " B"] | None = None,
-) -> Iterator[tuple[int, Tensor, Any]]:
-    """Let every centre take the first rung that passes.
+class Search:
+    """Every centre tries the candidates in turn, until one settles it.
 
-    `attempt(centers, index, rung)` tries the neighbourhoods `index` (b, K) and returns (passed (b,), result), where
-    `result[mask]` selects rows. Yields (rung number, rows of `centers` that took it, their result); rows that never
-    appear passed nowhere. `start` keeps a row off the rungs before its own.
+    Iterating gives (number of the candidate, rows of `centers` that try it, their neighbourhoods (b, K)); who has tried
+    it is settled, or turned away from more than this candidate, before the next.
+
+    Parameters
+    ----------
+    start : first candidate of each row; the very first by default.
     """
-    pending = torch.arange(len(centers))
-    start = torch.zeros_like(pending) if start is None else start
-    held = 0  # size of the balls at hand: small ones first, since most rows take an early rung
-    index = count = torch.empty(0)
-    for number, rung in enumerate(rungs):
-        eligible = start[pending] <= number
-        if not eligible.any():
-            continue
-        if rung.size > held:
-            held = rung.size if held == 0 else max(r.size for r in rungs if r.size <= 2 * rung.size)
-            index, count = balls(centers[pending], held)
-        tried = eligible & (count >= rung.size)
-        if not tried.any():
-            continue
-        passed, result = attempt(centers[pending[tried]], index[tried, : rung.size], rung)
-        if passed.any():
-            yield number, pending[tried][passed], result[passed]
-        left = ~tried
-        left[tried] = ~passed
-        pending, index, count = pending[left], index[left], count[left]
+
+    def __init__(
+        self,
+        balls: GraphBalls,
+        centers: Int[Tensor, " B"],
+        candidates: Sequence[Candidate],
+        start: Int[Tensor, " B"] | None = None,
+    ) -> None:
+        self.balls, self.centers, self.candidates = balls, centers, candidates
+        self._next = torch.zeros_like(centers) if start is None else start.clone()
+
+    def settle(self, rows: Int[Tensor, " b"]) -> None:
+        """These rows are done."""
+        self._next[rows] = len(self.candidates)
+
+    def reject_degree(self, rows: Int[Tensor, " b"], number: int) -> None:
+        """These rows go on with the first candidate of a degree below that of candidate `number`."""
+        degree = self.candidates[number].degree
+        self._next[rows] = sum(other.degree >= degree for other in self.candidates)
+
+    def __iter__(self) -> Iterator[tuple[int, Int[Tensor, " b"], Int[Tensor, "b K"]]]:
+        """Candidates that somebody can try; balls are gathered small at first, since most rows settle early."""
+        pending = torch.arange(len(self.centers))
+        held = 0
+        index = count = torch.empty(0)
+        for number, candidate in enumerate(self.candidates):
+            left = self._next[pending] < len(self.candidates)
+            pending = pending[left]
+            index, count = (index[left], count[left]) if held else (index, count)
+            eligible = self._next[pending] <= number
+            if not eligible.any():
+                continue
+            if candidate.size > held:
+                within = [c.size for c in self.candidates if c.size <= 2 * candidate.size]
+                held = candidate.size if held == 0 else max(within)
+                index, count = self.balls(self.centers[pending], held)
+            tried = eligible & (count >= candidate.size)
+            if tried.any():
+                yield number, pending[tried], index[tried, : candidate.size]

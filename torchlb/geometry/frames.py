@@ -1,6 +1,6 @@
 """Tangent frames, and the way from space to the tangent plane (`method.md`, section 3).
 
-A frame E_i (n × d, orthonormal) is *poor* at first: principal components of the nearest neighbours, or the faces
+A frame E_i (n × d, orthonormal) is *initial* at first: principal components of the nearest neighbours, or the faces
 around a vertex. A fit of degree q to the heights over it gives the slope, and [I; ∇H], orthonormalised, is the frame
 of order q.
 """
@@ -11,8 +11,8 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from torchlb.fits.weights import least_squares_weights, window
-from torchlb.geometry.candidates import Candidate, walk_ladder
+from torchlb.fits.weights import MAX_RESIDUAL, least_squares_weights, window
+from torchlb.geometry.candidates import Candidate, Search
 from torchlb.geometry.neighbors import MIN_ALIGNMENT, GraphBalls, admissible
 
 __all__ = [
@@ -37,7 +37,7 @@ NO_NORMAL = 1e-12
 def cloud_frames(
     points: Float[Tensor, "N n"], candidates: Int[Tensor, "N K"], dim: int, rounds: int = 3
 ) -> Float[Tensor, "N n d"]:
-    """Poor frames of a cloud: principal components of the nearer half of the candidates, decaying with distance.
+    """Initial frames of a cloud: principal components of the nearer half of the candidates, decaying with distance.
 
     Each further round takes the nearest that the frames before found admissible, so that the other side of a thin
     sheet drops out. Error O(h) on a smooth surface.
@@ -70,7 +70,7 @@ def _principal_directions(
 def mesh_frames(
     vertices: Float[Tensor, "N n"], faces: Int[Tensor, "F v"]
 ) -> Float[Tensor, "N n d"]:
-    """Poor frames of a mesh of d-simplices: the plane closest to those of the faces around a vertex.
+    """Initial frames of a mesh of d-simplices: the plane closest to those of the faces around a vertex.
 
     Leading eigenvectors of the projectors onto the faces' planes, averaged by area: the orientation of the faces is
     irrelevant, and so is the codimension. Error O(h) on a smooth surface.
@@ -86,40 +86,36 @@ def mesh_frames(
 
 
 def refine_frames(
-    points: Float[Tensor, "N n"],
-    poor: Float[Tensor, "N n d"],
     balls: GraphBalls,
     centers: Int[Tensor, " B"],
-    rungs: list[Candidate],
+    candidates: list[Candidate],
 ) -> tuple[Float[Tensor, "B n d"], Int[Tensor, " B"]]:
-    """Frames of order q at `centers`, by fits of degree q to the heights over the poor ones.
+    """Frames of order q at `centers`, by fits of degree q to the heights over those of `balls`.
 
-    Each centre takes the first rung whose fit has full rank, bounded weights and a tilt below 60°.
+    Each centre takes the first candidate whose fit has full rank, bounded weights and a tilt below 60°.
 
     Returns
     -------
     frames : (B, n, d).
-    order : (B,), the degree that was reached; 0 where the poor frame stayed.
+    order : (B,), the degree that was reached; 0 where the initial frame stayed.
     """
-
-    def attempt(rows: Tensor, index: Tensor, rung: Candidate) -> tuple[Tensor, Tensor]:
-        frame = poor[rows]
-        offset = points[index[:, 1:]] - points[rows, None]
+    points, frames = balls.points, balls.frames[centers]
+    order = torch.zeros(len(centers), dtype=torch.int64)
+    search = Search(balls, centers, candidates)
+    for number, rows, index in search:
+        frame = frames[rows]
+        offset = points[index[:, 1:]] - points[index[:, :1]]
         coords = offset @ frame
-        weights = least_squares_weights(coords, rung.degree)
+        weights = least_squares_weights(coords, candidates[number].degree)
         heights = offset - coords @ frame.mT
         slope = weights.gradient[:, 1:].mT @ heights  # (b, d, n), in the normal space
         refined, _ = torch.linalg.qr(frame + slope.mT)
         growth = weights.radius * weights.gradient.abs().sum(1).amax(-1)
-        passed = (weights.residual <= 1e-10) & (growth <= MAX_GRADIENT_GROWTH)
+        passed = (weights.residual <= MAX_RESIDUAL) & (growth <= MAX_GRADIENT_GROWTH)
         passed &= _cosine_bound(slope) & refined.isfinite().all(-1).all(-1)
-        return passed, refined
-
-    frames = poor[centers]
-    order = torch.zeros(len(centers), dtype=torch.int64)
-    for number, rows, refined in walk_ladder(balls, centers, rungs, attempt):
-        frames[rows] = refined
-        order[rows] = rungs[number].degree
+        frames[rows[passed]] = refined[passed]
+        order[rows[passed]] = candidates[number].degree
+        search.settle(rows[passed])
     return frames, order
 
 

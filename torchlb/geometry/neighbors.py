@@ -3,7 +3,7 @@
 A plain ball of the nearest points mixes the two sides of a thin sheet, whose tangent planes agree. So a stencil is
 drawn from a *graph ball*: walk the edges of a mesh, or of the graph of each point's few nearest admissible neighbours
 on a cloud, and step only on points that are admissible from the centre. The `size` nearest of what was reached are the
-pool, ordered by distance. A path across a sharp rim is cut at the rim, where the tangent planes turn away.
+pool, ordered by distance. A path across a crease is cut there, where the tangent planes turn away.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ two bounds meet, at 60°."""
 VOID = 1.5
 """A natural neighbour may be this many times farther than the nearest ones; at an open end all else would be."""
 BALL_SURPLUS = 1.5
-"""A graph ball holds this many times the points asked for, so that its round core lies inside the ragged rim."""
+"""A graph ball holds this many times the points asked for, so that its round core lies inside the ragged edge."""
 
 
 def nearest_neighbors(points: Float[Tensor, "N n"], size: int) -> Int[Tensor, "N K"]:

@@ -1,7 +1,7 @@
 """Which way is out: normals made consistent, so that the two sides of a thin shape are told apart.
 
 Across an edge a surface is taken for an arc: the normal at one end is the mirror image of that at the other in the
-plane that bisects the edge. So the sign is carried round a rim, where the normals turn, and straight through a thin
+plane that bisects the edge. So the sign is carried round a crease, where the normals turn, and straight through a thin
 sheet, whose two sides face away from each other.
 """
 

@@ -1,4 +1,4 @@
-"""From input to a finished operator: check, geometry, ladder, certificate."""
+"""From input to a finished operator: check, shape, stencils, certificate."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from torchlb.operator.checks import (
 )
 from torchlb.stability.certificate import Certificate
 from torchlb.stability.enforce import certify
-from torchlb.stencils.assemble import Ladder, build_stencil
+from torchlb.stencils.assemble import Stencils, assemble
 from torchlb.stencils.conditions import CONDITIONS
 from torchlb.stencils.rows import Rows, matrix_rows
 from torchlb.stencils.shape import Shape, cloud_shape, mesh_shape
@@ -155,22 +155,22 @@ def build_cotangent(vertices: Any, faces: Any) -> Built:
 
 
 def _finished(geometry: Shape, kind: str, options: Options, progress: bool) -> Built:
-    """Rows from the ladder, certified if asked for."""
-    ladder = Ladder(
+    """Rows of the shape, certified if asked for."""
+    stencils = Stencils(
         geometry,
         options.order,
         projection=options.projection,
         weights=options.weights,
         num_neighbors=options.num_neighbors,
     )
-    rows = build_stencil(ladder, progress=progress)
+    rows = assemble(stencils, progress=progress)
     if not options.certify:
         return Built(rows, geometry, kind, asdict(options), None)
     rows, mass, certificate = certify(
         rows,
         geometry.areas,
-        ladder.rows,
-        len(ladder.candidates),
+        stencils.rows,
+        len(stencils.candidates),
         outflow=not geometry.condition.conserves,
         progress=progress,
     )

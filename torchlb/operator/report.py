@@ -8,7 +8,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from torchlb.fits.rules import typical_growth
+from torchlb.fits.rules import reference
 from torchlb.stencils.rows import Reason, Rows
 
 __all__ = ["StencilReport"]
@@ -22,11 +22,11 @@ class StencilReport:
     ----------
     requested_order : p asked for.
     dim : d of the manifold.
-    order : (N,), order of accuracy reached; 0 for a fallback row.
+    order : (N,), order of accuracy reached; 0 for a low-order row.
     normal_order : (N,), degree q behind the tangent frame; 0 where it stayed poor.
     num_neighbors : (N,), points of the stencil, itself included.
     growth : (N,), ρ² Σ|w|: the factor of the a-priori error bound.
-    condition : (N,), of the scaled weighted Vandermonde matrix; NaN in a fallback row.
+    condition : (N,), of the scaled weighted Vandermonde matrix; NaN in a low-order row.
     off_diagonal_ratio : (N,), Σ_{j≠i}|w_ij| / |w_ii|; 1 for an M-matrix row.
     rule : (N,), place of the rule for the weights in `WEIGHT_RULES`; their number for a low-order row.
     reason : (N,), why the row is below the requested order, a `Reason`.
@@ -89,6 +89,6 @@ class StencilReport:
                 values = getattr(self, name)[stencil].double().sort().values
                 middle, high = values[len(values) // 2], values[int(0.95 * (len(values) - 1))]
                 lines.append(f"  {name:<22}{middle:12.4g}{high:10.4g}{values[-1]:10.4g}")
-            good = typical_growth(self.dim, self.requested_order + 1)
+            good = reference(self.dim, self.requested_order + 1).growth
             lines.append(f"  (growth of a good stencil of the requested order: {good:.3g})")
         return "\n".join(lines)

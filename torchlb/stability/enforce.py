@@ -210,7 +210,6 @@ def _lowered(
     index = marked.nonzero()[:, 0]
     rebuilt = lower(index, start[index].maximum(rows.candidate[index] + 1))
     reason = torch.where(rebuilt.order < first.order[index], Reason.STABILITY, first.reason[index])
-    kept = rebuilt.hessian[:, : rows.hessian.shape[1]]
     place = torch.arange(len(first.order))
     place[index] = len(place) + torch.arange(len(index))
-    return Rows.stack([rows, replace(rebuilt, reason=reason, hessian=kept)])[place]
+    return Rows.stack([rows, replace(rebuilt, reason=reason)])[place]

@@ -2,58 +2,86 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Int
 from torch import Tensor
 
-from torchlb.fits.weights import Weights
+from torchlb.fits.rules import SIZE_FACTORS, reference
+from torchlb.fits.weights import MAX_RESIDUAL, Weights
+from torchlb.geometry.candidates import Candidate
+from torchlb.stencils.rows import Reason
 
-__all__ = ["first_failure"]
+__all__ = ["Acceptance"]
 
-MAX_DOMINANCE = 3.0
-MAX_GROWTH = 3.0
-MAX_GROWTH_OF_SPLINES = 12.0
-"""Good splines have 2 to 3 times the growth of good least squares, and one-sided ones more."""
-MAX_GROWTH_AT_BOUNDARY = 12.0
-MAX_DOMINANCE_AT_BOUNDARY = 6.0
-"""One-sided stencils have larger weights, and wide ones would be balanced but poor: a lower order is better there."""
-MAX_SIZE_AT_BOUNDARY = 2.5
-"""Points of a stencil per polynomial that holds points of the boundary."""
-MAX_RESIDUAL = 1e-10
-MAX_MISFIT = 0.07
-MAX_MISFIT_ON_MESH = 0.03
-"""Heights that no polynomial of the stencil's degree follows: a crease, an unresolved fold, noise. Triangles know more
-of the surface there than a fit, points alone do not."""
-DEGREE_OF_MISFIT = 4
-"""The bound on a mesh holds up to it; beyond it falls as g∞ rises, as heights do to Δ misfit times growth."""
-WIDE_ON_MESH = 3.0
-MISFIT_OF_WIDE = 1 / 3
-"""Share of the bound for stencils with more points per polynomial than that: uneven points of a surface that is well
-resolved need them, and a fit to folds does not become better over more of them."""
-MISFIT_OF_NORMALS = 0.5
-"""Share of the bound beyond degree 2 by the note's projection, whose errors on the same mesh are larger."""
-HOPELESS = 2.5
-"""The widest stencil of a degree on a cloud is 2.5 times as wide as the first, so noise of the heights can fall by that
-much. A size that the user fixed cannot widen and falls only beyond."""
+FACTOR, FACTOR_AT_BOUNDARY = 3.0, 4.1
+"""Growth may be this many times that of the reference stencil, which at a boundary is the one-sided one. FACTOR also
+bounds the off-diagonal ratio: over that of an M-matrix row, 1, and at a boundary over that of the reference."""
+RESOLVED_ON_MESH = {"tangent": 1.776, "normal": 0.888}
+RESOLVED_ON_CLOUD = 4.14
+"""Heights may leave this much of a fit, over the growth g∞ that turns it into an error of Δ. Triangles know more of a
+surface that its points do not resolve than a fit, points alone do not; along normals errors are larger on a mesh."""
+RESOLVING_DEGREE = 4
+"""Up to it the bound stays the same: what a low degree leaves of the heights is not worth the fall to the next rows."""
+WIDE = 3.0
+"""Points per polynomial from which on, on a mesh, heights may leave the less the more points there are: a fit to folds
+does not become better over more of them, while uneven points of a surface that is well resolved need them."""
+WIDEST_AT_BOUNDARY = 2.5
+"""Points per polynomial: wider stencils with boundary points are balanced but lopsided, and a lower order is better."""
 
 
-def first_failure(
-    weights: Weights,
-    max_growth: Float[Tensor, " B"],
-    max_dominance: Float[Tensor, " B"],
-    max_misfit: float,
-) -> Int[Tensor, " B"]:
-    """Which of the local tests a stencil fails first, as an index into `REASONS`; 0 if none."""
-    laplacian = weights.laplacian
-    center, others = laplacian[:, 0], laplacian[:, 1:].abs().sum(1)
-    failure = torch.zeros(len(center), dtype=torch.int64)
-    for code, passed in (
-        (2, weights.deficit == 0),
-        (3, weights.residual <= MAX_RESIDUAL),  # false for NaN
-        (8, weights.misfit <= max_misfit),
-        (4, center < 0),
-        (5, others <= max_dominance * center.abs()),
-        (6, weights.radius.square() * (others + center.abs()) <= max_growth),
-    ):
-        failure = torch.where((failure == 0) & ~passed, code, failure)
-    return failure
+@dataclass(frozen=True)
+class Acceptance:
+    """The tests for the stencils of a shape.
+
+    Attributes
+    ----------
+    dim : d.
+    on_mesh : whether low-order rows know the surface better than a fit that misses heights.
+    projection : of the coordinates.
+    """
+
+    dim: int
+    on_mesh: bool
+    projection: str
+
+    def judge(
+        self, weights: Weights, candidate: Candidate, touching: Bool[Tensor, " B"]
+    ) -> tuple[Int[Tensor, " B"], Bool[Tensor, " B"]]:
+        """The first test that each stencil fails, as a `Reason`, and whether its whole degree is to be given up.
+
+        `touching` are the stencils that hold boundary points.
+        """
+        inside = reference(self.dim, candidate.degree, candidate.rule)
+        edge = reference(self.dim, candidate.degree, one_sided=True) if touching.any() else inside
+        too_wide = candidate.degree > 2 and candidate.factor > WIDEST_AT_BOUNDARY
+        at_edge = 0.0 if too_wide else FACTOR_AT_BOUNDARY * edge.growth
+        max_growth = torch.where(touching, at_edge, FACTOR * inside.growth)
+        max_ratio = FACTOR * torch.where(touching, edge.off_diagonal_ratio, 1.0)
+        resolved, resolvable = self._resolved(candidate)
+        center, others = weights.laplacian[:, 0], weights.laplacian[:, 1:].abs().sum(1)
+        failure = torch.zeros(len(center), dtype=torch.int64)
+        for reason, passed in (
+            (Reason.MOMENTS, weights.residual <= MAX_RESIDUAL),  # false for NaN
+            (Reason.UNRESOLVED, weights.height_residual <= resolved),
+            (Reason.RATIO, others <= -max_ratio * center),
+            (Reason.GROWTH, weights.radius.square() * (others + center.abs()) <= max_growth),
+        ):
+            failure = torch.where((failure == 0) & ~passed, reason, failure)
+        return failure, weights.height_residual > resolvable
+
+    def _resolved(self, candidate: Candidate) -> tuple[float, float]:
+        """Bounds on the residual of the heights: for this candidate, and for all of its degree.
+
+        On a cloud the noise of the heights may fall by as much as the widest stencil is wider than the first, and a
+        size that the user fixed cannot widen.
+        """
+        growth = max(reference(self.dim, m).growth for m in (candidate.degree, RESOLVING_DEGREE))
+        if self.on_mesh:
+            bound = RESOLVED_ON_MESH[self.projection] / growth
+            return bound * WIDE / max(candidate.factor, WIDE), bound
+        bound = RESOLVED_ON_CLOUD / growth
+        factors = SIZE_FACTORS["least_squares"]
+        widest = bound * (factors[-1] / factors[0]) ** (1 / self.dim)
+        return (bound if candidate.factor else widest), widest

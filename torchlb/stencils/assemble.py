@@ -1,59 +1,43 @@
-"""From points to the rows of a sparse operator: every point takes the first stencil that passes.
+"""From a shape to the rows of a sparse operator: every point takes the first candidate that passes.
 
-The ladder of a point at order p (`method.md`, section 4): least-squares (or polyharmonic) stencils of degree p + 1
+The candidates of a point at order p (`method.md`, section 4): least-squares (or polyharmonic) stencils of degree p + 1
 with K = 1.6, 2, …, 10 times as many points as polynomials; then the same at every odd order below; then positive
-weights of order 1; then the fallback row. On a mesh that is better than order 1, which is tried there only if asked
-for. How far down each point had to step is part of the result and never silent.
+weights of order 1; then the low-order row. On a mesh that is better than order 1, which is tried there only if asked
+for. What each point took, and why no better, is part of the result and never silent.
 """
 
 from __future__ import annotations
 
 from dataclasses import replace
-from math import ceil
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 from tqdm import tqdm
 
 from torchlb.errors import StencilError
-from torchlb.fits.polynomials import num_monomials
-from torchlb.fits.rules import WEIGHT_RULES, typical_growth
-from torchlb.fits.weights import Weights, least_squares_weights, positive_weights
-from torchlb.geometry.candidates import Candidate, chunks, list_candidates, walk_ladder
+from torchlb.fits.rules import WEIGHT_RULES
+from torchlb.fits.weights import MAX_RESIDUAL, Weights, least_squares_weights, positive_weights
+from torchlb.geometry.candidates import Candidate, Search, chunks, stencil_candidates
 from torchlb.geometry.frames import local_heights, local_offsets
-from torchlb.stencils.acceptance import (
-    DEGREE_OF_MISFIT,
-    HOPELESS,
-    MAX_DOMINANCE,
-    MAX_DOMINANCE_AT_BOUNDARY,
-    MAX_GROWTH,
-    MAX_GROWTH_AT_BOUNDARY,
-    MAX_GROWTH_OF_SPLINES,
-    MAX_MISFIT,
-    MAX_MISFIT_ON_MESH,
-    MAX_RESIDUAL,
-    MAX_SIZE_AT_BOUNDARY,
-    MISFIT_OF_NORMALS,
-    MISFIT_OF_WIDE,
-    WIDE_ON_MESH,
-    first_failure,
-)
-from torchlb.stencils.rows import Rows, matrix_rows, stencil_rows
+from torchlb.stencils.acceptance import Acceptance
+from torchlb.stencils.rows import Reason, Rows, matrix_rows, stencil_rows
 from torchlb.stencils.shape import Shape
 
-__all__ = ["Ladder", "build_stencil"]
+__all__ = ["Stencils", "assemble"]
+
+RULES = list(WEIGHT_RULES)
 
 
-class Ladder:
-    """All that decides a row, ready to build any of them, at any rung and below.
+class Stencils:
+    """All that decides a row, ready to build any of them from any candidate on.
 
     Parameters
     ----------
     shape : points, frames, neighbourhoods, boundary and low-order rows.
-    order : p ≥ 1 of the first rungs.
+    order : p ≥ 1 of the first candidates.
     projection, weights : keys of `PROJECTIONS` and `WEIGHT_RULES`.
-    num_neighbors : K of every rung, instead of `SIZE_FACTORS`.
+    num_neighbors : K of every candidate, instead of `SIZE_FACTORS`.
     """
 
     def __init__(
@@ -65,156 +49,124 @@ class Ladder:
         weights: str = "least_squares",
         num_neighbors: int | None = None,
     ) -> None:
-        self.shape, self.points, self.frames = shape, shape.points, shape.frames
-        self.boundary, self.balls, self.on_mesh = shape.boundary, shape.balls, shape.on_mesh
-        self.projection, self.fixed_size = projection, num_neighbors is not None
-        dim = self.frames.shape[-1]
-        rules = [weights] if weights == "least_squares" else [weights, "least_squares"]
-        # Rows of an even order are no better on evenly spread points than those of the odd order below, and rows of
-        # order 1 no better on a mesh than its triangles.
-        lowest = 4 if self.on_mesh else 2
-        degrees = [order + 1, *range(order // 2 * 2, lowest - 1, -2)]
-        self.candidates = list_candidates(dim, degrees, rules, num_neighbors)
-        if order == 1 or not self.on_mesh:
-            self.candidates += list_candidates(dim, [2], ["positive"], num_neighbors)
+        dim, on_mesh = shape.frames.shape[-1], shape.on_mesh
+        self.shape, self.order, self.projection = shape, order, projection
+        self.candidates = stencil_candidates(dim, order, weights, num_neighbors, on_mesh)
+        self.acceptance = Acceptance(dim, on_mesh, projection)
 
     def rows(self, centers: Int[Tensor, " B"], start: Int[Tensor, " B"] | None = None) -> Rows:
-        """Rows of `centers`, each at the first rung (from `start` on) that passes, else the fallback row."""
+        """Rows of `centers`, each of the first candidate (from `start` on) that passes, else the low-order row."""
         blocks, taken = [], []
-        reason = torch.ones(len(centers), dtype=torch.int64)  # until something is tried: too few
-        place = torch.empty(len(self.points), dtype=torch.int64)
-        place[centers] = torch.arange(len(centers))
-        start = torch.zeros_like(centers) if start is None else start.clone()
-        top = self.candidates[0].degree
-        lower = [
-            sum(other.degree >= rung.degree for other in self.candidates)
-            for rung in self.candidates
-        ]
-
-        def attempt(rows: Tensor, index: Tensor, rung: Candidate) -> tuple[Tensor, Rows]:
-            weights = self._weights(rows, index, rung)
-            max_misfit, hopeless = self._misfits(rung)
-            failure = first_failure(weights, *self._limits(index, rung), max_misfit)
-            if rung.degree == top and rung.rule != "positive":
-                reason[place[rows]] = failure
-            unresolved = rows[weights.misfit > hopeless]
-            start[place[unresolved]] = lower[self.candidates.index(rung)]
-            return failure == 0, stencil_rows(index, weights, rung.degree, rung.rule)
-
-        for number, rows, block in walk_ladder(
-            self.balls, centers, self.candidates, attempt, start
-        ):
-            block.candidate[:] = number
-            blocks.append(block)
-            taken.append(rows)
+        reason = torch.full_like(centers, Reason.FEW)  # until something is tried
+        search = Search(self.shape.balls, centers, self.candidates, start)
+        for number, tried, index in search:
+            candidate = self.candidates[number]
+            holds = self._holds_boundary(index)
+            with_data = holds & (self.shape.condition.share is not None)
+            weights = self._weights(centers[tried], index, candidate, with_data)
+            failure, rejected = self.acceptance.judge(weights, candidate, holds)
+            if candidate.degree == self.order + 1 and candidate.rule != "positive":
+                reason[tried] = failure
+            passed = failure == 0
+            search.reject_degree(tried[rejected], number)
+            search.settle(tried[passed])
+            splines = candidate.rule == "polyharmonic"
+            rule = torch.full_like(tried, RULES.index(candidate.rule))
+            rule[with_data & splines] = RULES.index("least_squares")
+            order = candidate.degree - 1
+            blocks.append(stencil_rows(index[passed], weights[passed], number, order, rule[passed]))
+            taken.append(tried[passed])
         left = torch.ones(len(centers), dtype=torch.bool)
         left[torch.cat([*taken, torch.empty(0, dtype=torch.int64)])] = False
         if left.any():
-            blocks.append(self._fallback_rows(centers[left]))
+            blocks.append(self._low_order_rows(centers[left]))
             taken.append(left.nonzero()[:, 0])
         rows = Rows.stack(blocks)[torch.cat(taken).argsort()]
-        if self.boundary is not None:
-            rows = self.shape.condition.finish(self.points, self.boundary, centers, rows)
-        return replace(rows, reason=torch.where(rows.order < top - 1, reason, rows.reason))
+        if self.shape.boundary is not None:
+            rows = self.shape.condition.finish(
+                self.shape.points, self.shape.boundary, centers, rows
+            )
+        return replace(rows, reason=torch.where(rows.order < self.order, reason, rows.reason))
 
-    def _weights(self, centers: Tensor, index: Tensor, rung: Candidate) -> Weights:
-        """Weights of a batch; stencils that hold boundary points use the Neumann data there, if they have some."""
-        touching = torch.zeros(len(centers), dtype=torch.bool)
-        if self.boundary is not None and self.shape.condition.share is not None:
-            touching = self.boundary.mask[index].any(1)
-        parts = []
-        if not touching.all():
-            own, around = centers[~touching], index[~touching]
-            coords = local_offsets(self.points, self.frames, own, around[:, 1:], self.projection)
-            heights = self._heights(own, around, coords)
-            parts.append(WEIGHT_RULES[rung.rule](coords, rung.degree, heights=heights))
-        if touching.any():
-            parts.append(self._neumann_weights(centers[touching], index[touching], rung))
-        order = torch.cat([(~touching).nonzero()[:, 0], touching.nonzero()[:, 0]]).argsort()
-        return Weights.stack(parts)[order]
+    def _holds_boundary(self, index: Int[Tensor, "B K"]) -> Bool[Tensor, " B"]:
+        if self.shape.boundary is None:
+            return torch.zeros(len(index), dtype=torch.bool)
+        return self.shape.boundary.mask[index].any(1)
 
-    def _heights(self, centers: Tensor, index: Tensor, coords: Tensor) -> Float[Tensor, "B K n"]:
-        """What a polynomial must follow: heights over the points of the plane that the coordinates name, on a mesh.
+    def _weights(
+        self, centers: Tensor, index: Tensor, candidate: Candidate, with_data: Bool[Tensor, " B"]
+    ) -> Weights:
+        """Weights of a batch, with the data of the boundary where `with_data` says so."""
+        parts, order = [], []
+        for data, rows in ((False, ~with_data), (True, with_data)):
+            if rows.any():
+                fit = self._weights_with_data if data else self._free_weights
+                parts.append(fit(centers[rows], index[rows], candidate))
+                order.append(rows.nonzero()[:, 0])
+        return Weights.stack(parts)[torch.cat(order).argsort()] if len(parts) > 1 else parts[0]
 
-        So the note's coordinates are tested too, which need normals that folds do not have. On a cloud there is nothing
-        better to fall to: heights straight over the plane.
-        """
-        neighbors = index[:, 1:]
-        if not self.on_mesh and self.projection != "tangent":
-            coords = local_offsets(self.points, self.frames, centers, neighbors, "tangent")
-        return local_heights(self.points, self.frames, centers, neighbors, coords)
+    def _free_weights(self, centers: Tensor, index: Tensor, candidate: Candidate) -> Weights:
+        points, frames = self.shape.points, self.shape.frames
+        coords = local_offsets(points, frames, centers, index[:, 1:], self.projection)
+        heights = self._heights(centers, index, coords)
+        return WEIGHT_RULES[candidate.rule](coords, candidate.degree, heights=heights)
 
-    def _widened(self, rung: Candidate, factor: float) -> bool:
-        """Whether the ladder, not the user, has come to more than `factor` points per polynomial."""
-        size = ceil(factor * num_monomials(self.frames.shape[-1], rung.degree))
-        return rung.size > size and not self.fixed_size
-
-    def _misfits(self, rung: Candidate) -> tuple[float, float]:
-        """Bounds on the misfit: of this rung, and of all rungs of its degree."""
-        if not self.on_mesh:
-            hopeless = MAX_MISFIT * HOPELESS
-            return (hopeless if self.fixed_size else MAX_MISFIT), hopeless
-        dim = self.frames.shape[-1]
-        growth = typical_growth(dim, DEGREE_OF_MISFIT) / typical_growth(dim, rung.degree)
-        straight = rung.degree == 2 or self.projection == "tangent"
-        bound = MAX_MISFIT_ON_MESH * min(1.0, growth) * (1.0 if straight else MISFIT_OF_NORMALS)
-        return bound * (MISFIT_OF_WIDE if self._widened(rung, WIDE_ON_MESH) else 1.0), bound
-
-    def _limits(
-        self, index: Tensor, rung: Candidate
-    ) -> tuple[Float[Tensor, " B"], Float[Tensor, " B"]]:
-        """Bounds on growth and dominance; none passes where points of the boundary make a wide stencil lopsided."""
-        dim = self.frames.shape[-1]
-        largest = MAX_GROWTH_OF_SPLINES if rung.rule == "polyharmonic" else MAX_GROWTH
-        growth = torch.full((len(index),), largest, dtype=self.points.dtype)
-        dominance = torch.full_like(growth, MAX_DOMINANCE)
-        if self.boundary is not None:
-            touching = self.boundary.mask[index].any(1)
-            refused = rung.degree > 2 and self._widened(rung, MAX_SIZE_AT_BOUNDARY)
-            growth[touching] = 0.0 if refused else MAX_GROWTH_AT_BOUNDARY
-            dominance[touching] = MAX_DOMINANCE_AT_BOUNDARY
-        return growth * typical_growth(dim, rung.degree), dominance
-
-    def _neumann_weights(self, centers: Tensor, index: Tensor, rung: Candidate) -> Weights:
-        """Second derivatives that use ∂_ν f = 0; first derivatives that do not, since they serve any f.
+    def _weights_with_data(self, centers: Tensor, index: Tensor, candidate: Candidate) -> Weights:
+        """Δ by a fit that uses the condition; first and second derivatives by one that does not, to serve any f.
 
         By straight projection, where the derivative along a conormal is its component in the plane. Splines have no
         such form; least squares stands in for them.
         """
-        assert self.boundary is not None
-        coords = local_offsets(self.points, self.frames, centers, index[:, 1:], "tangent")
-        flux = self.boundary.conormals[index] @ self.frames[centers]
-        rule = positive_weights if rung.rule == "positive" else least_squares_weights
-        weights = rule(coords, rung.degree, flux=flux)
+        points, frames, degree = self.shape.points, self.shape.frames, candidate.degree
+        boundary, share = self.shape.boundary, self.shape.condition.share
+        assert boundary is not None
+        assert share is not None
+        coords = local_offsets(points, frames, centers, index[:, 1:], "tangent")
+        flux = boundary.conormals[index] @ frames[centers]
+        rule = positive_weights if candidate.rule == "positive" else least_squares_weights
+        weights = rule(coords, degree, flux=flux, share=share)
         heights = self._heights(centers, index, coords)
-        free = least_squares_weights(coords, rung.degree, heights=heights)
+        free = least_squares_weights(coords, degree, heights=heights)
         usable = (free.residual <= MAX_RESIDUAL)[:, None, None]
-        gradient = torch.where(usable, free.gradient, weights.gradient)
-        return replace(weights, gradient=gradient, misfit=free.misfit)
+        return replace(
+            weights,
+            gradient=torch.where(usable, free.gradient, weights.gradient),
+            hessian=torch.where(usable, free.hessian, weights.hessian),
+            height_residual=free.height_residual,
+        )
 
-    def _fallback_rows(self, centers: Int[Tensor, " B"]) -> Rows:
+    def _heights(self, centers: Tensor, index: Tensor, coords: Tensor) -> Float[Tensor, "B K n"]:
+        """What a polynomial must follow: heights over the points of the plane that the coordinates name, on a mesh.
+
+        So coordinates along normals are tested too, which need normals that folds do not have. On a cloud there is
+        nothing better to fall to: heights straight over the plane.
+        """
+        points, frames, neighbors = self.shape.points, self.shape.frames, index[:, 1:]
+        if not self.shape.on_mesh and self.projection != "tangent":
+            coords = local_offsets(points, frames, centers, neighbors, "tangent")
+        return local_heights(points, frames, centers, neighbors, coords)
+
+    def _low_order_rows(self, centers: Int[Tensor, " B"]) -> Rows:
         assert self.shape.low_order is not None
         matrix = self.shape.low_order.rows(centers)
-        rows = matrix_rows(matrix, self.points, self.frames, centers)
-        rows.candidate[:] = len(self.candidates)
+        rows = matrix_rows(matrix, self.shape.points, self.shape.frames, centers)
         bad = centers[~rows.off_diagonal_ratio.isfinite()]
         if len(bad):
             names = ", ".join(map(str, bad[:8].tolist())) + (", …" if len(bad) > 8 else "")
             raise StencilError(
-                f"{len(bad)} points have neither a stencil after {len(self.candidates)} tries nor a fallback row: "
+                f"{len(bad)} points have neither a stencil after {len(self.candidates)} tries nor a low-order row: "
                 f"{names}. Nothing admissible lies around them; remove them, or merge them with their neighbours"
             )
-        return rows
+        return replace(rows, candidate=torch.full_like(centers, len(self.candidates)))
 
 
-def build_stencil(ladder: Ladder, *, hessian: bool = False, progress: bool = True) -> Rows:
-    """Rows of all points, in chunks; the second derivatives are kept only if asked for.
+def assemble(stencils: Stencils, *, progress: bool = True) -> Rows:
+    """Rows of all points, in chunks.
 
-    Memory beyond the result: about 1 GB whatever N (`ladder.CHUNK_BYTES`). The result takes 16 + 8 d bytes an entry.
+    Memory beyond the result: about 1 GB whatever N (`candidates.CHUNK_BYTES`). The result takes 16 + 8 d + 4 d(d + 1)
+    bytes an entry.
     """
-    blocks = []
-    parts = chunks(len(ladder.points), ladder.candidates, ladder.frames.shape[-1])
-    for centers in tqdm(parts, "stencils", delay=2, disable=not progress, leave=False):
-        rows = ladder.rows(centers)
-        blocks.append(rows if hessian else replace(rows, hessian=rows.hessian[:, :0]))
-    return Rows.stack(blocks)
+    shape = stencils.shape
+    parts = chunks(len(shape.points), stencils.candidates, shape.frames.shape[-1])
+    bar = tqdm(parts, "stencils", delay=2, disable=not progress, leave=False)
+    return Rows.stack(stencils.rows(centers) for centers in bar)

@@ -1,7 +1,7 @@
-"""Rows of last resort, for points where no stencil passes: positive weights, stable, and first order at best.
+"""Low-order rows, for points where no stencil passes: positive weights, stable, and first order at best.
 
 On a triangle mesh they are robust_laplacian's. On a cloud they are finite volumes of the Voronoi cell in the tangent
-plane, built from admissible neighbours alone; only where a sharp rim leaves a surface of R³ without a tangent plane,
+plane, built from admissible neighbours alone; only where a crease leaves a surface of R³ without a tangent plane,
 and robust_laplacian's own row stays on this side of every gap, that row is better and is taken.
 """
 
@@ -23,8 +23,8 @@ from torchlb.geometry.voronoi import cell_laplacian, cell_volume
 
 __all__ = ["CloudLowOrder", "MeshLowOrder"]
 
-ISLAND_REACH = 2
-"""How much farther a point on an island looks than the few nearest."""
+SMALL_REACH = 2
+"""How much farther a point of a small component looks than the few nearest."""
 MAX_HOPS = 3
 """Neighbours of a row of robust_laplacian farther than this along the graph lie across a gap."""
 
@@ -68,7 +68,7 @@ class CloudLowOrder:
     def _volumes(self) -> Float[Tensor, " N"]:
         volumes = []
         for centers in torch.arange(len(self.balls.points)).split(4096):
-            _, coords, valid = self._cells(centers, self._on_island)
+            _, coords, valid = self._cells(centers, self._in_small)
             outward = torch.zeros_like(coords[:, 0])
             if self.boundary is not None:
                 conormals = self.boundary.conormals[centers, None]
@@ -82,20 +82,20 @@ class CloudLowOrder:
 
     @cached_property
     def _matrix(self) -> sparse.csr_array:
-        """All rows. Small pieces that they leave by themselves are islands, too."""
-        matrix = self._joined(self._on_island)
+        """All rows. Small components that they leave are looked at once more."""
+        matrix = self._joined(self._in_small)
         pieces = self._small_pieces(matrix)
-        if (pieces & ~self._on_island).any():
-            matrix = self._joined(pieces | self._on_island)
+        if (pieces & ~self._in_small).any():
+            matrix = self._joined(pieces | self._in_small)
         return matrix
 
-    def _joined(self, on_island: Bool[Tensor, " N"]) -> sparse.csr_array:
+    def _joined(self, small: Bool[Tensor, " N"]) -> sparse.csr_array:
         """W/m less its sums, with m the volumes and W the mean of what both ends make of the flux.
 
-        So the rows of last resort alone are an M-matrix, symmetric in m. A flux that one end alone knows is its own.
+        So these rows alone are an M-matrix, symmetric in m. A flux that one end alone knows is its own.
         """
         chunks = torch.arange(len(self._volumes)).split(4096)
-        parts = [self._one_sided(chunk, on_island) for chunk in chunks]
+        parts = [self._one_sided(chunk, small) for chunk in chunks]
         volumes = np.concatenate([volume for volume, _ in parts])
         rows = sparse.vstack([row for _, row in parts], format="csr")
         flux = sparse.csr_array(sparse.diags_array(volumes) @ rows)
@@ -107,10 +107,10 @@ class CloudLowOrder:
         return sparse.csr_array(sparse.diags_array(1 / volumes) @ flux)
 
     def _one_sided(
-        self, centers: Int[Tensor, " B"], on_island: Bool[Tensor, " N"]
+        self, centers: Int[Tensor, " B"], small: Bool[Tensor, " N"]
     ) -> tuple[np.ndarray, sparse.csr_array]:
         """Volumes and rows as each point by itself would have them."""
-        index, coords, valid = self._cells(centers, on_island)
+        index, coords, valid = self._cells(centers, small)
         flux = cell_laplacian(coords, valid)
         weights = torch.cat([-flux.sum(1, keepdim=True), flux], dim=1)
         row = np.arange(len(centers)).repeat(index.shape[1])
@@ -130,22 +130,22 @@ class CloudLowOrder:
         return volumes, sparse.csr_array(ours @ cells + theirs @ robust)
 
     def _cells(
-        self, centers: Int[Tensor, " B"], on_island: Bool[Tensor, " N"]
+        self, centers: Int[Tensor, " B"], small: Bool[Tensor, " N"]
     ) -> tuple[Int[Tensor, "B K"], Float[Tensor, "B neighbors d"], Bool[Tensor, "B neighbors"]]:
         """Neighbours, their coordinates, and which are real.
 
-        A point with hardly an admissible neighbour takes the few nearest points, whatever they are. One on an island of
-        fewer points than a row looks `ISLAND_REACH` times as far, at as many as a row has, some of which lie beyond:
+        A point with hardly an admissible neighbour takes the few nearest points, whatever they are. One of a component
+        of fewer points than a row looks `SMALL_REACH` times as far, at as many as a row has, some of which lie beyond:
         crumpled corners of a scan hang together with the rest.
         """
         points, frames = self.balls.points, self.balls.frames
         index, count = self.balls(centers, self.size)
-        far = on_island[centers]
+        far = small[centers]
         alone = far | (count <= 2 * frames.shape[-1])
         if alone.any():
             nearest = self._nearest[centers[alone]]
             distance = (points[nearest] - points[centers[alone], None]).norm(dim=-1)
-            reach = distance[:, self.few - 1] * torch.where(far[alone], ISLAND_REACH, 1)
+            reach = distance[:, self.few - 1] * torch.where(far[alone], SMALL_REACH, 1)
             index[alone], count[alone] = nearest, (distance <= reach[:, None]).sum(1)
         offset = points[index[:, 1:]] - points[centers, None]
         coords = offset @ frames[centers]
@@ -155,7 +155,7 @@ class CloudLowOrder:
         return index, coords, torch.arange(1, self.size) < count[:, None]
 
     @cached_property
-    def _on_island(self) -> Bool[Tensor, " N"]:
+    def _in_small(self) -> Bool[Tensor, " N"]:
         return self._small_pieces(self.balls.graph)
 
     def _small_pieces(self, graph: sparse.csr_array) -> Bool[Tensor, " N"]:

@@ -31,13 +31,11 @@ class Reason(IntEnum):
 
     REACHED = 0, "requested order reached"
     FEW = 1, "too few admissible neighbours"
-    RANK = 2, "rank below the number of polynomials"
-    MOMENTS = 3, "moment equations not met"
-    CENTER = 4, "weight of the centre not negative"
-    RATIO = 5, "neighbours outweigh the centre"
-    GROWTH = 6, "growth beyond that of good stencils"
-    STABILITY = 7, "lowered by the certificate"
-    UNRESOLVED = 8, "points do not resolve the surface"
+    MOMENTS = 2, "moment equations not met"
+    UNRESOLVED = 3, "points do not resolve the surface"
+    RATIO = 4, "neighbours outweigh the centre"
+    GROWTH = 5, "growth beyond that of good stencils"
+    STABILITY = 6, "lowered by the certificate"
 
 
 @dataclass(frozen=True)
@@ -51,8 +49,9 @@ class Rows:
     laplacian : (nnz,), 1/ℓ².
     gradient : (nnz, d), 1/ℓ, in the frame of the row's point.
     hessian : (nnz, d(d+1)/2), 1/ℓ², ∂_a∂_b for a ≤ b at the origin of the tangent plane; zero in low-order rows.
-    candidate : (B,), place in the ladder; the number of rungs for a fallback row.
-    order : (B,), order of accuracy p; 0 for a fallback row.
+    candidate : (B,), place in the list of candidates; their number for a low-order row.
+    rule : (B,), place in `WEIGHT_RULES` of the rule for its weights; their number for a low-order row.
+    order : (B,), order of accuracy p; 0 for a low-order row.
     growth : (B,), ρ² Σ|w|, the factor of the a-priori error bound.
     condition : (B,), of the scaled weighted Vandermonde matrix.
     off_diagonal_ratio : (B,), Σ_{j≠i}|w_ij| / |w_ii|; 1 for an M-matrix row.
@@ -98,25 +97,27 @@ ENTRIES = {"col", "laplacian", "gradient", "hessian"}
 """The fields of `Rows` that have one value an entry; the others have one a row."""
 
 
-def stencil_rows(index: Int[Tensor, "B K"], weights: Weights, degree: int, rule: str) -> Rows:
-    """A batch of stencils of one size as rows, columns ascending."""
+def stencil_rows(
+    index: Int[Tensor, "B K"], weights: Weights, candidate: int, order: int, rule: Int[Tensor, " B"]
+) -> Rows:
+    """A batch of stencils of one candidate as rows, columns ascending."""
     batch, size = index.shape
-    col, order = index.sort(dim=1)
+    col, place = index.sort(dim=1)
     laplacian = weights.laplacian
     center, total = laplacian[:, 0].abs(), laplacian.abs().sum(1)
 
     def entries(values: Tensor) -> Tensor:
-        return values.take_along_dim(order[..., None], dim=1).flatten(0, 1)
+        return values.take_along_dim(place[..., None], dim=1).flatten(0, 1)
 
     return Rows(
         length=torch.full((batch,), size),
         col=col.flatten(),
-        laplacian=laplacian.take_along_dim(order, dim=1).flatten(),
+        laplacian=laplacian.take_along_dim(place, dim=1).flatten(),
         gradient=entries(weights.gradient),
         hessian=entries(weights.hessian),
-        candidate=torch.zeros(batch, dtype=torch.int64),
-        rule=torch.full((batch,), list(WEIGHT_RULES).index(rule)),
-        order=torch.full((batch,), degree - 1),
+        candidate=torch.full((batch,), candidate),
+        rule=rule,
+        order=torch.full((batch,), order),
         growth=weights.radius.square() * total,
         condition=weights.condition,
         off_diagonal_ratio=(total - center) / center,

@@ -187,7 +187,7 @@ def _refined(
     parts = chunks(len(points), candidates, initial.shape[-1])
     bar = tqdm(parts, "tangent frames", delay=2, disable=not progress, leave=False)
     found, order = zip(
-        *(refine_frames(points, initial, balls, centers, candidates) for centers in bar),
+        *(refine_frames(balls, centers, candidates) for centers in bar),
         strict=True,
     )
     frames = torch.cat(found)
