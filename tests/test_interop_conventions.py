@@ -16,10 +16,15 @@ from torchlb import LaplaceBeltrami
 from torchlb.interop.conventions import SIGNS, edge_weights, weak_matrices
 from torchlb.surfaces import Ellipsoid
 
-VERTICES, FACES = Ellipsoid().mesh(200)
-V, F = VERTICES.numpy(), FACES.numpy()
-COTANGENT = LaplaceBeltrami.from_cotangent(VERTICES, FACES)
-STENCIL = LaplaceBeltrami.from_mesh(VERTICES, FACES, order=3)
+
+@pytest.fixture(scope="module", autouse=True)
+def shape():
+    """Made when the first test runs, not when tests are collected."""
+    global VERTICES, FACES, V, F, COTANGENT, STENCIL
+    VERTICES, FACES = Ellipsoid().mesh(200)
+    V, F = VERTICES.numpy(), FACES.numpy()
+    COTANGENT = LaplaceBeltrami.from_cotangent(VERTICES, FACES)
+    STENCIL = LaplaceBeltrami.from_mesh(VERTICES, FACES, order=3)
 
 
 def dense(index, weight):

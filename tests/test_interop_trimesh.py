@@ -10,8 +10,13 @@ from torchlb.interop.trimesh import from_trimesh, to_trimesh
 from torchlb.io.files import SUFFIXES, read_shape
 from torchlb.surfaces import Sphere
 
-VERTICES, FACES = Sphere().mesh(200)
-MESH = trimesh.Trimesh(VERTICES.numpy(), FACES.numpy(), process=False)
+
+@pytest.fixture(scope="module", autouse=True)
+def shape():
+    """Made when the first test runs, not when tests are collected."""
+    global VERTICES, FACES, MESH
+    VERTICES, FACES = Sphere().mesh(200)
+    MESH = trimesh.Trimesh(VERTICES.numpy(), FACES.numpy(), process=False)
 
 
 def test_the_operator_of_a_mesh_a_cloud_and_a_scene():

@@ -21,8 +21,14 @@ from torchlb.io.files import read_shape
 from torchlb.surfaces import Sphere
 
 ROOT = Path(__file__).parents[1]
-VERTICES, FACES = Sphere().mesh(100)
 OPTIONS = {"order": 1, "progress": False}
+
+
+@pytest.fixture(scope="module", autouse=True)
+def shape():
+    """Made when the first test runs, not when tests are collected."""
+    global VERTICES, FACES
+    VERTICES, FACES = Sphere().mesh(100)
 
 
 def write_shapes(folder, count):

@@ -45,7 +45,7 @@ from torch import Tensor
 
 from torchlb.errors import InputError
 from torchlb.io.cache import load_or_build
-from torchlb.operator.dispatch import build_operator
+from torchlb.operator.dispatch import Operator, build_operator
 from torchlb.operator.laplace_beltrami import LaplaceBeltrami
 
 __all__ = ["compute_operators", "get_all_operators", "get_operators"]
@@ -64,7 +64,7 @@ def get_operators(
     overwrite_cache: bool = False,
     truncate_cache: bool = False,
     *,
-    operator: str = "stencil",
+    operator: Operator = "stencil",
     symmetric: bool = True,
     **options: Any,
 ) -> Operators:
