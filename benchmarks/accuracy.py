@@ -454,7 +454,7 @@ def noise(asked: argparse.Namespace) -> None:
     known = sphere.eigenvalues(26)[1:]
     rows, misses = [], []
     for order, size in bar(variants, "noise"):
-        cells: list[object] = [order, size or "ladder"]
+        cells: list[object] = [order, size or "candidates"]
         for share in (0.0, 0.01, 0.03, 0.1):
             generator = torch.Generator().manual_seed(0)
             shift = torch.randn(true.shape, generator=generator, dtype=torch.float64)

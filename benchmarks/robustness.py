@@ -4,7 +4,7 @@ Every mesh under the folder (.ply, .obj, .off, .stl; .npz with `vertices`, `face
 as many shapes) and a few generated dirty ones, as a mesh and as the cloud of its vertices, at orders 1, 3, 5 with both
 projections. What each row says:
 
-rows at p: share of the rows that keep the order p, then that of rows of last resort; abscissa: largest real part of an
+rows at p: share of the rows that keep the order p, then that of low-order rows; abscissa: largest real part of an
 eigenvalue of Δ over the spectral radius, densely up to 3,000 points, by Arnoldi above; λ: the largest relative
 difference between eigenvalues 1 to 9 of −Δ and those of robust_laplacian on the same mesh, or on the mesh refined
 twice by midpoints where `--refine 2` asks for it; seconds: of the build, with `--split` stencils + certificate.
@@ -26,7 +26,6 @@ from typing import NamedTuple
 import numpy as np
 import robust_laplacian
 import torch
-import torchlb.certificate
 import trimesh
 from _common import versions
 from scipy import sparse
@@ -35,6 +34,7 @@ from torch import Tensor
 from tqdm import tqdm
 
 from torchlb import LaplaceBeltrami, clean_mesh
+from torchlb.linalg import krylov
 from torchlb.surfaces import Sphere, Torus
 
 DENSE = 3000
@@ -47,10 +47,10 @@ HEADER = [
     "certificate",
     "rounds",
     "rows at p",
-    "last resort",
+    "low order",
 ]
 HEADER += ["abscissa", "λ", "seconds"]
-SUMMARY = "| as | p | projection | shapes | certificate | rounds | % of rows at p | % last resort "
+SUMMARY = "| as | p | projection | shapes | certificate | rounds | % of rows at p | % low order "
 SUMMARY += "| λ, median (max) % | seconds, median |"
 
 
@@ -238,7 +238,7 @@ def main() -> None:
         print(*summarize(options.summarize), sep="\n")
         return
     if options.unfactored:
-        torchlb.certificate.LARGEST_FACTORED = 0
+        krylov.LARGEST_FACTORED = 0
     torch.set_num_threads(1)
     warnings.simplefilter("ignore")
     every = list(shapes_in(options.data)) if options.data else list(dirty())
