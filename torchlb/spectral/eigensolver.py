@@ -51,12 +51,9 @@ def blockwise_eigenbasis(
     mass: Float[Tensor, " N"],
     k: int,
     sizes: tuple[int, ...] | None,
-    *,
-    outflow: bool = False,
-    rounding: float = 0.0,
+    **options: Any,
 ) -> Eigenbasis:
     """As `solve_eigenbasis`, of every diagonal block of the given sizes by itself; None: of the whole."""
-    options = {"outflow": outflow, "rounding": rounding}
     if sizes is None:
         return solve_eigenbasis(matrix, mass, k, **options)
     ends = np.cumsum(sizes)
@@ -271,7 +268,8 @@ def _ritz(part: _Part, cut: float) -> Solved:
         phi, z = np.column_stack([zero, u]), np.column_stack([part.null_left, z])
         values = np.append(0.0, values)
     if part.symmetric or phi.shape[1] == 0:
-        return values, phi, phi, np.stack([values, 0 * values]), _plain_transform(len(values))
+        eye = np.eye(len(values))
+        return values, phi, phi, np.stack([values, 0 * values]), np.stack([eye, eye, 0 * eye])
     overlap = phi.T @ z if z.shape == phi.shape else np.zeros((1, 1))
     if linalg.svdvals(overlap)[-1] < 1e-8 * linalg.svdvals(overlap)[0]:
         raise EigenbasisError(
@@ -284,10 +282,6 @@ def _ritz(part: _Part, cut: float) -> Solved:
         b[:, 0] = 0.0  # constants, exactly
     rates, transform = _exact_modes(b)
     return values, phi, w, rates, transform
-
-
-def _plain_transform(k: int) -> np.ndarray:
-    return np.stack([np.eye(k), np.eye(k), np.zeros((k, k))])
 
 
 def _exact_modes(b: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
