@@ -8,7 +8,9 @@ import trimesh
 
 from torchlb import LaplaceBeltrami
 from torchlb.fits.rules import reference
+from torchlb.stencils.assemble import Stencils, assemble
 from torchlb.stencils.rows import Reason
+from torchlb.stencils.shape import cloud_shape, mesh_shape
 from torchlb.surfaces import Sphere, Torus
 
 
@@ -148,3 +150,15 @@ def test_fallback_rows_are_m_matrix_rows():
     torch.testing.assert_close(
         lb.report.off_diagonal_ratio[rows], torch.ones(int(rows.sum())).double()
     )
+
+
+def test_fewer_points_than_polynomials_have_low_order_rows():
+    """A tetrahedron at order 3, mesh and cloud: M-matrix rows, and the reason is that neighbours are too few."""
+    signs = [[1, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1]]
+    points = torch.tensor(signs, dtype=torch.float64)
+    faces = torch.tensor([[0, 1, 2], [0, 3, 1], [0, 2, 3], [1, 3, 2]])
+    for shape in (mesh_shape(points, faces, 4), cloud_shape(points, 2, 4)):
+        rows = assemble(Stencils(shape, 3))
+        assert rows.order.tolist() == [0] * 4
+        assert rows.reason.tolist() == [Reason.FEW] * 4
+        torch.testing.assert_close(rows.off_diagonal_ratio, torch.ones(4).double())
