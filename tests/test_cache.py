@@ -120,7 +120,7 @@ def test_same_values_share_an_entry():
         operator_key(vertices.double(), FACES.int()),
         operator_key(vertices.numpy(), FACES.numpy().astype(np.int32)),
         operator_key(vertices.numpy().astype(np.float64, order="F"), FACES.tolist()),
-        operator_key(vertices, FACES, order=np.int64(3), boundary="neumann", certify=True),
+        operator_key(vertices, FACES, order=np.int64(3), condition="neumann", certify=True),
         operator_key(signed, FACES),
         operator_key(vertices.clone().requires_grad_(), FACES),
     ):
@@ -146,7 +146,7 @@ def test_anything_that_changes_the_operator_changes_the_key(monkeypatch):
         operator_key(VERTICES, FACES, projection="normal"),
         operator_key(VERTICES, FACES, weights="polyharmonic"),
         operator_key(VERTICES, FACES, num_neighbors=40),
-        operator_key(VERTICES, FACES, boundary=None),
+        operator_key(VERTICES, FACES, condition=None),
         operator_key(VERTICES, FACES, certify=False),
         operator_key(VERTICES),
         operator_key(VERTICES, normals=VERTICES),
@@ -253,7 +253,7 @@ def test_the_file_holds_no_pickle(tmp_path):
     save_operator(LaplaceBeltrami.from_cotangent(VERTICES, FACES), tmp_path / "lb.npz")
     with np.load(tmp_path / "lb.npz", allow_pickle=False) as archive:
         assert all(archive[name].dtype != object for name in archive.files)
-        assert json.loads(str(archive["header"]))["state"]["kind"] == "cotangent"
+        assert json.loads(str(archive["header"]))["state"]["source"] == "cotangent"
 
 
 def test_a_pickle_is_refused_unopened(tmp_path):

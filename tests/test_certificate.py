@@ -341,13 +341,13 @@ def test_coincident_vertices_have_each_its_own_row():
         half = own[: len(own) // 2]
         faces[half] = torch.where(faces[half] == vertex, len(vertices), faces[half])
         vertices = torch.cat([vertices, vertices[vertex : vertex + 1]])
-    lb = LaplaceBeltrami.from_mesh(vertices, faces, boundary=None, certify=False)
+    lb = LaplaceBeltrami.from_mesh(vertices, faces, condition=None, certify=False)
     diagonal = dense(lb).diagonal()
     assert diagonal.max() < 0.1 * diagonal.median()
     assert (lb.report.order == 3).all()
     error = lb(smooth_function(vertices)) - Sphere().laplacian(smooth_function, vertices)
     assert error.abs().max() < 5e-3
-    assert LaplaceBeltrami.from_mesh(vertices, faces, boundary=None).certificate.holds
+    assert LaplaceBeltrami.from_mesh(vertices, faces, condition=None).certificate.holds
 
 
 def test_uncertified_operator_says_so():

@@ -39,7 +39,7 @@ def two_components():
 
 
 def with_outflow():
-    return LaplaceBeltrami.from_mesh(*Hemisphere().mesh(500), boundary="dirichlet")
+    return LaplaceBeltrami.from_mesh(*Hemisphere().mesh(500), condition="dirichlet")
 
 
 @pytest.mark.parametrize("build", [random_cloud, two_components, two_scales, with_outflow])

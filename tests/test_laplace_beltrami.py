@@ -1,23 +1,27 @@
 """One contract for every operator, invariances at the level of rounding, and the accuracy that is promised."""
 
 import copy
+import functools
 import io
 import pickle
 from functools import cache
 
 import igl
+import jaxtyping
 import numpy as np
 import pytest
 import torch
 from torch.autograd import gradcheck, gradgradcheck
 
-from torchlb import LaplaceBeltrami
+from torchlb import LaplaceBeltrami, collate
+from torchlb.operator.storage import BASIS
 from torchlb.surfaces import (
     Circle,
     CliffordTorus,
     Ellipsoid,
     Sphere,
     Torus,
+    UnitDisk,
     deserno_points,
     smooth_function,
     spherical_harmonic,
@@ -184,6 +188,33 @@ def test_forward_is_linear_and_differentiable_twice(lb):
     same(found, dense(lb).T @ g)
 
 
+def test_the_adjoint_is_the_transpose(lb):
+    """Lᵀf in every layout, its derivative is L; lb @ f is lb(f)."""
+    f, g = random_like(lb, 2, lb.num_points, 3), random_like(lb, lb.num_points)
+    same(lb.adjoint(f), dense(lb).T @ f)
+    same(lb.adjoint(g), dense(lb).T @ g)
+    same(lb @ g, lb(g))
+    g.requires_grad_()
+    (found,) = torch.autograd.grad(lb.adjoint(g).sum(), g)
+    same(found, lb(torch.ones_like(g)), 1e-9)
+
+
+def test_the_hessian_is_symmetric_and_its_trace_is_div_grad(lb):
+    f = random_like(lb, lb.num_points, 2)
+    found = lb.hessian(f)
+    assert found.shape == (lb.num_points, lb.dim, lb.dim, 2)
+    same(found, found.transpose(1, 2))
+    same(lb.hessian(f[:, 1]), found[..., 1])
+    same(torch.einsum("iaac->ic", found), lb.divergence(lb.gradient(f)))
+
+
+def test_it_knows_its_shape_type_and_options(lb):
+    assert lb.shape == lb.matrix.shape
+    assert (lb.dtype, lb.device) == (torch.float64, torch.device("cpu"))
+    assert lb.order == lb.options.get("order")
+    assert lb.boundary is None
+
+
 def test_gradient_and_divergence_are_differentiable(lb):
     f = random_like(lb, lb.num_points, 1).requires_grad_()
     v = random_like(lb, *lb.points.shape).requires_grad_()
@@ -219,7 +250,7 @@ def test_copies_are_equal(lb, way):
         other.load_state_dict(state)
     for name, buffer in lb.named_buffers():
         assert torch.equal(getattr(other, name).nan_to_num(), buffer.nan_to_num()), name
-    assert (other.kind, other.options) == (lb.kind, lb.options)
+    assert (other.source, other.options) == (lb.source, lb.options)
     assert other.certificate == lb.certificate
     assert repr(other) == repr(lb)
     assert str(other.report) == str(lb.report)
@@ -276,7 +307,7 @@ def test_repr_says_what_it_is(lb):
     text = repr(lb)
     assert f"{lb.num_points} points" in text
     assert f"dim={lb.dim} in R^{lb.points.shape[1]}" in text
-    assert lb.kind in text
+    assert lb.source in text
     assert f"{len(lb.col)} entries" in text
 
 
@@ -289,6 +320,116 @@ def test_empty():
     lb = LaplaceBeltrami()
     assert repr(lb) == "LaplaceBeltrami(empty)"
     assert lb.num_points == 0
+
+
+# Batches, boundaries, positions
+
+
+def assert_identical(actual, expected):
+    for name, buffer in expected.named_buffers():
+        assert torch.equal(getattr(actual, name).nan_to_num(), buffer.nan_to_num()), name
+    assert actual.get_extra_state() == expected.get_extra_state()
+
+
+@functools.cache
+def disk(condition="dirichlet"):
+    return LaplaceBeltrami.from_mesh(*mesh_of(UnitDisk(), 150), order=2, condition=condition)
+
+
+def test_unbatch_is_the_inverse_of_batch():
+    """Every tensor, the certificate, bounds, options and eigenbasis of every shape, also of a batch of batches."""
+    shapes = [copy.deepcopy(built(name)) for name in ("points", "mesh", "cotangent")]
+    shapes.append(copy.deepcopy(disk()))
+    for k, shape in enumerate(shapes, start=4):
+        shape.eigenbasis(k)
+    for found, expected in zip(LaplaceBeltrami.batch(shapes).unbatch(), shapes, strict=True):
+        assert_identical(found, expected)
+    for shape in shapes:
+        shape.keep_basis(None, store=False)
+        for name in BASIS:
+            setattr(shape, f"basis_{name}", shape.values.new_zeros(0))
+    nested = LaplaceBeltrami.batch([LaplaceBeltrami.batch(shapes[:2]), *shapes[2:]])
+    for found, expected in zip(nested.unbatch(), shapes, strict=True):
+        assert_identical(found, expected)
+    with pytest.raises(ValueError, match="expected a batch"):
+        shapes[0].unbatch()
+
+
+def test_the_boundary_and_its_condition_are_known():
+    """Also after a round trip, and in a batch, where a closed shape has none."""
+    mask = UnitDisk().boundary_mask(mesh_of(UnitDisk(), 150)[0])
+    other = LaplaceBeltrami()
+    other.load_state_dict(disk().state_dict())
+    for lb in (disk(), other, copy.deepcopy(disk()).float()):
+        assert lb.condition == "dirichlet"
+        assert torch.equal(lb.boundary, mask)
+        assert "condition='dirichlet'" in repr(lb)
+    assert disk("neumann").condition == "neumann"
+    assert (disk(None).condition, disk(None).boundary) == (None, None)
+    batch = LaplaceBeltrami.batch([built("mesh"), disk()])
+    assert torch.equal(batch.boundary, torch.cat([torch.zeros(400, dtype=torch.bool), mask]))
+    assert batch.condition is None  # not one for all
+
+
+def test_a_condition_may_hold_on_a_part_of_the_boundary_of_a_mesh():
+    vertices, faces = mesh_of(UnitDisk(), 150)
+    whole = UnitDisk().boundary_mask(vertices)
+    part = whole & (vertices[:, 0] > 0)
+    build = functools.partial(LaplaceBeltrami.from_mesh, vertices, faces, order=2)
+    assert torch.equal(build(boundary=part, condition="dirichlet").boundary, part)
+    for all_of_it in (whole, "detect", None):
+        lb = build(boundary=all_of_it, condition="dirichlet")
+        assert torch.equal(lb.values, disk().values)
+    with pytest.raises(ValueError, match="condition='dirichlet'"):
+        build(boundary="dirichlet")
+
+
+def test_dirichlet_on_a_cloud_needs_a_boundary(monkeypatch):
+    monkeypatch.setattr(jaxtyping.config, "jaxtyping_disable", True)  # which knows the choices, too
+    with pytest.raises(ValueError, match="pass a mask of them"):
+        LaplaceBeltrami.from_points(points_of(Sphere(), 100), order=1, condition="dirichlet")
+    with pytest.raises(ValueError, match="condition: expected one of"):
+        LaplaceBeltrami.from_points(points_of(Sphere(), 100), order=1, condition="robin")
+
+
+def test_an_operator_knows_its_points():
+    """To float32 rounding; scaled, turned, moved or fewer ones are refused."""
+    lb, points = built("points"), points_of(Ellipsoid(), 300)
+    for same_points in (points, points.float(), points + 1e-8):
+        lb.check_points(same_points)
+    copy.deepcopy(lb).float().check_points(points)
+    for stale in (2 * points, points.roll(1, 1), points + 0.01, points[:200], points[:, :2]):
+        with pytest.raises(ValueError, match="build it again"):
+            lb.check_points(stale)
+
+
+def test_a_state_of_other_points_is_not_taken_in_silence():
+    """Of another number of them: an error, as for any module; of as many in other places: a warning."""
+    model = torch.nn.ModuleDict({"lb": copy.deepcopy(built("points"))})
+    model.load_state_dict(model.state_dict())
+    with pytest.raises(RuntimeError, match="of an operator on 400 points, this one has 300"):
+        model.load_state_dict(torch.nn.ModuleDict({"lb": built("mesh")}).state_dict())
+    assert model["lb"].num_points == 300
+    with pytest.warns(UserWarning, match="as many other points"):
+        model.load_state_dict(torch.nn.ModuleDict({"lb": built("polyharmonic")}).state_dict())
+
+
+def test_collate_joins_operators_features_and_faces():
+    """Rows of every point below each other, faces moved by the offsets, the rest as torch does."""
+    shapes = [(built("mesh"), *mesh_of(Torus(), 400)), (disk(), *mesh_of(UnitDisk(), 150))]
+    samples = [
+        {"lb": lb, "x": x, "faces": faces, "label": i} for i, (lb, x, faces) in enumerate(shapes)
+    ]
+    batch = collate(samples)
+    assert batch["lb"].sizes == (400, 150)
+    assert torch.equal(batch["x"], torch.cat([x for _, x, _ in shapes]))
+    assert torch.equal(batch["faces"], torch.cat([shapes[0][2], shapes[1][2] + 400]))
+    assert batch["label"].tolist() == [0, 1]
+    lb, x, y = collate([(lb, x, torch.ones(4)) for lb, x, _ in shapes])
+    assert lb(x).shape == (550, 3)
+    assert y.shape == (2, 4)
+    with pytest.raises(ValueError, match="collate: expected samples"):
+        collate([(1, 2), (3, 4)])
 
 
 # Input
@@ -443,6 +584,14 @@ def test_divergence_of_the_position_is_the_dimension(name):
     assert fitted.double().mean() > 0.9
     expected = torch.full((int(fitted.sum()),), float(lb.dim), dtype=torch.float64)
     same(lb.divergence(lb.points)[fitted], expected, 1e-8)
+
+
+def test_hessian_on_the_sphere():
+    """∇²z = −z g, to 1e-4 at N = 2000, p = 3."""
+    points = points_of(Sphere(), 2000)
+    lb = LaplaceBeltrami.from_points(points, order=3, certify=False)
+    exact = -points[:, 2, None, None] * torch.eye(2)
+    assert (lb.hessian(points[:, 2]) - exact).abs().max() <= 1e-4
 
 
 @pytest.mark.parametrize(

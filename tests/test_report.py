@@ -67,6 +67,32 @@ def test_numbers_are_those_of_the_matrix():
     assert (report.condition >= 1).all()
 
 
+def test_the_summary_has_the_counts_and_reports_compare():
+    """Numbers of the same report; two reports are compared by identity, and shown as they are printed."""
+    report = cube()[1].report
+    numbers = report.summary
+    assert numbers["points"] == len(report.order)
+    assert numbers["at_requested_order"] == report.order_counts[3]
+    assert numbers["low_order"] == report.order_counts[0]
+    assert numbers["max_growth"] == report.growth[report.order > 0].max()
+    assert numbers["reference_growth"] == reference(2, 4).growth
+    assert report == report
+    assert report != cube()[1].report
+    assert repr(report) == str(report)
+
+
+def test_half_the_rows_at_low_order_are_named():
+    """For a cloud with the wrong dimension as for a mesh of noise: the share, the reason, the remedy."""
+    with pytest.warns(
+        UserWarning, match=r"% of the points have only low-order rows.*pass its dimension"
+    ):
+        LaplaceBeltrami.from_points(torch.randn(300, 3).double(), order=3, certify=False)
+    vertices, faces = Sphere().mesh(300)
+    noisy = vertices + 0.05 * torch.randn_like(vertices)
+    with pytest.warns(UserWarning, match=r"% of the points have only low-order rows.*finer mesh"):
+        LaplaceBeltrami.from_mesh(noisy, faces, order=3, certify=False)
+
+
 def test_it_prints_a_summary():
     text = str(cube()[1].report)
     assert text.startswith("386 points, order 3 requested")
@@ -87,7 +113,7 @@ def test_operators_without_stencils_have_a_report_too(build):
     else:
         report = LaplaceBeltrami.from_cotangent(*Torus().mesh(200)).report
         assert report.order_counts == {0: 200}
-        assert "fallback" in str(report)
+        assert "low order" in str(report)
 
 
 def test_a_crease_falls_below_the_order_and_says_why():

@@ -2,6 +2,8 @@
 
 import copy
 import shutil
+import subprocess
+import sys
 
 import jaxtyping
 import numpy as np
@@ -221,3 +223,20 @@ def test_from_scipy_sorts_columns_and_sums_duplicates_without_touching_the_matri
     parts = [part.tolist() for part in from_scipy(given)]
     assert parts == [[0, 2, 3], [0, 2, 1], [2.0, 5.0, 8.0]]
     assert given.indices.tolist() == [2, 0, 2, 1]
+
+
+def test_importing_torchlb_silences_nobody():
+    """torch says of the first CSR tensor of a process that they are in beta; torchlb keeps that from its own alone."""
+    program = """
+import warnings
+with warnings.catch_warnings(record=True) as said:
+    warnings.simplefilter("always")
+    import torch, torchlb
+    own = torchlb.linalg.sparse.csr_tensor if MINE else torch.sparse_csr_tensor
+    own(torch.tensor([0, 1]), torch.tensor([0]), torch.tensor([1.0]), 1 if MINE else (1, 1))
+print(sum("Sparse CSR" in str(each.message) for each in said))
+"""
+    for mine, count in ((True, 0), (False, 1)):
+        text = program.replace("MINE", str(mine))
+        done = subprocess.run([sys.executable, "-c", text], capture_output=True, text=True)
+        assert done.stdout.strip() == str(count), done.stderr

@@ -25,6 +25,7 @@ from torchlb.nn.diffusion_net import DiffusionNet, DiffusionNetBlock
 from torchlb.nn.gradient_features import GradientFeatures
 from torchlb.nn.spectral_conv import SpectralConv
 from torchlb.operator.cleaning import clean_mesh, clean_points
+from torchlb.operator.collate import collate
 from torchlb.operator.laplace_beltrami import LaplaceBeltrami
 from torchlb.operator.report import StencilReport
 from torchlb.spectral.eigenbasis import Eigenbasis
@@ -62,6 +63,7 @@ __all__ = [
     "__version__",
     "clean_mesh",
     "clean_points",
+    "collate",
     "diffusion_distance",
     "diffusion_map",
     "heat_flow",

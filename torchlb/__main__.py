@@ -17,11 +17,11 @@ import click
 from click.core import ParameterSource
 
 from torchlb.errors import OperatorFileError
-from torchlb.geometry.frames import PROJECTIONS
+from torchlb.fits.rules import WeightsName
+from torchlb.geometry.frames import Projection
 from torchlb.io.cache import describe_file
 from torchlb.io.files import read_shape
 from torchlb.io.precompute import concerns_the_shape, precompute_operators
-from torchlb.operator.build import WEIGHTS
 from torchlb.operator.cleaning import clean_mesh
 from torchlb.operator.dispatch import Operator, build_operator
 from torchlb.operator.laplace_beltrami import LaplaceBeltrami
@@ -60,14 +60,14 @@ def _stencil_options(command: Callable[..., Any]) -> Callable[..., Any]:
         ),
         click.option(
             "--projection",
-            type=click.Choice(list(PROJECTIONS)),
+            type=click.Choice(get_args(Projection)),
             default="tangent",
             show_default=True,
             help="Onto the tangent plane, or along the normals.",
         ),
         click.option(
             "--weights",
-            type=click.Choice(WEIGHTS),
+            type=click.Choice(get_args(WeightsName)),
             default="least_squares",
             show_default=True,
             help="How the weights are found.",
@@ -212,7 +212,7 @@ def info(file: Path) -> None:
         return
     lb = found["operator"]
     click.echo(f"{lb}\n\n{lb.report}\n{lb.certificate or 'no certificate'}")
-    pairs = lb.basis_eigenvectors.shape[-1] if len(lb.basis_left) else 0
+    pairs = 0 if lb.basis is None else lb.basis.eigenvectors.shape[1]
     click.echo(f"{pairs} eigenpairs stored")
     click.echo(f"{file.stat().st_size / 1e6:.1f} MB, written by torchlb {found['version']}")
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from functools import lru_cache
 from math import ceil, gamma, pi
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 import torch
 
@@ -12,8 +12,9 @@ from torchlb.fits.polyharmonic import polyharmonic_weights
 from torchlb.fits.polynomials import num_monomials
 from torchlb.fits.weights import least_squares_weights, positive_weights
 
-__all__ = ["SIZE_FACTORS", "WEIGHT_RULES", "Reference", "reference"]
+__all__ = ["SIZE_FACTORS", "WEIGHT_RULES", "Reference", "WeightsName", "reference"]
 
+WeightsName = Literal["least_squares", "polyharmonic"]
 WEIGHT_RULES = {
     "least_squares": least_squares_weights,
     "polyharmonic": polyharmonic_weights,

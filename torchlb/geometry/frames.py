@@ -7,6 +7,8 @@ of order q.
 
 from __future__ import annotations
 
+from typing import Literal
+
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
@@ -17,6 +19,7 @@ from torchlb.geometry.neighbors import MIN_ALIGNMENT, GraphBalls, admissible
 
 __all__ = [
     "PROJECTIONS",
+    "Projection",
     "cloud_frames",
     "complete_frames",
     "face_normals",
@@ -160,6 +163,7 @@ def _normal_offsets(points: Tensor, frames: Tensor, centers: Tensor, neighbors: 
     return torch.linalg.solve(theirs @ frames[centers, None], theirs @ offset[..., None])[..., 0]
 
 
+Projection = Literal["tangent", "normal"]
 PROJECTIONS = {"tangent": _tangent_offsets, "normal": _normal_offsets}
 """The values of the option `projection`."""
 

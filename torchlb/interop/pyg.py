@@ -21,16 +21,13 @@ from torch_geometric.transforms import BaseTransform
 
 from torchlb.errors import InputError, TorchlbError, warn
 from torchlb.io.cache import load_or_build
-from torchlb.linalg.spectral_bounds import Bounds, join_bounds
-from torchlb.operator.batching import join_certificates
+from torchlb.operator.batching import join_states
 from torchlb.operator.dispatch import Operator, build_operator
 from torchlb.operator.laplace_beltrami import LaplaceBeltrami
+from torchlb.operator.storage import BASIS
 from torchlb.spectral.eigenbasis import Eigenbasis, stack_eigenbases
-from torchlb.stability.certificate import Certificate
 
 __all__ = ["LaplaceBeltramiTransform", "to_operator"]
-
-BASIS = ("eigenvalues", "eigenvectors", "left", "decay_rates", "modal_transform")
 
 
 @functional_transform("laplace_beltrami")
@@ -50,7 +47,7 @@ class LaplaceBeltramiTransform(BaseTransform):
     lb_normals         (N, n)       unit normals of a hypersurface
     lb_basis           (…,)         with k > 0: all parts of the eigenbasis in one vector, for `to_operator`
     lb_basis_size      (1, 2)       number of eigenpairs, and whether its span is invariant
-    lb_info            str          kind, options and certificate as JSON
+    lb_info            str          source, options, certificate, bounds as JSON
     =================  ===========  ============================================================================
 
     Every key has a last or first axis that concatenates, and the one whose name contains "index" is shifted by the
@@ -143,8 +140,7 @@ def _keys(lb: LaplaceBeltrami, k: int) -> dict[str, Any]:
     if len(lb.normals):
         keys["lb_normals"] = lb.normals
     if k > 0:
-        lb.eigenbasis(k)
-        basis = lb.eigenbasis(1, closed=True)  # all that was solved
+        basis = lb.invariant_basis(k)
         parts = [getattr(basis, name) for name in BASIS]
         keys["lb_basis"] = torch.cat([part.flatten() for part in parts if part is not None])
         size = [basis.eigenvectors.shape[1], int(basis.is_invariant)]
@@ -168,34 +164,35 @@ def to_operator(data: Any) -> LaplaceBeltrami:
     infos = [json.loads(text) for text in (data["lb_info"] if batched else [data["lb_info"]])]
     sizes = data["ptr"].diff() if batched else data.lb_mass.new_tensor([len(data.lb_mass)]).long()
     _check_unchanged(data, sizes)
-    lb = LaplaceBeltrami()
-    _fill(lb, data, sizes)
-    if batched:
-        lb.kind, lb.options = "batch", dict(infos[0]["options"])
-        lb.sizes = tuple(sizes.tolist())
-        known = [i["certificate"] and Certificate(**i["certificate"]) for i in infos]
-        lb.certificate = join_certificates(known)
-        bounds = [i.get("bounds") for i in infos]
-        lb.set_bounds(join_bounds([Bounds(*b) for b in bounds]) if all(bounds) else None)
-    else:
-        lb.set_extra_state(infos[0])
+    basis = None
     if "lb_basis" in data:
         bases = _bases(data, sizes.tolist())
-        lb._keep(stack_eigenbases(bases) if batched else bases[0])
-    return lb
+        basis = stack_eigenbases(bases) if batched else bases[0]
+    state = join_states(infos, sizes.tolist()) if batched else infos[0]
+    return LaplaceBeltrami.from_buffers(_buffers(data, sizes), state, basis)
 
 
-def _fill(lb: LaplaceBeltrami, data: Any, sizes: Int[Tensor, " S"]) -> None:
-    """Set the buffers of the block-diagonal matrix and of its transpose."""
+def _buffers(data: Any, sizes: Int[Tensor, " S"]) -> dict[str, Tensor]:
+    """The block-diagonal matrix and its transpose, and what else is known of the points."""
     col, row = data.lb_edge_index
-    lb.crow, lb.crow_t = _starts(row, len(data.pos)), _starts(col, len(data.pos))
-    ends = lb.crow[sizes.cumsum(0)]
+    crow = _starts(row, len(data.pos))
+    ends = crow[sizes.cumsum(0)]
     entries = torch.diff(ends, prepend=ends.new_zeros(1))
-    lb.order_t = data.lb_order_t + (ends - entries).repeat_interleave(entries)
-    lb.col, lb.col_t = col.contiguous(), row[lb.order_t]
-    lb.values, lb.gradient_values = data.lb_values, data.lb_gradient.T.contiguous()
-    lb.mass, lb.points, lb.frames = data.lb_mass, data.pos.to(data.lb_mass), data.lb_frames
-    lb.normals = data.lb_normals if "lb_normals" in data else lb.points[:0]
+    order_t = data.lb_order_t + (ends - entries).repeat_interleave(entries)
+    points = data.pos.to(data.lb_mass)
+    return {
+        "crow": crow,
+        "col": col.contiguous(),
+        "crow_t": _starts(col, len(data.pos)),
+        "col_t": row[order_t],
+        "order_t": order_t,
+        "values": data.lb_values,
+        "gradient_values": data.lb_gradient.T.contiguous(),
+        "mass": data.lb_mass,
+        "points": points,
+        "frames": data.lb_frames,
+        "normals": data.lb_normals if "lb_normals" in data else points[:0],
+    }
 
 
 def _check_unchanged(data: Any, sizes: Int[Tensor, " S"]) -> None:

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Sequence
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -20,6 +21,7 @@ from torch.nn.functional import embedding_bag
 
 __all__ = [
     "csr_product",
+    "csr_tensor",
     "from_scipy",
     "matmul",
     "multiply",
@@ -27,10 +29,6 @@ __all__ = [
     "transpose_pattern",
     "with_diagonal",
 ]
-
-with warnings.catch_warnings():  # torch says once, at the first CSR tensor, that they are in beta
-    warnings.simplefilter("ignore")
-    torch.sparse_csr_tensor([0, 1], [0], [1.0], (1, 1))
 
 
 def transpose_pattern(
@@ -92,7 +90,17 @@ def _result_dtype(values: Tensor, x: Tensor) -> torch.dtype:
     return x.dtype if half else _compute_dtype(values, x)
 
 
-def _csr(crow: Tensor, col: Tensor, values: Tensor, num_cols: int) -> Tensor:
+@cache
+def _hear_out_torch() -> None:
+    """Make the first CSR tensor, at which torch says once that they are in beta."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        torch.sparse_csr_tensor([0, 1], [0], [1.0], (1, 1))
+
+
+def csr_tensor(crow: Tensor, col: Tensor, values: Tensor, num_cols: int) -> Tensor:
+    """A torch sparse CSR tensor that shares the memory of its parts."""
+    _hear_out_torch()
     shape = (len(crow) - 1, num_cols)
     return torch.sparse_csr_tensor(crow, col, values, shape, check_invariants=False)
 
@@ -111,7 +119,7 @@ def multiply(
             col, x, crow, mode="sum", per_sample_weights=values, include_last_offset=True
         )
     with torch.autocast(x.device.type, enabled=False):
-        return _csr(crow, col, values, len(x)) @ x
+        return csr_tensor(crow, col, values, len(x)) @ x
 
 
 @torch.library.custom_op(
@@ -137,7 +145,9 @@ def _values_gradient(pattern: Sequence[Tensor], left: Tensor, right: Tensor) -> 
     """Σ_c left[row, c] right[col, c] at every entry (row, col), without the (nnz, C) of its terms."""
     crow, col, *_ = pattern
     dtype = _compute_dtype(left, right)
-    matrix = _csr(crow, col, torch.zeros(len(col), dtype=dtype, device=left.device), len(right))
+    matrix = csr_tensor(
+        crow, col, torch.zeros(len(col), dtype=dtype, device=left.device), len(right)
+    )
     with torch.autocast(left.device.type, enabled=False):
         return torch.sparse.sampled_addmm(matrix, left.to(dtype), right.to(dtype).T).values()
 

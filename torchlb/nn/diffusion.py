@@ -102,7 +102,7 @@ def _flow(
     if method == "spectral":
         return _spectral(lb.eigenbasis(k), x, time)
     if method == "deflated":
-        return _deflated(lb, lb.eigenbasis(k, closed=True), x, time, tolerance)
+        return _deflated(lb, lb.invariant_basis(k), x, time, tolerance)
     return _expanded(lb, x, time, method, tolerance)
 
 

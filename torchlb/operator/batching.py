@@ -1,8 +1,9 @@
-"""Several operators side by side as one block-diagonal operator: what happens to each of the stored tensors."""
+"""Several operators side by side as one block-diagonal operator, and back: what becomes of each stored tensor."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from itertools import accumulate
 from math import isnan
 from typing import Any
 
@@ -10,12 +11,13 @@ import torch
 from torch import Tensor
 
 from torchlb.errors import InputError
-from torchlb.stability.certificate import Certificate
+from torchlb.linalg.spectral_bounds import Bounds, join_bounds
 
-__all__ = ["join_buffers", "join_certificates"]
+__all__ = ["join_buffers", "join_states", "split_buffers"]
 
 Buffers = dict[str, Tensor]
-BY_POINT = ("mass", "points", "frames")
+BY_POINT = ("mass", "points", "frames", "normals", "on_boundary")
+BY_ENTRY = ("col", "values", "col_t", "order_t")
 
 
 def join_buffers(shapes: Sequence[Buffers]) -> Buffers:
@@ -23,7 +25,7 @@ def join_buffers(shapes: Sequence[Buffers]) -> Buffers:
 
     Raises
     ------
-    ValueError : if the shapes differ in dimension, in floating type or in device.
+    InputError : if the shapes differ in dimension, in floating type or in device.
     """
     first = shapes[0]
     for name in ("frames", "values"):
@@ -37,12 +39,16 @@ def join_buffers(shapes: Sequence[Buffers]) -> Buffers:
                     f"batch: shape {i} has {name} of {theirs}, shape 0 of {ours}; one dimension, floating type and "
                     "device are needed: use lb.to(…)"
                 )
-    joined = {name: torch.cat([s[name] for s in shapes]) for name in BY_POINT}
-    joined |= {n: torch.cat([s[n] for s in shapes]) for n in first if n.startswith("report_")}
-    joined["values"] = torch.cat([s["values"] for s in shapes])
+    by_point = [n for n in first if n in BY_POINT or n.startswith("report_")]
+    joined = {n: torch.cat([s[n] for s in shapes]) for n in (*by_point, "values")}
     joined["gradient_values"] = torch.cat([s["gradient_values"] for s in shapes], dim=1)
-    oriented = all(len(s["normals"]) for s in shapes)
-    joined["normals"] = torch.cat([s["normals"] if oriented else s["normals"][:0] for s in shapes])
+    if not all(len(s["normals"]) for s in shapes):
+        joined["normals"] = first["normals"][:0]
+    if len(joined["on_boundary"]):
+        masks = [s["on_boundary"] for s in shapes]
+        empty = [torch.zeros_like(s["mass"], dtype=torch.bool) for s in shapes]
+        pairs = zip(masks, empty, strict=True)
+        joined["on_boundary"] = torch.cat([mask if len(mask) else none for mask, none in pairs])
     points = _starts([len(s["mass"]) for s in shapes])
     entries = _starts([len(s["col"]) for s in shapes])
     for suffix in ("", "_t"):
@@ -55,21 +61,57 @@ def join_buffers(shapes: Sequence[Buffers]) -> Buffers:
     return joined
 
 
-def _starts(counts: list[int]) -> list[int]:
-    return [sum(counts[:i]) for i in range(len(counts))]
+def _starts(counts: Sequence[int]) -> list[int]:
+    return [0, *accumulate(counts)][: len(counts)]
 
 
-def join_certificates(certificates: Sequence[Certificate | None]) -> Certificate | None:
-    """The worst of each figure; None where one shape has none."""
-    known: list[Any] = [c for c in certificates if c is not None]
+def split_buffers(joined: Buffers, sizes: Sequence[int]) -> list[Buffers]:
+    """The inverse of `join_buffers`."""
+    shapes = []
+    for start, size in zip(_starts(sizes), sizes, strict=True):
+        point = slice(start, start + size)
+        first, last = joined["crow"][[start, start + size]].tolist()
+        entry = slice(first, last)
+        by_point = [n for n in joined if n in BY_POINT or n.startswith("report_")]
+        shape = {n: joined[n][point] for n in by_point} | {n: joined[n][entry] for n in BY_ENTRY}
+        shape["gradient_values"] = joined["gradient_values"][:, entry]
+        for name, shift in (("col", start), ("col_t", start), ("order_t", first)):
+            shape[name] = shape[name] - shift
+        for name in ("crow", "crow_t"):
+            shape[name] = joined[name][start : start + size + 1] - first
+        if not shape["on_boundary"].any():
+            shape["on_boundary"] = shape["on_boundary"][:0]
+        shapes.append({name: tensor.clone() for name, tensor in shape.items()})
+    return shapes
+
+
+def join_states(states: Sequence[dict[str, Any]], sizes: Sequence[int]) -> dict[str, Any]:
+    """What `OperatorStorage.get_extra_state` has beside the tensors, for the batch; it keeps those of the shapes.
+
+    Its options are those that the shapes share.
+    """
+    known, options = ([state[key] for state in states] for key in ("bounds", "options"))
+    first = options[0]
+    parts = [part for state in states for part in state.get("parts") or [state]]
+    return {
+        "source": "batch",
+        "options": {k: v for k, v in first.items() if all(o.get(k, ...) == v for o in options)},
+        "certificate": _joined_certificate([state["certificate"] for state in states]),
+        "sizes": list(sizes),
+        "bounds": list(join_bounds([Bounds(*each) for each in known])) if all(known) else None,
+        "parts": parts,
+    }
+
+
+def _joined_certificate(certificates: Sequence[dict[str, Any] | None]) -> dict[str, Any] | None:
+    """The worst of each figure, and the sum of each count; None where one shape has none."""
+    known = [each for each in certificates if each is not None]
     if len(known) < len(certificates):
         return None
-    return Certificate(
-        holds=all(c.holds for c in known),
-        min_pi=min(c.min_pi for c in known),
-        max_s=max((c.max_s for c in known), key=lambda s: (isnan(s), s)),
-        components=sum(c.components for c in known),
-        rounds=max(c.rounds for c in known),
-        lowered=sum(c.lowered for c in known),
-        widened=sum(c.widened for c in known),
-    )
+    worst = {
+        "holds": all(each["holds"] for each in known),
+        "min_pi": min(each["min_pi"] for each in known),
+        "max_s": max((each["max_s"] for each in known), key=lambda s: (isnan(s), s)),
+        "rounds": max(each["rounds"] for each in known),
+    }
+    return {key: worst[key] if key in worst else sum(c[key] for c in known) for key in known[0]}

@@ -1,16 +1,17 @@
-"""From input to a finished operator: check, shape, stencils, certificate."""
+"""From input to a finished operator: checks, shape, stencils, certificate."""
 
 from __future__ import annotations
 
+import sys
 from dataclasses import asdict, dataclass, replace
-from typing import Any
+from typing import Any, get_args
 
 import torch
-from torch import Tensor
 
 from torchlb.baseline.cotangent import cotangent_laplacian
 from torchlb.errors import InputError, warn
-from torchlb.geometry.frames import PROJECTIONS
+from torchlb.fits.rules import WeightsName
+from torchlb.geometry.frames import Projection
 from torchlb.operator.checks import (
     check_boundary,
     check_dimension,
@@ -22,16 +23,18 @@ from torchlb.operator.checks import (
     check_scale,
     mended_faces,
 )
+from torchlb.operator.cleaning import ArrayLike
 from torchlb.stability.certificate import Certificate
 from torchlb.stability.enforce import certify
 from torchlb.stencils.assemble import Stencils, assemble
-from torchlb.stencils.conditions import CONDITIONS
-from torchlb.stencils.rows import Rows, matrix_rows
+from torchlb.stencils.conditions import CONDITIONS, Condition, ConditionName
+from torchlb.stencils.rows import Reason, Rows, matrix_rows
 from torchlb.stencils.shape import Shape, cloud_shape, mesh_shape
 
-__all__ = ["Built", "Options", "build_cloud", "build_cotangent", "build_mesh"]
+__all__ = ["AssembledOperator", "Options", "build_cloud", "build_cotangent", "build_mesh"]
 
-WEIGHTS = ["least_squares", "polyharmonic"]
+MANY = 0.5
+"""Share of low-order rows from which on a warning names them."""
 
 
 @dataclass(frozen=True)
@@ -40,9 +43,10 @@ class Options:
 
     order: int
     normal_order: int | None
-    projection: str
-    weights: str
+    projection: Projection
+    weights: WeightsName
     num_neighbors: int | None
+    condition: ConditionName | None
     certify: bool
 
     @property
@@ -50,8 +54,13 @@ class Options:
         """Order of the tangent frames: p + 1 unless given."""
         return self.order + 1 if self.normal_order is None else self.normal_order
 
+    @property
+    def held(self) -> Condition | None:
+        """The condition at the boundary, as what it does to rows."""
+        return None if self.condition is None else CONDITIONS[self.condition]
+
     def check(self, num_points: int, ambient_dim: int, dim: int) -> None:
-        """ValueError for a choice that is none."""
+        """InputError for a choice that is none."""
         check_options(
             num_points,
             ambient_dim,
@@ -59,32 +68,32 @@ class Options:
             self.order,
             self.normal_order or 0,
             self.num_neighbors,
-            projection=(self.projection, list(PROJECTIONS)),
-            weights=(self.weights, WEIGHTS),
+            projection=(self.projection, [*get_args(Projection)]),
+            weights=(self.weights, [*get_args(WeightsName)]),
+            condition=(self.condition or "neumann", [*get_args(ConditionName)]),
         )
 
 
 @dataclass(frozen=True)
-class Built:
-    """A finished operator; `geometry.areas` is its mass, and `certificate` is None where none was asked for."""
+class AssembledOperator:
+    """A finished operator; `shape.areas` is its mass, and `certificate` is None where none was asked for."""
 
     rows: Rows
-    geometry: Shape
-    kind: str
+    shape: Shape
+    source: str
     options: dict[str, Any]
     certificate: Certificate | None
 
 
 def build_cloud(
-    points: Any,
+    points: ArrayLike,
     dim: int | None,
     options: Options,
     *,
-    normals: Any,
-    boundary: Any,
-    condition: str,
+    normals: ArrayLike | None,
+    boundary: ArrayLike | str | None,
     progress: bool,
-) -> Built:
+) -> AssembledOperator:
     """Operator on a point cloud; arguments as for `LaplaceBeltrami.from_points`."""
     points = check_points(points)
     check_scale(points)
@@ -92,86 +101,108 @@ def build_cloud(
     d = check_dimension(points, dim, hypersurface=normals is not None)
     options.check(len(points), ambient, d)
     check_distinct(points)
-    if condition not in CONDITIONS:
-        raise InputError(f"condition: expected one of {list(CONDITIONS)}, got {condition!r}")
+    where = check_boundary(boundary, len(points))
+    if where is None and options.condition == "dirichlet":
+        raise InputError(
+            "boundary: condition='dirichlet' holds at boundary points; pass a mask of them, or 'detect'"
+        )
     if normals is not None:
         if d != ambient - 1:
             raise InputError(f"normals: only hypersurfaces have them, not dim={d} in R^{ambient}")
         normals = check_normals(normals, points)
-    geometry = cloud_shape(
+    progress = progress and sys.stderr.isatty()
+    shape = cloud_shape(
         points,
         d,
         options.q,
         num_neighbors=options.num_neighbors,
         normals=normals,
-        boundary=check_boundary(boundary, len(points)),
-        condition=CONDITIONS[condition],
+        boundary=where,
+        condition=options.held,
         progress=progress,
     )
-    built = _finished(geometry, "points", options, progress)
-    if not (built.rows.order > 0).any():
-        warn(
-            f"no point has a stencil, only rows of last resort: do the points lie on a manifold of dimension {d}? "
-            "If not, pass its dimension as `dim`; else `report` says what is wrong",
-        )
-    return built
+    remedy = f"do the points lie on a manifold of dimension {d}? If not, pass its dimension as `dim`; else add points"
+    return _finished(shape, "points", options, remedy, progress)
 
 
 def build_mesh(
-    vertices: Any, faces: Any, options: Options, *, boundary: str | None, progress: bool
-) -> Built:
+    vertices: ArrayLike,
+    faces: ArrayLike,
+    options: Options,
+    *,
+    boundary: ArrayLike | str | None,
+    progress: bool,
+) -> AssembledOperator:
     """Operator on a mesh; arguments as for `LaplaceBeltrami.from_mesh`."""
     vertices = check_points(vertices, "vertices")
     check_scale(vertices)
-    faces = check_faces(faces, len(vertices))
-    options.check(len(vertices), vertices.shape[1], faces.shape[1] - 1)
-    faces = mended_faces(vertices, faces)
-    if boundary not in (*CONDITIONS, None):
-        raise InputError(f"boundary: expected one of {list(CONDITIONS)} or None, got {boundary!r}")
-    geometry = mesh_shape(
+    corners = check_faces(faces, len(vertices))
+    options.check(len(vertices), vertices.shape[1], corners.shape[1] - 1)
+    corners = mended_faces(vertices, corners)
+    if isinstance(boundary, str) and boundary in CONDITIONS:
+        raise InputError(
+            f"boundary: expected where the condition holds, a mask of the vertices, got {boundary!r}; what holds there "
+            f"is condition={boundary!r}"
+        )
+    where = check_boundary(boundary, len(vertices))
+    progress = progress and sys.stderr.isatty()
+    shape = mesh_shape(
         vertices,
-        faces,
+        corners,
         options.q,
         num_neighbors=options.num_neighbors,
-        condition=None if boundary is None else CONDITIONS[boundary],
+        boundary=None if isinstance(where, str) else where,
+        condition=options.held,
         progress=progress,
     )
-    return _finished(geometry, "mesh", options, progress)
+    remedy = "a finer mesh, or one without noise, has better ones"
+    return _finished(shape, "mesh", options, remedy, progress)
 
 
-def build_cotangent(vertices: Any, faces: Any) -> Built:
+def build_cotangent(vertices: ArrayLike, faces: ArrayLike) -> AssembledOperator:
     """The cotangent operator with its mass; arguments as for `LaplaceBeltrami.from_cotangent`."""
     vertices = check_points(vertices, "vertices")
     check_scale(vertices)
-    faces = check_faces(faces, len(vertices))
-    if faces.shape[1] != 3:
-        raise InputError(f"faces: the cotangent operator needs triangles, got {tuple(faces.shape)}")
-    faces = mended_faces(vertices, faces)
-    matrix, mass = cotangent_laplacian(vertices, faces)
-    geometry = mesh_shape(vertices, faces, 0, condition=None, areas=mass)
-    everything: Tensor = torch.arange(len(vertices))
-    rows = matrix_rows(matrix, geometry.points, geometry.frames, everything)
-    return Built(rows, geometry, "cotangent", {}, None)
+    corners = check_faces(faces, len(vertices))
+    if corners.shape[1] != 3:
+        raise InputError(
+            f"faces: the cotangent operator needs triangles, got {tuple(corners.shape)}"
+        )
+    corners = mended_faces(vertices, corners)
+    matrix, mass = cotangent_laplacian(vertices, corners)
+    shape = mesh_shape(vertices, corners, 0, condition=None, areas=mass)
+    rows = matrix_rows(matrix, shape.points, shape.frames, torch.arange(len(vertices)))
+    return AssembledOperator(rows, shape, "cotangent", {}, None)
 
 
-def _finished(geometry: Shape, kind: str, options: Options, progress: bool) -> Built:
-    """Rows of the shape, certified if asked for."""
+def _finished(
+    shape: Shape, source: str, options: Options, remedy: str, progress: bool
+) -> AssembledOperator:
+    """Rows from the candidates, certified if asked for; a warning if at most of the points there are only low ones."""
     stencils = Stencils(
-        geometry,
+        shape,
         options.order,
         projection=options.projection,
         weights=options.weights,
         num_neighbors=options.num_neighbors,
     )
-    rows = assemble(stencils, progress=progress)
-    if not options.certify:
-        return Built(rows, geometry, kind, asdict(options), None)
-    rows, mass, certificate = certify(
-        rows,
-        geometry.areas,
-        stencils.rows,
-        len(stencils.candidates),
-        outflow=not geometry.condition.conserves,
-        progress=progress,
-    )
-    return Built(rows, replace(geometry, areas=mass), kind, asdict(options), certificate)
+    rows, certificate = assemble(stencils, progress=progress), None
+    if options.certify:
+        rows, mass, certificate = certify(
+            rows,
+            shape.areas,
+            stencils.rows,
+            len(stencils.candidates),
+            outflow=not shape.condition.conserves,
+            progress=progress,
+        )
+        shape = replace(shape, areas=mass)
+    low = rows.order == 0
+    share = float(low.double().mean())
+    if share >= MANY:
+        reason = Reason(int(rows.reason[low].mode().values)).text
+        warn(
+            f"{share:.0%} of the points have only low-order rows, of first order at best; at most of them: {reason}. "
+            f"{remedy[:1].upper()}{remedy[1:]}; `print(lb.report)` says more"
+        )
+    return AssembledOperator(rows, shape, source, asdict(options), certificate)

@@ -8,22 +8,22 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from torchlb.fits.rules import reference
-from torchlb.stencils.rows import Reason, Rows
+from torchlb.fits.rules import WEIGHT_RULES, reference
+from torchlb.stencils.rows import Reason
 
 __all__ = ["StencilReport"]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False, repr=False)
 class StencilReport:
-    """Free numbers of each point's stencil (`method.md`, section 4). `print(lb.report)` for a summary.
+    """Numbers of each point's stencil (`method.md`, section 4). `print(lb.report)` for a summary.
 
     Attributes
     ----------
     requested_order : p asked for.
     dim : d of the manifold.
     order : (N,), order of accuracy reached; 0 for a low-order row.
-    normal_order : (N,), degree q behind the tangent frame; 0 where it stayed poor.
+    normal_order : (N,), degree q behind the tangent frame; 0 where it stayed the initial one.
     num_neighbors : (N,), points of the stencil, itself included.
     growth : (N,), ρ² Σ|w|: the factor of the a-priori error bound.
     condition : (N,), of the scaled weighted Vandermonde matrix; NaN in a low-order row.
@@ -43,22 +43,6 @@ class StencilReport:
     rule: Int[Tensor, " N"]
     reason: Int[Tensor, " N"]
 
-    @staticmethod
-    def of(rows: Rows, normal_order: Int[Tensor, " N"], requested_order: int) -> StencilReport:
-        """Report of an assembled stencil."""
-        return StencilReport(
-            requested_order,
-            rows.gradient.shape[1],
-            rows.order,
-            normal_order,
-            rows.length,
-            rows.growth,
-            rows.condition,
-            rows.off_diagonal_ratio,
-            rows.rule,
-            rows.reason,
-        )
-
     @property
     def order_counts(self) -> dict[int, int]:
         """Number of points by order reached, highest first, zeros included."""
@@ -71,24 +55,51 @@ class StencilReport:
         counts = torch.bincount(self.reason, minlength=len(Reason)).tolist()
         return {reason.text: counts[reason] for reason in Reason if reason and counts[reason]}
 
-    def __str__(self) -> str:
+    @property
+    def summary(self) -> dict[str, int | float]:
+        """The same as numbers, with medians and maxima over the stencils, and the growth that good ones have."""
+        reached = int((self.order >= self.requested_order).sum()) if self.requested_order else 0
+        numbers: dict[str, int | float] = {
+            "points": len(self.order),
+            "requested_order": self.requested_order,
+        }
+        numbers |= {"at_requested_order": reached, "low_order": int((self.order == 0).sum())}
+        for name, (middle, _, most) in self._quantiles().items():
+            numbers |= {f"median_{name}": middle, f"max_{name}": most}
+        if self.requested_order:
+            numbers["reference_growth"] = reference(self.dim, self.requested_order + 1).growth
+        return numbers
+
+    def _quantiles(self) -> dict[str, tuple[float, float, float]]:
+        """Median, 95 % and maximum over the stencils that are none of low order."""
+        found = {}
+        for name in ("num_neighbors", "growth", "condition", "off_diagonal_ratio"):
+            values = getattr(self, name)[self.order > 0].double().sort().values
+            if len(values):
+                places = len(values) // 2, int(0.95 * (len(values) - 1)), -1
+                found[name] = tuple(float(values[place]) for place in places)
+        return found
+
+    def __repr__(self) -> str:
         """Summary of a screenful."""
         total = len(self.order)
         lines = [f"{total} points, order {self.requested_order} requested"]
         for order, count in self.order_counts.items():
             if count:
-                name = f"order {order}" if order else "fallback (first order at best)"
+                name = f"order {order}" if order else "low order (first at best)"
                 lines.append(f"  {name:<31}{count:>9}  {100 * count / total:6.2f} %")
         if self.reason_counts:
             lines.append("why below the requested order")
             lines += [f"  {text:<38}{count:>9}" for text, count in self.reason_counts.items()]
-        stencil = self.order > 0
-        if stencil.any():
+        splines = int((self.rule == list(WEIGHT_RULES).index("polyharmonic")).sum())
+        if splines:
+            lines.append(
+                f"  {'weights of polyharmonic splines':<31}{splines:>9}  {100 * splines / total:6.2f} %"
+            )
+        if quantiles := self._quantiles():
             lines.append("stencils                      median      95 %       max")
-            for name in ("num_neighbors", "growth", "condition", "off_diagonal_ratio"):
-                values = getattr(self, name)[stencil].double().sort().values
-                middle, high = values[len(values) // 2], values[int(0.95 * (len(values) - 1))]
-                lines.append(f"  {name:<22}{middle:12.4g}{high:10.4g}{values[-1]:10.4g}")
-            good = reference(self.dim, self.requested_order + 1).growth
+            for name, (middle, high, most) in quantiles.items():
+                lines.append(f"  {name:<22}{middle:12.4g}{high:10.4g}{most:10.4g}")
+            good = self.summary["reference_growth"]
             lines.append(f"  (growth of a good stencil of the requested order: {good:.3g})")
         return "\n".join(lines)

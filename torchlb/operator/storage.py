@@ -5,29 +5,24 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import asdict
 from math import isnan
-from typing import Any
+from typing import Any, TypeVar
 
 import torch
 from torch import Tensor, nn
 
+from torchlb.errors import InputError, warn
 from torchlb.linalg.sparse import to_scipy, transpose_pattern
 from torchlb.linalg.spectral_bounds import Bounds, spectral_bounds
 from torchlb.spectral.eigenbasis import Eigenbasis
 from torchlb.stability.certificate import Certificate
 
-__all__ = ["REPORT_FIELDS", "OperatorStorage"]
+__all__ = ["BASIS", "REPORT_FIELDS", "OperatorStorage"]
 
-REPORT_FIELDS = (
-    "order",
-    "normal_order",
-    "num_neighbors",
-    "growth",
-    "condition",
-    "off_diagonal_ratio",
-    "rule",
-    "reason",
-)
+REAL_FIELDS = ("growth", "condition", "off_diagonal_ratio")
+REPORT_FIELDS = ("order", "normal_order", "num_neighbors", *REAL_FIELDS, "rule", "reason")
 BUFFERS = ("crow", "col", "values", "gradient_values", "mass", "points", "frames", "normals")
+TRANSPOSE = ("crow_t", "col_t", "order_t")
+Storage = TypeVar("Storage", bound="OperatorStorage")
 BASIS = ("eigenvalues", "eigenvectors", "left", "decay_rates", "modal_transform")
 
 
@@ -46,6 +41,10 @@ class OperatorStorage(nn.Module):
     points: Tensor
     frames: Tensor
     normals: Tensor
+    on_boundary: Tensor
+    crow_t: Tensor
+    col_t: Tensor
+    order_t: Tensor
     basis_eigenvalues: Tensor
     basis_eigenvectors: Tensor
     basis_left: Tensor
@@ -54,19 +53,20 @@ class OperatorStorage(nn.Module):
 
     def __init__(self) -> None:
         super().__init__()
-        self.kind = "empty"
+        self.source = "empty"
         self.options: dict[str, Any] = {}
         self.certificate: Certificate | None = None
         self._sizes: list[Tensor] | None = None
+        self.parts: list[dict[str, Any]] | None = None  # the extra states of the shapes of a batch
         self._bounds: Tensor | None = None
         for name in BUFFERS:
             self.register_buffer(name, torch.zeros(0))
+        self.register_buffer("on_boundary", torch.zeros(0, dtype=torch.bool))
         self.crow, self.col = torch.zeros(1, dtype=torch.int64), torch.zeros(0, dtype=torch.int64)
         for name in REPORT_FIELDS:
-            real = name in ("growth", "condition", "off_diagonal_ratio")
-            empty = torch.zeros(0, dtype=torch.get_default_dtype() if real else torch.int64)
-            self.register_buffer(f"report_{name}", empty)
-        for name in ("crow_t", "col_t", "order_t"):  # of the transpose, for the backward pass
+            dtype = torch.get_default_dtype() if name in REAL_FIELDS else torch.int64
+            self.register_buffer(f"report_{name}", torch.zeros(0, dtype=dtype))
+        for name in TRANSPOSE:  # for the backward pass
             self.register_buffer(name, torch.zeros(0, dtype=torch.int64), persistent=False)
         for name in BASIS:
             self.register_buffer(f"basis_{name}", torch.zeros(0), persistent=False)
@@ -82,10 +82,30 @@ class OperatorStorage(nn.Module):
         return None if self._sizes is None else tuple(t.shape[0] for t in self._sizes)
 
     @sizes.setter
-    def sizes(
-        self, sizes: Sequence[int] | None
-    ) -> None:  # in shapes of tensors: numbers are compiled in
+    def sizes(self, sizes: Sequence[int] | None) -> None:
+        # In shapes of tensors, since numbers are compiled in.
         self._sizes = None if sizes is None else [torch.empty(n, 0) for n in sizes]
+
+    @classmethod
+    def from_buffers(
+        cls: type[Storage],
+        buffers: dict[str, Tensor],
+        state: dict[str, Any],
+        basis: Eigenbasis | None = None,
+    ) -> Storage:
+        """An operator of given tensors, by their names here, and of what `get_extra_state` has beside them.
+
+        Without the pattern of the transpose it is found; all else that is left out stays empty.
+        """
+        lb = cls()
+        for name, tensor in buffers.items():
+            setattr(lb, name, tensor)
+        lb.set_extra_state(state)
+        if "order_t" not in buffers:
+            lb._transpose()
+        if basis is not None:
+            lb.keep_basis(basis)
+        return lb
 
     @property
     def num_points(self) -> int:
@@ -126,7 +146,16 @@ class OperatorStorage(nn.Module):
             self.crow, self.col, self.num_points
         )
 
-    def _keep(self, basis: Eigenbasis | None, *, store: bool | None = None) -> None:
+    @property
+    def basis(self) -> Eigenbasis | None:
+        """All eigenpairs that are stored; None if there are none."""
+        if len(self.basis_left) == 0:
+            return None
+        modes = (self.basis_decay_rates, self.basis_modal_transform)
+        pairs = (self.basis_eigenvalues, self.basis_eigenvectors, self.mass, self.basis_left)
+        return Eigenbasis(*pairs, self.sizes, *(t if len(t) else None for t in modes))
+
+    def keep_basis(self, basis: Eigenbasis | None = None, *, store: bool | None = None) -> None:
         """Hold a basis (None: the one there is) in buffers, in `state_dict` or not (None: as it was)."""
         for name in BASIS:
             key = f"basis_{name}"
@@ -135,26 +164,48 @@ class OperatorStorage(nn.Module):
             outside = key in self._non_persistent_buffers_set
             self.register_buffer(key, value, persistent=not outside if store is None else store)
 
+    def check_points(self, points: Tensor) -> None:
+        """InputError unless the operator was built from these points: as many, each in its place to float32 rounding.
+
+        An operator does not follow its points: after scaling, turning, or taking a part of them it is another one.
+        """
+        if points.shape != self.points.shape:
+            raise InputError(
+                f"points: expected the {tuple(self.points.shape)} that the operator was built from, got "
+                f"{tuple(points.shape)}; build it again after points are added, left out or projected"
+            )
+        theirs, ours = points.detach().to(self.points.device).double(), self.points.double()
+        rounding = max(
+            torch.finfo(torch.promote_types(t, torch.float16)).eps
+            for t in (points.dtype, self.points.dtype)
+        )
+        most = 4 * max(rounding, torch.finfo(torch.float32).eps) * float(ours.abs().amax())
+        distance = (theirs - ours).abs().amax(1)
+        moved = (~(distance <= most)).nonzero()[:, 0]
+        if len(moved):
+            names = ", ".join(map(str, moved[:8].tolist())) + (", …" if len(moved) > 8 else "")
+            raise InputError(
+                f"points: {len(moved)} of {len(points)} are not where they were when the operator was built ({names}; "
+                f"by up to {float(distance.amax()):.3g}); build it again after scaling, turning or deforming a shape"
+            )
+
     def get_extra_state(self) -> dict[str, Any]:
-        """Kind, options, certificate and spectral bounds, plain types only."""
-        certificate = None if self.certificate is None else asdict(self.certificate)
-        sizes = None if self.sizes is None else list(self.sizes)
+        """Source, options, certificate and spectral bounds, plain types only."""
         return {
-            "kind": self.kind,
+            "source": self.source,
             "options": self.options,
-            "certificate": certificate,
-            "sizes": sizes,
+            "certificate": None if self.certificate is None else asdict(self.certificate),
+            "sizes": None if self.sizes is None else list(self.sizes),
             "bounds": list(self.spectral_bounds),
+            "parts": self.parts,
         }
 
     def set_extra_state(self, state: dict[str, Any]) -> None:
-        """Inverse of `get_extra_state`."""
-        self.kind, self.options = state["kind"], dict(state["options"])
-        found = state["certificate"]
+        """Inverse of `get_extra_state`; what is left out is not known."""
+        self.source, self.options = state["source"], dict(state["options"])
+        found, sizes, bounds = (state.get(key) for key in ("certificate", "sizes", "bounds"))
         self.certificate = None if found is None else Certificate(**found)
-        sizes = state.get("sizes")
-        self.sizes = None if sizes is None else tuple(sizes)
-        bounds = state.get("bounds")
+        self.sizes, self.parts = None if sizes is None else tuple(sizes), state.get("parts")
         self.set_bounds(bounds and Bounds(*bounds))
 
     def _load_from_state_dict(
@@ -167,7 +218,25 @@ class OperatorStorage(nn.Module):
         unexpected_keys: Any,
         error_msgs: Any,
     ) -> None:
-        """Take buffers of any size: an operator is data, not parameters of a fixed shape."""
+        """Buffers of any size into an empty operator; one that has points takes only a state of as many.
+
+        A state of other points replaces the operator, too, and a warning says so.
+        """
+        theirs = state_dict.get(f"{prefix}points")
+        if self.num_points and theirs is not None:
+            if len(theirs) != self.num_points:
+                error_msgs.append(
+                    f"{prefix or 'LaplaceBeltrami'}: the state is of an operator on {len(theirs)} points, this one has "
+                    f"{self.num_points}; load it into an empty LaplaceBeltrami(), or leave it out of the state"
+                )
+                return
+            try:
+                self.check_points(theirs)
+            except InputError:
+                warn(
+                    f"{prefix or 'LaplaceBeltrami'}: replaced by an operator on as many other points; leave it out "
+                    "of the state to keep the one that is there"
+                )
         for name in BASIS:
             stored = f"{prefix}basis_{name}" in state_dict
             self.register_buffer(f"basis_{name}", self.values.new_zeros(0), persistent=stored)

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from torchlb.errors import InputError
 
-__all__ = ["Eigenbasis", "Spectral", "check_num_pairs", "stack_eigenbases"]
+__all__ = ["Eigenbasis", "Spectral", "check_num_pairs", "stack_eigenbases", "unstack_eigenbases"]
 
 
 def check_num_pairs(k: object) -> int:
@@ -119,6 +119,23 @@ class Eigenbasis:
             return functionals.mT @ f
         parts = zip(functionals.split(self.sizes), f.split(self.sizes, dim=-2), strict=True)
         return torch.stack([block.mT @ g for block, g in parts], dim=-3)
+
+
+def unstack_eigenbases(basis: Eigenbasis) -> list[Eigenbasis]:
+    """The basis of each shape of a batch, without the padding: the inverse of `stack_eigenbases`."""
+    if basis.sizes is None:
+        return [basis]
+    parts = []
+    columns = [t.split(basis.sizes) for t in (basis.eigenvectors, basis.mass, basis.left)]
+    for s, (vectors, mass, left) in enumerate(zip(*columns, strict=True)):
+        k = int((vectors != 0).any(0).sum())
+        pairs = (basis.eigenvalues[s, :k], vectors[:, :k], mass, left[:, :k])
+        if basis.decay_rates is None or basis.modal_transform is None:
+            parts.append(Eigenbasis(*pairs))
+        else:
+            modes = (basis.decay_rates[s, :, :k], basis.modal_transform[s, :, :k, :k])
+            parts.append(Eigenbasis(*pairs, None, *modes))
+    return parts
 
 
 def stack_eigenbases(bases: list[Eigenbasis]) -> Eigenbasis:

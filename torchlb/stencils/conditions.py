@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Literal
 
 import torch
 from jaxtyping import Float, Int
@@ -11,7 +12,7 @@ from torch import Tensor
 from torchlb.geometry.boundary import Boundary
 from torchlb.stencils.rows import Rows
 
-__all__ = ["CONDITIONS", "Condition", "Dirichlet", "Neumann"]
+__all__ = ["CONDITIONS", "Condition", "ConditionName", "Dirichlet", "Neumann"]
 
 CLOSEST = 0.1
 """Share of the farthest distance in its row that a boundary point's own scale has at least: near pairs are stiff."""
@@ -76,5 +77,6 @@ class Dirichlet(Condition):
         return replace(rows, laplacian=torch.where(own, -4 * dim / nearest[local], kept))
 
 
-CONDITIONS = {"neumann": Neumann(), "dirichlet": Dirichlet()}
+ConditionName = Literal["neumann", "dirichlet"]
+CONDITIONS: dict[str, Condition] = {"neumann": Neumann(), "dirichlet": Dirichlet()}
 """The values of the option `condition`; None stands for no condition at all."""
