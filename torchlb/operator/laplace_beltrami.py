@@ -173,6 +173,7 @@ class LaplaceBeltrami(OperatorStorage):
         if len(shapes) == 0:
             raise InputError("batch: got no shapes")
         sizes = [n for shape in shapes for n in shape.sizes or (shape.num_points,)]
+        _ = [shape.bounds for shape in shapes]  # of one from an old state they are found here, once
         state = join_states([shape.get_extra_state() for shape in shapes], sizes)
         bases = [shape.basis for shape in shapes if shape.basis and not shape.sizes]
         basis = stack_eigenbases(bases) if len(bases) == len(shapes) else None

@@ -196,7 +196,7 @@ class OperatorStorage(nn.Module):
             "options": self.options,
             "certificate": None if self.certificate is None else asdict(self.certificate),
             "sizes": None if self.sizes is None else list(self.sizes),
-            "bounds": list(self.spectral_bounds),
+            "bounds": None if self._bounds is None else list(self.spectral_bounds),
             "parts": self.parts,
         }
 
