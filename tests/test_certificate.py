@@ -127,14 +127,16 @@ def test_every_component_has_its_own_null_vector():
     assert abs(ratio - 4) < 0.05
 
 
-@pytest.mark.parametrize("boundary", ["neumann", "dirichlet"])
-def test_parts_of_a_mesh_may_be_of_two_scales(boundary):
+@pytest.mark.parametrize("condition", ["neumann", "dirichlet"])
+def test_parts_of_a_mesh_may_be_of_two_scales(condition):
     """A hemisphere beside a torus, as it is and smaller by 2²⁰: the same operator and mass, up to the scale."""
     (vertices, faces), (ring, corners) = Hemisphere().mesh(500), Torus().mesh(400)
 
     def build(factor):
         both = torch.cat([factor * vertices, ring + 9])
-        return LaplaceBeltrami.from_mesh(both, torch.cat([faces, corners + 500]), boundary=boundary)
+        return LaplaceBeltrami.from_mesh(
+            both, torch.cat([faces, corners + 500]), condition=condition
+        )
 
     unscaled, lb = build(1.0), build(2.0**-20)
     assert lb.certificate.holds

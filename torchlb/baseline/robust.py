@@ -12,11 +12,13 @@ from scipy import sparse
 from scipy.sparse import csgraph
 from torch import Tensor
 
+from torchlb.errors import warn
 from torchlb.geometry.neighbors import mesh_graph
 from torchlb.linalg.sparse import with_diagonal
 
 __all__ = ["robust_rows"]
 
+LEAST_AREA = 1e-12
 MOLLIFY = 1e-5
 """robust_laplacian's intrinsic mollification, relative to the mean edge: lets zero-area triangles in."""
 
@@ -45,8 +47,14 @@ def robust_rows(
         unit = _units(space, mesh_graph(faces, len(space)))
         weak, mass = robust_laplacian.mesh_laplacian(space / unit[:, None], faces.numpy(), MOLLIFY)
     area = cast(np.ndarray, mass.diagonal())
-    # Degenerate triangles leave vertices with next to no area; a row must stay finite.
-    area = np.maximum(area, 1e-12 * area.mean()) * unit**2
+    least = LEAST_AREA * area.mean()
+    tiny = np.flatnonzero(area < least)
+    if len(tiny):
+        warn(
+            f"{len(tiny)} points ({', '.join(map(str, tiny[:8]))}{', …' if len(tiny) > 8 else ''}) have next to no "
+            f"area, their triangles are degenerate; {LEAST_AREA:g} of the mean is taken, so that rows stay finite"
+        )
+    area = np.maximum(area, least) * unit**2
     off = sparse.coo_array(-weak)
     row, col = off.coords
     keep = (row != col) & (off.data > 0)

@@ -52,7 +52,7 @@ def reference(
     A one-sided stencil is centred on a flat boundary whose Neumann data it uses.
 
     >>> [round(reference(2, m).growth) for m in (2, 4, 6, 8)]
-    [23, 59, 111, 181]
+    [23, 59, 110, 180]
     >>> [round(reference(2, m, one_sided=True).growth) for m in (2, 4, 6, 8)]
     [23, 173, 761, 2367]
     """

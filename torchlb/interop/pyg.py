@@ -45,6 +45,7 @@ class LaplaceBeltramiTransform(BaseTransform):
     lb_frames          (N, n, d)    orthonormal tangent vectors
     lb_pos             (N, n)       the points, by which `to_operator` sees whether `pos` was changed since
     lb_normals         (N, n)       unit normals of a hypersurface
+    lb_boundary        (N,)         mask of the points where the boundary condition holds, if any
     lb_basis           (…,)         with k > 0: all parts of the eigenbasis in one vector, for `to_operator`
     lb_basis_size      (1, 2)       number of eigenpairs, and whether its span is invariant
     lb_info            str          source, options, certificate, bounds as JSON
@@ -137,8 +138,9 @@ def _keys(lb: LaplaceBeltrami, k: int) -> dict[str, Any]:
         "lb_pos": lb.points,
         "lb_info": json.dumps(lb.get_extra_state()),
     }
-    if len(lb.normals):
-        keys["lb_normals"] = lb.normals
+    for name, tensor in (("lb_normals", lb.normals), ("lb_boundary", lb.on_boundary)):
+        if len(tensor):
+            keys[name] = tensor
     if k > 0:
         basis = lb.invariant_basis(k)
         parts = [getattr(basis, name) for name in BASIS]
@@ -191,16 +193,18 @@ def _buffers(data: Any, sizes: Int[Tensor, " S"]) -> dict[str, Tensor]:
         "mass": data.lb_mass,
         "points": points,
         "frames": data.lb_frames,
-        "normals": data.lb_normals if "lb_normals" in data else points[:0],
+        "normals": data.get("lb_normals", points[:0]),
+        "on_boundary": data.get("lb_boundary", points.new_zeros(0, dtype=torch.bool)),
     }
 
 
 def _check_unchanged(data: Any, sizes: Int[Tensor, " S"]) -> None:
     """ValueError unless `pos` is what the operator was built from, but for a translation of each shape."""
     built, pos = data.lb_pos, data.pos
-    if len(pos) != len(built) or int(sizes.sum()) != len(built):
+    count = max(len(built), int(data.lb_edge_index.max()) + 1)  # some transforms sample every key
+    if not len(pos) == int(sizes.sum()) == count:
         raise InputError(
-            f"{len(pos)} points, but an operator of {len(built)}: nodes were added or taken away after "
+            f"{len(pos)} points, but an operator of {count}: nodes were added or taken away after "
             "LaplaceBeltramiTransform; apply it last"
         )
     moved = (pos - built).split(sizes.tolist())

@@ -27,8 +27,7 @@ from torchlb.spectral.eigenbasis import (
 )
 from torchlb.spectral.eigensolver import blockwise_eigenbasis
 from torchlb.stability.certificate import Certificate
-from torchlb.stability.null_vector import has_outflow
-from torchlb.stencils.conditions import ConditionName
+from torchlb.stencils.conditions import CONDITIONS, ConditionName
 
 __all__ = ["LaplaceBeltrami"]
 
@@ -372,7 +371,9 @@ class LaplaceBeltrami(OperatorStorage):
         k = check_num_pairs(k)
         if self.basis_left.shape[-1] < min(k, max(self.sizes or (self.num_points,))):
             matrix, rounding = self.to_scipy(), torch.finfo(self.dtype).eps
-            outflow = bool(has_outflow(matrix, rounding).any())
+            states = self.parts or [self.get_extra_state()]
+            conditions = [CONDITIONS.get(state["options"].get("condition")) for state in states]
+            outflow = not all(c is None or c.conserves for c in conditions)
             options = {"outflow": outflow, "rounding": rounding}
             self.keep_basis(blockwise_eigenbasis(matrix, self.mass, k, self.sizes, **options))
         if store:

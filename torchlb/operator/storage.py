@@ -218,24 +218,18 @@ class OperatorStorage(nn.Module):
         unexpected_keys: Any,
         error_msgs: Any,
     ) -> None:
-        """Buffers of any size into an empty operator; one that has points takes only a state of as many.
+        """Take buffers of any size: an operator is data, not parameters of a fixed shape.
 
-        A state of other points replaces the operator, too, and a warning says so.
+        Where that replaces an operator on other points a warning says so.
         """
         theirs = state_dict.get(f"{prefix}points")
         if self.num_points and theirs is not None:
-            if len(theirs) != self.num_points:
-                error_msgs.append(
-                    f"{prefix or 'LaplaceBeltrami'}: the state is of an operator on {len(theirs)} points, this one has "
-                    f"{self.num_points}; load it into an empty LaplaceBeltrami(), or leave it out of the state"
-                )
-                return
             try:
                 self.check_points(theirs)
             except InputError:
                 warn(
-                    f"{prefix or 'LaplaceBeltrami'}: replaced by an operator on as many other points; leave it out "
-                    "of the state to keep the one that is there"
+                    f"{prefix or 'LaplaceBeltrami'}: the operator on {self.num_points} points is replaced by one on "
+                    f"{len(theirs)} others; leave it out of the state to keep the one that is there"
                 )
         for name in BASIS:
             stored = f"{prefix}basis_{name}" in state_dict

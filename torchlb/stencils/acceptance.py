@@ -15,9 +15,10 @@ from torchlb.stencils.rows import Reason
 
 __all__ = ["Acceptance"]
 
-FACTOR, FACTOR_AT_BOUNDARY = 3.0, 4.1
-"""Growth may be this many times that of the reference stencil, which at a boundary is the one-sided one. FACTOR also
-bounds the off-diagonal ratio: over that of an M-matrix row, 1, and at a boundary over that of the reference."""
+FACTOR, FACTOR_AT_BOUNDARY = 3.0, 4.0
+"""Growth may be this many times that of the reference stencil. At a boundary that is the one-sided one, or what is
+accepted inside if that is larger, since corners have more. FACTOR also bounds the off-diagonal ratio: over that of an
+M-matrix row, 1, and at a boundary over that of the reference."""
 RESOLVED_ON_MESH = {"tangent": 1.776, "normal": 0.888}
 RESOLVED_ON_CLOUD = 4.14
 """Heights may leave this much of a fit, over the growth g∞ that turns it into an error of Δ. Triangles know more of a
@@ -56,7 +57,8 @@ class Acceptance:
         inside = reference(self.dim, candidate.degree, candidate.rule)
         edge = reference(self.dim, candidate.degree, one_sided=True) if touching.any() else inside
         too_wide = candidate.degree > 2 and candidate.factor > WIDEST_AT_BOUNDARY
-        at_edge = 0.0 if too_wide else FACTOR_AT_BOUNDARY * edge.growth
+        one_sided = max(edge.growth, FACTOR * inside.growth)
+        at_edge = 0.0 if too_wide else FACTOR_AT_BOUNDARY * one_sided
         max_growth = torch.where(touching, at_edge, FACTOR * inside.growth)
         max_ratio = FACTOR * torch.where(touching, edge.off_diagonal_ratio, 1.0)
         resolved, resolvable = self._resolved(candidate)

@@ -17,6 +17,7 @@ from scipy.sparse import csgraph
 from torch import Tensor
 
 from torchlb.baseline.robust import robust_rows
+from torchlb.errors import warn
 from torchlb.geometry.boundary import Boundary
 from torchlb.geometry.neighbors import GraphBalls, nearest_neighbors
 from torchlb.geometry.voronoi import cell_laplacian, cell_volume
@@ -174,11 +175,15 @@ class CloudLowOrder:
         None where it cannot be asked, or refuses: a point has no triangle, as on a line.
         """
         points = self.balls.points
-        if not self.surface or len(points) < 4:
+        spread = torch.linalg.svdvals(points - points.mean(0))
+        if not self.surface or len(points) < 4 or spread[1] <= 1e-9 * spread[0]:
             return None
         try:
             rows, areas = robust_rows(points, None)
-        except RuntimeError:
+        except RuntimeError as error:
+            warn(
+                f"robust_laplacian refuses the cloud ({error}); Voronoi cells give all low-order rows"
+            )
             return None
         close = self._nearest[:, : self.balls.frames.shape[-1] + 1]
         row = np.arange(len(points)).repeat(close.shape[1])
