@@ -26,7 +26,7 @@ from torchlb.stencils.rows import Reason, Rows
 __all__ = ["Schedule", "certify"]
 MARGIN = 0.02
 """A point of smaller weight, π below this share of its area, has the rows around it marked while they can change."""
-SHARE = 0.2
+SHARE = 0.1
 """Of the largest entry or contribution around, from which on a row is marked."""
 PEAK = 0.02
 """Share of the largest contribution to a direction from which on a row can be a peak of its own."""
