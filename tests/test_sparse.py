@@ -16,8 +16,8 @@ from tolerances import TOLERANCE
 from torchlb.linalg.sparse import (
     _product,
     _values_gradient,
+    csr_product,
     from_scipy,
-    matmul,
     to_scipy,
     transpose_pattern,
 )
@@ -52,7 +52,7 @@ class Product(torch.nn.Module):
 
     def forward(self, x, values=None):
         values = self.values if values is None else values
-        return matmul(self.crow, self.col, values, (self.crow_t, self.col_t, self.order_t), x)
+        return csr_product([self.crow, self.col, self.crow_t, self.col_t, self.order_t], values, x)
 
     def dense(self):
         zero = torch.zeros(self.shape, dtype=self.values.dtype)
@@ -88,7 +88,7 @@ def test_large_sparse_product_and_gradients_are_those_of_scipy(dtype):
     matrix = sparse.csr_array(rng.normal(size=(500, 300)) * (rng.random((500, 300)) < 0.1))
     crow, col, values = from_scipy(matrix)
     values, x = values.to(dtype).requires_grad_(), features(300, 40, dtype)
-    y = matmul(crow, col, values, transpose_pattern(crow, col, 300), x)
+    y = csr_product([crow, col, *transpose_pattern(crow, col, 300)], values, x)
     g = torch.randn_like(y)
     close(y, torch.from_numpy(matrix @ x.detach().numpy()).to(dtype), dtype)
     grad_x, grad_values = grad(y, (x, values), g)

@@ -16,8 +16,6 @@ from torch import Tensor
 from torchlb.errors import InputError
 from torchlb.linalg.sparse import with_diagonal
 
-__all__ = ["cotangent_laplacian"]
-
 
 def cotangent_laplacian(
     vertices: Float[Tensor, "N n"], faces: Int[Tensor, "F 3"]

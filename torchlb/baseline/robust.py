@@ -16,8 +16,6 @@ from torchlb.errors import warn
 from torchlb.geometry.neighbors import mesh_graph
 from torchlb.linalg.sparse import with_diagonal
 
-__all__ = ["robust_rows"]
-
 LEAST_AREA = 1e-12
 MOLLIFY = 1e-5
 """robust_laplacian's intrinsic mollification, relative to the mean edge: lets zero-area triangles in."""

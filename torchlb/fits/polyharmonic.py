@@ -15,8 +15,6 @@ from torchlb.fits.weights import (
     _scaled_system,
 )
 
-__all__ = ["polyharmonic_weights"]
-
 
 def polyharmonic_weights(
     coords: Float[Tensor, "B neighbors d"],

@@ -18,15 +18,6 @@ from torch import Tensor
 
 from torchlb.errors import InputError
 
-__all__ = [
-    "exponents",
-    "gradient_functional",
-    "hessian_functional",
-    "monomial_derivatives",
-    "monomials",
-    "num_monomials",
-]
-
 
 def num_monomials(dim: int, degree: int) -> int:
     """Number M of monomials of `dim` variables and total degree ≤ `degree`, the constant included.

@@ -12,8 +12,6 @@ from torchlb.fits.polyharmonic import polyharmonic_weights
 from torchlb.fits.polynomials import num_monomials
 from torchlb.fits.weights import least_squares_weights, positive_weights
 
-__all__ = ["SIZE_FACTORS", "WEIGHT_RULES", "Reference", "WeightsName", "reference"]
-
 WeightsName = Literal["least_squares", "polyharmonic"]
 WEIGHT_RULES = {
     "least_squares": least_squares_weights,

@@ -19,8 +19,6 @@ from torchlb.fits.polynomials import (
     monomials,
 )
 
-__all__ = ["MAX_RESIDUAL", "Weights", "least_squares_weights", "positive_weights", "window"]
-
 MAX_RESIDUAL = 1e-10
 """Moment equations are met if nothing larger is left; what a system without full rank leaves is."""
 

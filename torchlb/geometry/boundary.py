@@ -18,8 +18,6 @@ from torchlb.geometry.frames import cloud_frames, mesh_frames, normals_of_frames
 from torchlb.geometry.neighbors import GraphBalls, mesh_graph, nearest_graph, nearest_neighbors
 from torchlb.geometry.voronoi import largest_gap
 
-__all__ = ["Boundary", "boundary_faces", "boundary_of_cloud", "boundary_of_mesh", "detect_boundary"]
-
 OPEN_ANGLE, NEAREST = 2.3, 32
 """Radians of the tangent plane without any of so many nearest points that make a point of a cloud a boundary point.
 Of 16, two in a hundred random points leave as much open, of 32 none in a thousand."""

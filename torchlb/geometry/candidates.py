@@ -14,8 +14,6 @@ from torchlb.fits.polynomials import num_monomials
 from torchlb.fits.rules import SIZE_FACTORS
 from torchlb.geometry.neighbors import GraphBalls
 
-__all__ = ["CHUNK_BYTES", "Candidate", "Search", "chunks", "list_candidates", "stencil_candidates"]
-
 CHUNK_BYTES = 2**28
 """Bound on one array of a chunk of points: about four of them live at once."""
 

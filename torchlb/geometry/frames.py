@@ -17,20 +17,6 @@ from torchlb.fits.weights import MAX_RESIDUAL, least_squares_weights, window
 from torchlb.geometry.candidates import Candidate, Search
 from torchlb.geometry.neighbors import MIN_ALIGNMENT, GraphBalls, admissible
 
-__all__ = [
-    "PROJECTIONS",
-    "Projection",
-    "cloud_frames",
-    "complete_frames",
-    "face_normals",
-    "local_heights",
-    "local_offsets",
-    "mesh_frames",
-    "normals_of_frames",
-    "refine_frames",
-    "vertex_normals",
-]
-
 MAX_GRADIENT_GROWTH = 15.0
 """A slope is trusted if ρ Σ|w| of its weights stays below this; good stencils have 2 to 8."""
 NO_NORMAL = 1e-12

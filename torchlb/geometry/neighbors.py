@@ -17,8 +17,6 @@ from torch import Tensor
 
 from torchlb.geometry.voronoi import natural_neighbors
 
-__all__ = ["GraphBalls", "admissible", "mesh_graph", "nearest_graph", "nearest_neighbors"]
-
 MIN_ALIGNMENT = 0.5
 """Admission: smallest singular value of E_kᵀE_i, the cosine of the largest angle between two tangent planes."""
 MAX_SLOPE = 0.5

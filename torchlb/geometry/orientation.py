@@ -16,8 +16,6 @@ from torch import Tensor
 
 from torchlb.geometry.neighbors import MAX_SLOPE, MIN_ALIGNMENT
 
-__all__ = ["consistently_wound", "nearest_pairs", "orient_normals", "thin_sides"]
-
 SMOOTH = 0.97
 """An edge whose ends' normals mirror each other better than this (within 14°) and that lies flat is trusted first."""
 FLAT = 0.35

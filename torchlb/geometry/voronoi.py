@@ -13,8 +13,6 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-__all__ = ["cell_laplacian", "cell_volume", "largest_gap", "natural_neighbors"]
-
 
 def unit_directions(dim: int) -> Float[Tensor, "u d"]:
     """Evenly spread unit vectors: 2, 128 or 1024 of them for d = 1, 2, more."""

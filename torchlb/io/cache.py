@@ -25,8 +25,6 @@ from torchlb.operator.dispatch import Operator, build_operator, builder_of, comp
 from torchlb.operator.laplace_beltrami import LaplaceBeltrami
 from torchlb.version import __version__
 
-__all__ = ["describe_file", "load_operator", "load_or_build", "operator_key", "save_operator"]
-
 FORMAT = 2
 """Of the file. It changes when another torchlb could not read it."""
 

@@ -13,8 +13,6 @@ from torch import Tensor
 from torchlb.errors import InputError
 from torchlb.operator.cleaning import as_tensor
 
-__all__ = ["SUFFIXES", "arrays_of", "read_shape"]
-
 SUFFIXES = (".glb", ".gltf", ".npy", ".npz", ".obj", ".off", ".ply", ".stl", ".xyz")
 """Of files that `read_shape` takes."""
 Shape = tuple[Float[Tensor, "N n"], Int[Tensor, "F v"] | None]

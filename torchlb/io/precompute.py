@@ -27,8 +27,6 @@ from torchlb.io.files import SUFFIXES, read_shape
 from torchlb.operator.cleaning import clean_mesh
 from torchlb.operator.dispatch import Operator, check_options_of
 
-__all__ = ["PrecomputeReport", "ShapeResult", "concerns_the_shape", "precompute_operators"]
-
 TABLE = "precompute.csv"
 """File in the cache that lists what became of every shape in the last run."""
 STALE = 24 * 3600

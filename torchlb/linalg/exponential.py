@@ -32,8 +32,6 @@ from torchlb.errors import DiffusionError
 from torchlb.linalg.factor import factorized
 from torchlb.linalg.sparse import csr_product, multiply
 
-__all__ = ["chebyshev_coefficients", "heat", "hyperbola"]
-
 MAX_TERMS = 30_000
 PRODUCTS = 5_000
 """Beyond this many the sparse factors of the contour sum are quicker."""

@@ -5,8 +5,6 @@ from __future__ import annotations
 from scipy import sparse
 from scipy.sparse.linalg import SuperLU, splu
 
-__all__ = ["factorized"]
-
 
 def factorized(matrix: sparse.csc_array, threshold: float) -> SuperLU:
     """Sparse LU with an ordering for nearly symmetric patterns, several times faster here than the default."""

@@ -20,15 +20,6 @@ from scipy.sparse.linalg import LinearOperator, gmres
 
 from torchlb.errors import warn
 
-__all__ = [
-    "backward_error",
-    "krylov_or_factors",
-    "negative_directions",
-    "null_density",
-    "prefers_krylov",
-    "rescaled",
-]
-
 Result = TypeVar("Result")
 LARGEST_FACTORED = 100_000
 """Beyond this many points Krylov methods come before the sparse factors, whose memory grows faster than the points."""

@@ -19,17 +19,6 @@ from scipy import sparse
 from torch import Tensor
 from torch.nn.functional import embedding_bag
 
-__all__ = [
-    "csr_product",
-    "csr_tensor",
-    "from_scipy",
-    "matmul",
-    "multiply",
-    "to_scipy",
-    "transpose_pattern",
-    "with_diagonal",
-]
-
 
 def transpose_pattern(
     crow: Int[Tensor, " rows_plus_1"], col: Int[Tensor, " nnz"], num_cols: int
@@ -47,36 +36,26 @@ def transpose_pattern(
     return crow_t.to(crow.dtype), row[order].to(col.dtype), order.to(col.dtype)
 
 
-def matmul(
-    crow: Int[Tensor, " rows_plus_1"],
-    col: Int[Tensor, " nnz"],
-    values: Float[Tensor, " nnz"],
-    pattern_t: tuple[Tensor, Tensor, Tensor],
-    x: Float[Tensor, "cols C"],
-) -> Float[Tensor, "rows C"]:
-    """Product A x of a CSR matrix, differentiable any number of times in `values` and in `x`.
-
-    Parameters
-    ----------
-    crow, col, values : A; int32 or int64 indices.
-    pattern_t : of its transpose, from `transpose_pattern`.
-    x : dense. The product is computed in the wider of the types of `values` and `x`, and at least in float32, also
-        under autocast; the result has that type, but for a half-precision x, which gives its own.
-
-    >>> crow, col, values = torch.tensor([0, 2, 3]), torch.tensor([0, 1, 1]), torch.tensor([1.0, 2.0, 3.0])
-    >>> matmul(crow, col, values, transpose_pattern(crow, col, 2), torch.tensor([[1.0], [10.0]])).tolist()
-    [[21.0], [30.0]]
-    """
-    return _product([crow, col, *pattern_t], values, x, False)
-
-
 def csr_product(
     pattern: Sequence[Tensor],
     values: Float[Tensor, " nnz"],
     x: Float[Tensor, "M C"],
-    transposed: bool,
+    transposed: bool = False,
 ) -> Float[Tensor, "K C"]:
-    """A x, or Aᵀ x, for the pattern [crow, col, crow_t, col_t, order_t]; otherwise as `matmul`."""
+    """Product A x of a CSR matrix, or Aᵀ x, differentiable any number of times in `values` and in `x`.
+
+    Parameters
+    ----------
+    pattern : [crow, col, crow_t, col_t, order_t] of A and, from `transpose_pattern`, of its transpose; int32 or int64.
+    values : of A.
+    x : dense. The product is computed in the wider of the types of `values` and `x`, and at least in float32, also
+        under autocast; the result has that type, but for a half-precision x, which gives its own.
+
+    >>> crow, col, values = torch.tensor([0, 2, 3]), torch.tensor([0, 1, 1]), torch.tensor([1.0, 2.0, 3.0])
+    >>> pattern = [crow, col, *transpose_pattern(crow, col, 2)]
+    >>> csr_product(pattern, values, torch.tensor([[1.0], [10.0]])).tolist()
+    [[21.0], [30.0]]
+    """
     return _product(list(pattern), values, x, transposed)
 
 

@@ -9,8 +9,6 @@ import numpy as np
 from jaxtyping import Float
 from scipy import sparse
 
-__all__ = ["Bounds", "join_bounds", "spectral_bounds"]
-
 TERMS, GROWN = 500, 4.0
 """Length of a trial, and the growth that ends it. Eigenvalues outside by 2 % of b grow that much in two trials."""
 THINNEST, THICKEST, WIDER = 0.02, 0.9, 1.2

@@ -11,8 +11,6 @@ from torch import Tensor
 from torchlb.errors import InputError
 from torchlb.operator.laplace_beltrami import LaplaceBeltrami
 
-__all__ = ["check_choice", "check_features", "check_shape"]
-
 
 def check_shape(x: Tensor, lb: LaplaceBeltrami) -> None:
     """InputError unless x is (N, C) or (B, N, C) with the N of the operator."""

@@ -23,8 +23,6 @@ from torchlb.nn.checks import check_choice, check_features, check_shape
 from torchlb.operator.laplace_beltrami import LaplaceBeltrami
 from torchlb.spectral.eigenbasis import Eigenbasis
 
-__all__ = ["Diffusion", "Method", "heat_flow", "raw_of_time"]
-
 Method = Literal["deflated", "spectral", "chebyshev", "contour"]
 FORMER_NAMES = {"full": "deflated", "rational": "contour"}
 TOLERANCE = 1e-7

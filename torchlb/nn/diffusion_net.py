@@ -21,8 +21,6 @@ from torchlb.nn.diffusion import Diffusion, Method, raw_of_time
 from torchlb.nn.gradient_features import GradientFeatures
 from torchlb.operator.laplace_beltrami import LaplaceBeltrami
 
-__all__ = ["DiffusionNet", "DiffusionNetBlock"]
-
 Place = Literal["vertices", "edges", "faces", "global_mean"]
 LEAST_TIME = 1e-8
 """What the original cuts its times to before it uses them, ℓ²."""

@@ -11,8 +11,6 @@ from torchlb.errors import InputError
 from torchlb.nn.checks import check_features
 from torchlb.operator.laplace_beltrami import LaplaceBeltrami
 
-__all__ = ["GradientFeatures"]
-
 
 class GradientFeatures(nn.Module):
     """Features tanh(Re⟨∇x_c, Σ_j A_cj ∇x_j⟩) of the gradients, the same in any tangent frame.

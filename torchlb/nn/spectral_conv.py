@@ -11,8 +11,6 @@ from torch import Tensor, nn
 from torchlb.nn.checks import check_features
 from torchlb.operator.laplace_beltrami import LaplaceBeltrami
 
-__all__ = ["SpectralConv"]
-
 
 class SpectralConv(nn.Module):
     """Learned filters in the spectrum that mix channels: y = Φ G(λ) Φᵀ(πx) + b.

@@ -13,8 +13,6 @@ from torch import Tensor
 from torchlb.errors import InputError
 from torchlb.linalg.spectral_bounds import Bounds, join_bounds
 
-__all__ = ["join_buffers", "join_states", "split_buffers"]
-
 Buffers = dict[str, Tensor]
 BY_POINT = ("mass", "points", "frames", "normals", "on_boundary")
 BY_ENTRY = ("col", "values", "col_t", "order_t")

@@ -31,8 +31,6 @@ from torchlb.stencils.conditions import CONDITIONS, Condition, ConditionName
 from torchlb.stencils.rows import Reason, Rows, matrix_rows
 from torchlb.stencils.shape import Shape, cloud_shape, mesh_shape
 
-__all__ = ["AssembledOperator", "Options", "build_cloud", "build_cotangent", "build_mesh"]
-
 MANY = 0.5
 """Share of low-order rows from which on a warning names them."""
 

@@ -23,19 +23,6 @@ from torchlb.operator.cleaning import (
     turned_faces,
 )
 
-__all__ = [
-    "check_boundary",
-    "check_dimension",
-    "check_distinct",
-    "check_faces",
-    "check_normals",
-    "check_options",
-    "check_points",
-    "check_scale",
-    "mended_faces",
-]
-
-
 MAX_EXTENT = 1e70
 """Largest extent of the points, and the inverse of the smallest: fourth powers of it must stay finite."""
 COARSE = 1e-3

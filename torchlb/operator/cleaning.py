@@ -13,19 +13,6 @@ from scipy.sparse import csgraph
 from scipy.spatial import KDTree
 from torch import Tensor
 
-__all__ = [
-    "ArrayLike",
-    "are_quads",
-    "as_tensor",
-    "clean_mesh",
-    "clean_points",
-    "coincident",
-    "first_of_each",
-    "float_type",
-    "proper_faces",
-    "turned_faces",
-]
-
 ArrayLike = Tensor | np.ndarray | Sequence[Any]
 """What becomes a tensor."""
 COINCIDENT = 1e-12

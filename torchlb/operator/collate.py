@@ -12,8 +12,6 @@ from torch.utils.data import default_collate
 from torchlb.errors import InputError
 from torchlb.operator.laplace_beltrami import LaplaceBeltrami
 
-__all__ = ["collate"]
-
 
 def collate(samples: Sequence[Any]) -> Any:
     """`collate_fn` of a `DataLoader` whose samples, tuples or dicts, hold an operator each.

@@ -14,8 +14,6 @@ from torchlb.operator.checks import check_faces, check_points
 from torchlb.operator.cleaning import ArrayLike
 from torchlb.operator.laplace_beltrami import LaplaceBeltrami
 
-__all__ = ["Operator", "build_operator", "builder_of", "check_options_of", "complete_options"]
-
 Operator = Literal["stencil", "cotangent"]
 Builder = Callable[..., LaplaceBeltrami]
 

@@ -29,8 +29,6 @@ from torchlb.spectral.eigensolver import blockwise_eigenbasis
 from torchlb.stability.certificate import Certificate
 from torchlb.stencils.conditions import CONDITIONS, ConditionName
 
-__all__ = ["LaplaceBeltrami"]
-
 
 class LaplaceBeltrami(OperatorStorage):
     """The Laplace–Beltrami operator Δ of a surface (or any manifold in Rⁿ) as a sparse matrix.

@@ -11,8 +11,6 @@ from torch import Tensor
 from torchlb.fits.rules import WEIGHT_RULES, reference
 from torchlb.stencils.rows import Reason
 
-__all__ = ["StencilReport"]
-
 
 @dataclass(frozen=True, eq=False, repr=False)
 class StencilReport:

@@ -16,8 +16,6 @@ from torchlb.linalg.spectral_bounds import Bounds, spectral_bounds
 from torchlb.spectral.eigenbasis import Eigenbasis
 from torchlb.stability.certificate import Certificate
 
-__all__ = ["BASIS", "REPORT_FIELDS", "OperatorStorage"]
-
 REAL_FIELDS = ("growth", "condition", "off_diagonal_ratio")
 REPORT_FIELDS = ("order", "normal_order", "num_neighbors", *REAL_FIELDS, "rule", "reason")
 BUFFERS = ("crow", "col", "values", "gradient_values", "mass", "points", "frames", "normals")

@@ -13,8 +13,6 @@ from torch import Tensor
 from torchlb.operator.laplace_beltrami import LaplaceBeltrami
 from torchlb.plot.figures import LINE_COLORS, MARKERS, plot_orders
 
-__all__ = ["draw_comparison", "plot_spectrum", "spectra", "spectrum_table"]
-
 SIDES = [(20.0, -55.0), (20.0, 125.0)]
 
 

@@ -32,8 +32,6 @@ from torchlb.plot.drawing import (
     values_of,
 )
 
-__all__ = ["plot_convergence", "plot_orders", "plot_points", "plot_surface", "plot_vectors"]
-
 Vertices = Float[Tensor, "N 3"] | Float[np.ndarray, "N 3"]
 Faces = Int[Tensor, "F 3"] | Int[np.ndarray, "F 3"]
 Cloud = Float[Tensor, "N n"] | Float[np.ndarray, "N n"]

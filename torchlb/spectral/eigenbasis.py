@@ -11,8 +11,6 @@ from torch import Tensor
 
 from torchlb.errors import InputError
 
-__all__ = ["Eigenbasis", "Spectral", "check_num_pairs", "stack_eigenbases", "unstack_eigenbases"]
-
 
 def check_num_pairs(k: object) -> int:
     """k as an int; InputError if it is no number of eigenpairs.

@@ -31,8 +31,6 @@ from torchlb.stability.null_vector import (
     shared_outflow,
 )
 
-__all__ = ["blockwise_eigenbasis", "solve_eigenbasis"]
-
 DENSE = 400
 """Up to this many points a dense solve is as fast, and never fails."""
 SHIFT = 1e-9

@@ -15,14 +15,6 @@ from torch import Tensor
 from torchlb.errors import EigenbasisError, InputError
 from torchlb.spectral.eigenbasis import Eigenbasis, Spectral
 
-__all__ = [
-    "diffusion_distance",
-    "diffusion_map",
-    "heat_kernel_signature",
-    "spectral_wavelets",
-    "wave_kernel_signature",
-]
-
 
 def _present(basis: Eigenbasis) -> Tensor:
     """Which pairs are those of a shape, and not padding: (k,) or (S, k)."""

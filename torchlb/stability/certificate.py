@@ -18,7 +18,6 @@ from torchlb.linalg.factor import factorized
 from torchlb.linalg.krylov import krylov_or_factors, negative_directions
 from torchlb.stability.null_vector import CONSERVED, left_null_vector, shared_outflow
 
-__all__ = ["Certificate", "check_certificate"]
 STRICTNESS = 1e-12
 """S passes if it is negative up to this share of the size of each of its rows; a hundred times their rounding."""
 POSITIVE = 1e-10

@@ -23,7 +23,6 @@ from torchlb.linalg.sparse import to_scipy
 from torchlb.stability.certificate import Certificate, check_certificate
 from torchlb.stencils.rows import Reason, Rows
 
-__all__ = ["Schedule", "certify"]
 MARGIN = 0.02
 """A point of smaller weight, π below this share of its area, has the rows around it marked while they can change."""
 SHARE = 0.1

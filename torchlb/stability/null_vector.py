@@ -13,8 +13,6 @@ from torchlb.errors import StabilityError
 from torchlb.linalg.factor import factorized
 from torchlb.linalg.krylov import backward_error, krylov_or_factors, null_density, rescaled
 
-__all__ = ["has_outflow", "left_null_vector", "shared_outflow"]
-
 ROW_SUM = 1e-9
 """Share of its size from which on a row sum is not rounding."""
 CONSERVED = 1e-11

@@ -13,8 +13,6 @@ from torchlb.fits.weights import MAX_RESIDUAL, Weights
 from torchlb.geometry.candidates import Candidate
 from torchlb.stencils.rows import Reason
 
-__all__ = ["Acceptance"]
-
 FACTOR, FACTOR_AT_BOUNDARY = 3.0, 4.0
 """Growth may be this many times that of the reference stencil. At a boundary that is the one-sided one, or what is
 accepted inside if that is larger, since corners have more. FACTOR also bounds the off-diagonal ratio: over that of an

@@ -24,8 +24,6 @@ from torchlb.stencils.acceptance import Acceptance
 from torchlb.stencils.rows import Reason, Rows, matrix_rows, stencil_rows
 from torchlb.stencils.shape import Shape
 
-__all__ = ["Stencils", "assemble"]
-
 RULES = list(WEIGHT_RULES)
 
 
@@ -112,7 +110,7 @@ class Stencils:
         return WEIGHT_RULES[candidate.rule](coords, candidate.degree, heights=heights)
 
     def _weights_with_data(self, centers: Tensor, index: Tensor, candidate: Candidate) -> Weights:
-        """Δ by a fit that uses the condition; first and second derivatives by one that does not, to serve any f.
+        """Δ by a fit that uses the condition; first derivatives by one that does not, to serve any f.
 
         By straight projection, where the derivative along a conormal is its component in the plane. Splines have no
         such form; least squares stands in for them.
@@ -131,7 +129,6 @@ class Stencils:
         return replace(
             weights,
             gradient=torch.where(usable, free.gradient, weights.gradient),
-            hessian=torch.where(usable, free.hessian, weights.hessian),
             height_residual=free.height_residual,
         )
 

@@ -12,8 +12,6 @@ from torch import Tensor
 from torchlb.geometry.boundary import Boundary
 from torchlb.stencils.rows import Rows
 
-__all__ = ["CONDITIONS", "Condition", "ConditionName", "Dirichlet", "Neumann"]
-
 CLOSEST = 0.1
 """Share of the farthest distance in its row that a boundary point's own scale has at least: near pairs are stiff."""
 

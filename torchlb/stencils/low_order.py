@@ -22,8 +22,6 @@ from torchlb.geometry.boundary import Boundary
 from torchlb.geometry.neighbors import GraphBalls, nearest_neighbors
 from torchlb.geometry.voronoi import cell_laplacian, cell_volume
 
-__all__ = ["CloudLowOrder", "MeshLowOrder"]
-
 SMALL_REACH = 2
 """How much farther a point of a small component looks than the few nearest."""
 MAX_HOPS = 3

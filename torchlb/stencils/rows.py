@@ -15,8 +15,6 @@ from torchlb.fits.rules import WEIGHT_RULES
 from torchlb.fits.weights import Weights
 from torchlb.linalg.sparse import from_scipy
 
-__all__ = ["Reason", "Rows", "matrix_rows", "stencil_rows"]
-
 
 class Reason(IntEnum):
     """Why a row is below the requested order: the last test that it failed there; `text` says it in words."""
@@ -48,7 +46,6 @@ class Rows:
     col : (nnz,), points, ascending within a row.
     laplacian : (nnz,), 1/ℓ².
     gradient : (nnz, d), 1/ℓ, in the frame of the row's point.
-    hessian : (nnz, d(d+1)/2), 1/ℓ², ∂_a∂_b for a ≤ b at the origin of the tangent plane; zero in low-order rows.
     candidate : (B,), place in the list of candidates; their number for a low-order row.
     rule : (B,), place in `WEIGHT_RULES` of the rule for its weights; their number for a low-order row.
     order : (B,), order of accuracy p; 0 for a low-order row.
@@ -62,7 +59,6 @@ class Rows:
     col: Int[Tensor, " nnz"]
     laplacian: Float[Tensor, " nnz"]
     gradient: Float[Tensor, "nnz d"]
-    hessian: Float[Tensor, "nnz pairs"]
     candidate: Int[Tensor, " B"]
     rule: Int[Tensor, " B"]
     order: Int[Tensor, " B"]
@@ -93,7 +89,7 @@ class Rows:
         return Rows(*(torch.cat([getattr(b, f.name) for b in blocks]) for f in fields(Rows)))
 
 
-ENTRIES = {"col", "laplacian", "gradient", "hessian"}
+ENTRIES = {"col", "laplacian", "gradient"}
 """The fields of `Rows` that have one value an entry; the others have one a row."""
 
 
@@ -114,7 +110,6 @@ def stencil_rows(
         col=col.flatten(),
         laplacian=laplacian.take_along_dim(place, dim=1).flatten(),
         gradient=entries(weights.gradient),
-        hessian=entries(weights.hessian),
         candidate=torch.full((batch,), candidate),
         rule=rule,
         order=torch.full((batch,), order),
@@ -133,7 +128,7 @@ def matrix_rows(
 ) -> Rows:
     """Rows of a given strong-form matrix (B, N), with the least-squares gradient over the points of each row.
 
-    Where those all lie on a line the derivative across it is zero; the second derivatives are not estimated.
+    Where those all lie on a line the derivative across it is zero.
     """
     crow, col, laplacian = from_scipy(matrix)
     length = crow.diff()
@@ -159,7 +154,6 @@ def matrix_rows(
         col=col,
         laplacian=laplacian,
         gradient=gradient,
-        hessian=gradient.new_zeros(len(col), coords.shape[1] * (coords.shape[1] + 1) // 2),
         candidate=torch.zeros_like(length),
         rule=torch.full_like(length, len(WEIGHT_RULES)),
         order=torch.zeros_like(length),

@@ -30,8 +30,6 @@ from torchlb.geometry.orientation import (
 from torchlb.stencils.conditions import Condition, Neumann
 from torchlb.stencils.low_order import CloudLowOrder, MeshLowOrder
 
-__all__ = ["Shape", "cloud_shape", "mesh_shape"]
-
 NEUMANN = Neumann()
 CANDIDATES = {1: 12, 2: 24, 3: 64}
 """Nearest points from which the frames and the graph of a cloud start, by dimension."""

@@ -28,8 +28,6 @@ from torch.nn.functional import pad
 
 from torchlb.errors import InputError
 
-__all__ = ["Function", "Places", "Points", "Surface", "circle", "require"]
-
 ON_SURFACE = 1e-8  # a point is on the surface if the retraction moves it by no more than this
 PACKING = {2: (4 / 3) ** 0.25, 3: 2 ** (1 / 6)}  # spacing of the densest lattice of density 1
 NEIGHBORS = {2: 9, 3: 16}  # that repel a point, by dimension
