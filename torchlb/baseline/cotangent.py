@@ -1,12 +1,7 @@
-"""The low-order peers: libigl's cotangent operator, and the rows that catch what no high-order stencil can hold.
-
-This is the one place that talks to libigl and robust_laplacian. Both are turned into strong-form rows with the
-analyst's sign: (Lf)_i ≈ Δf(x_i), L1 = 0, diagonal negative.
-"""
+"""libigl's cotangent operator as strong-form rows, analyst's sign: (Lf)_i ≈ Δf(x_i), L1 = 0, diagonal negative."""
 
 from __future__ import annotations
 
-import igl
 import numpy as np
 import torch
 from jaxtyping import Float, Int
@@ -24,6 +19,8 @@ def cotangent_laplacian(
 
     Units: 1/ℓ² and ℓ². Raises ValueError if a vertex has no area.
     """
+    import igl
+
     points = np.ascontiguousarray(vertices.double().numpy())
     corners = np.ascontiguousarray(faces.numpy().astype(np.int64))
     weak = sparse.csr_array(igl.cotmatrix(points, corners))

@@ -12,7 +12,6 @@ from functools import cached_property
 from typing import TypeVar
 
 import numpy as np
-import pyamg
 from jaxtyping import Bool, Float
 from scipy import sparse
 from scipy.sparse import csgraph
@@ -83,6 +82,8 @@ class LowOrder:
     @cached_property
     def inverse(self) -> LinearOperator:
         """B: one symmetric V-cycle of multigrid by smoothed aggregation, the same in every run."""
+        import pyamg
+
         hierarchy = pyamg.smoothed_aggregation_solver(
             sparse.csr_matrix(self.matrix),
             symmetry="symmetric",
