@@ -58,7 +58,8 @@ def slope_and_error(surface, sizes, kind="points", **options):
 def test_order_on_evenly_spread_points(surface, projection, orders):
     found = {p: slope_and_error(surface, SIZES, order=p, projection=projection) for p in orders}
     bounds = BOUNDS[projection]
-    wrong = {p: (slope, e) for p, (slope, e) in found.items() if slope < p - 0.5 or e > bounds[p]}
+    slack = 0.45 if isinstance(surface, StarShaped) else 0.3  # the finest alone resolves its arms
+    wrong = {p: (slope, e) for p, (slope, e) in found.items() if slope < p - slack or e > bounds[p]}
     assert not wrong
 
 
