@@ -25,7 +25,7 @@ from torchlb import (
     operator_key,
     save_operator,
 )
-from torchlb.surfaces import Sphere
+from torchlb.surfaces import Sphere, UnitDisk
 
 ROOT = Path(__file__).parents[1]
 
@@ -432,3 +432,13 @@ def test_any_byte_order(tmp_path, no_building):
     no_building()
     vertices, faces = VERTICES.numpy().astype(">f8"), FACES.numpy().astype(">i4")
     assert_same(load_or_build(vertices, faces, cache=tmp_path, order=1), first)
+
+
+def test_a_file_remembers_the_boundary_condition_and_the_spectral_bounds(tmp_path):
+    lb = LaplaceBeltrami.from_mesh(*UnitDisk().mesh(150), order=1, condition="dirichlet")
+    save_operator(lb, tmp_path / "disk.npz")
+    found = load_operator(tmp_path / "disk.npz")
+    assert found.condition == "dirichlet"
+    assert torch.equal(found.boundary, lb.boundary)
+    assert found.spectral_bounds == lb.spectral_bounds
+    assert repr(found) == repr(lb)

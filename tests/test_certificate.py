@@ -197,8 +197,8 @@ def test_low_order_rows_leave_no_pocket_behind():
     sides = torch.tensor([0.0, 0.0, 1.0]).double().repeat(144, 1)
     pocket = ((x - 5.5).abs() < 1) & ((y - 5.5).abs() < 3.1)
     sides[pocket.flatten()] *= -1
-    fallback = CloudLowOrder(GraphBalls(points, graph, frames, sides), None, surface=False)
-    count, _ = csgraph.connected_components(fallback.rows(torch.arange(144)), directed=False)
+    low_order = CloudLowOrder(GraphBalls(points, graph, frames, sides), None, surface=False)
+    count, _ = csgraph.connected_components(low_order.rows(torch.arange(144)), directed=False)
     assert int(pocket.sum()) == 12
     assert count == 1
 

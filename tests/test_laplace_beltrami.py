@@ -453,7 +453,7 @@ def test_given_normals_decide_the_orientation():
     assert ((lb.normals * points).sum(1) < 0).all()
 
 
-def test_poor_frames_are_kept_at_normal_order_zero():
+def test_initial_frames_are_kept_at_normal_order_zero():
     points = points_of(Sphere(), 300)
     lb = LaplaceBeltrami.from_points(points, normal_order=0, normals=points)
     same(lb.normals, points)
@@ -576,7 +576,7 @@ def test_gradient_divergence_and_mean_curvature(surface):
 def test_divergence_of_the_position_is_the_dimension(name):
     """Σ_c E_c·∂_c x = d exactly for straight projection, whose coordinates are linear in x.
 
-    Fallback rows fit first derivatives, and are left out.
+    Low-order rows fit first derivatives, and are left out.
     """
     lb = built(name)
     fitted = lb.report.order > 0

@@ -32,7 +32,7 @@ def square_grid(size):
 
 
 def cloud_balls(points, dim=2):
-    """What a cloud is given: graph and balls on poor frames."""
+    """What a cloud is given: graph and balls on initial frames."""
     candidates = nearest_neighbors(points, 24)
     frames = cloud_frames(points, candidates, dim)
     graph = nearest_graph(points, frames, candidates)

@@ -164,7 +164,7 @@ def test_every_row_of_a_creased_mesh_is_valid():
     torch.testing.assert_close(lb.mass.sum().item(), 6.0)
 
 
-def test_fallback_rows_are_m_matrix_rows():
+def test_low_order_rows_are_m_matrix_rows():
     """At order 0: off-diagonal entries ≥ 0, off-diagonal ratio 1."""
     _, lb = cube()
     rows = lb.report.order == 0

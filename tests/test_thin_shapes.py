@@ -43,7 +43,7 @@ def crossings(lb, side):
 @pytest.mark.parametrize("order", [1, 3])
 @pytest.mark.parametrize("sampling", [low_discrepancy, jittered, aligned])
 def test_no_row_crosses_between_two_sheets(sampling, order):
-    """Gap 2h, h = 1/√n: rows, those of last resort included, stay on their own sheet."""
+    """Gap 2h, h = 1/√n: rows, those of low order included, stay on their own sheet."""
     sheets = sampling()
     count = len(sheets[0])
     height = torch.tensor([0.0, 2 / math.sqrt(count)], dtype=torch.float64)

@@ -262,7 +262,7 @@ def check_options(
         raise InputError(f"order: expected an integer ≥ 1, got {order}")
     if normal_order < 0:
         raise InputError(
-            f"normal_order: expected an integer ≥ 1, or 0 to keep the poor frames, got {normal_order}"
+            f"normal_order: expected an integer ≥ 1, or 0 to keep the initial frames, got {normal_order}"
         )
     needed = num_monomials(dim, order + 1)
     if num_neighbors is not None and num_neighbors < needed:
