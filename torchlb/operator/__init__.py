@@ -2,6 +2,7 @@
 
 `cleaning`: every face and point once, wound alike. `checks`: bad input is refused, with the remedy. `report`: what
 order was reached where. `storage`: its tensors, and how they travel. `batching`: several shapes as one operator.
-`build`: checked input to finished rows. `laplace_beltrami`: the class. `dispatch`: any operator by name and options.
+`build`: checked input to finished rows and pair. `stencil_face`: Δf, ∇f and curvature at a point. `weak_face`: the
+matrices of the weak pair, the eigenbasis. `laplace_beltrami`: the class. `dispatch`: any operator by name and options.
 `collate`: samples of a `DataLoader`.
 """

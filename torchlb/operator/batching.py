@@ -9,13 +9,16 @@ from typing import Any
 
 import torch
 from torch import Tensor
+from torch.nn.functional import pad
 
 from torchlb.errors import InputError
 from torchlb.linalg.spectral_bounds import Bounds, join_bounds
+from torchlb.operator.storage import PAIRS
 
 Buffers = dict[str, Tensor]
 BY_POINT = ("mass", "points", "frames", "normals", "on_boundary")
 BY_ENTRY = ("col", "values", "col_t", "order_t")
+PARTS = ("crow", "col", "values")
 
 
 def join_buffers(shapes: Sequence[Buffers]) -> Buffers:
@@ -56,6 +59,32 @@ def join_buffers(shapes: Sequence[Buffers]) -> Buffers:
         joined["col" + suffix] = torch.cat(cols)
     orders = [s["order_t"] + e for s, e in zip(shapes, entries, strict=True)]
     joined["order_t"] = torch.cat(orders)
+    return joined | _join_pairs(shapes)
+
+
+def _join_pairs(shapes: Sequence[Buffers]) -> Buffers:
+    """The weak pairs and, if any shape has one of its own, the linear ones."""
+    paired = [len(s["weak_crow"]) > 0 for s in shapes]
+    if any(paired) and not all(paired):
+        raise InputError(
+            f"batch: shape {paired.index(False)} has no weak pair, shape {paired.index(True)} has one; build all of "
+            "them with weak_form=False, or all with it"
+        )
+    joined = {}
+    points = _starts([len(s["mass"]) for s in shapes])
+    for pair in PAIRS:
+        if not any(len(s[f"{pair}_crow"]) for s in shapes):
+            joined |= {f"{pair}_{part}": shapes[0][f"{pair}_{part}"] for part in PARTS}
+            continue
+        names = [pair if len(s[f"{pair}_crow"]) else "weak" for s in shapes]
+        blocks = [[s[f"{name}_{p}"] for p in PARTS] for s, name in zip(shapes, names, strict=True)]
+        entries = _starts([len(col) for _, col, _ in blocks])
+        crows = [crow[i > 0 :] + entries[i] for i, (crow, _, _) in enumerate(blocks)]
+        joined[f"{pair}_crow"] = torch.cat(crows)
+        joined[f"{pair}_col"] = torch.cat([b[1] + p for b, p in zip(blocks, points, strict=True)])
+        most = max(len(values) for _, _, values in blocks)  # 3 where some shape has a boundary
+        padded = [pad(values, (0, 0, 0, most - len(values))) for _, _, values in blocks]
+        joined[f"{pair}_values"] = torch.cat(padded, dim=1)
     return joined
 
 
@@ -77,6 +106,16 @@ def split_buffers(joined: Buffers, sizes: Sequence[int]) -> list[Buffers]:
             shape[name] = shape[name] - shift
         for name in ("crow", "crow_t"):
             shape[name] = joined[name][start : start + size + 1] - first
+        for pair in PAIRS:
+            crow, col, values = (joined[f"{pair}_{part}"] for part in PARTS)
+            if len(crow):
+                first, last = crow[[start, start + size]].tolist()
+                crow, col = crow[start : start + size + 1] - first, col[first:last] - start
+                values = values[:, first:last]
+                values = values if values[2:].any() else values[:2]
+            shape |= dict(
+                zip((f"{pair}_{part}" for part in PARTS), (crow, col, values), strict=True)
+            )
         if not shape["on_boundary"].any():
             shape["on_boundary"] = shape["on_boundary"][:0]
         shapes.append({name: tensor.clone() for name, tensor in shape.items()})

@@ -11,6 +11,8 @@ import torch
 from torchlb.baseline.cotangent import cotangent_laplacian
 from torchlb.errors import InputError, warn
 from torchlb.fits.rules import WeightsName
+from torchlb.galerkin.pair import SparsePair, WeakPair
+from torchlb.geometry.boundary import boundary_faces
 from torchlb.geometry.frames import Projection
 from torchlb.operator.checks import (
     check_boundary,
@@ -74,13 +76,14 @@ class Options:
 
 @dataclass(frozen=True)
 class AssembledOperator:
-    """A finished operator; `shape.areas` is its mass, and `certificate` is None where none was asked for."""
+    """A finished operator; `shape.areas` is its mass; without what was not asked for or cannot be there."""
 
     rows: Rows
     shape: Shape
     source: str
     options: dict[str, Any]
     certificate: Certificate | None
+    pair: WeakPair | None
 
 
 def build_cloud(
@@ -169,8 +172,18 @@ def build_cotangent(vertices: ArrayLike, faces: ArrayLike) -> AssembledOperator:
     corners = mended_faces(vertices, corners)
     matrix, mass = cotangent_laplacian(vertices, corners)
     shape = mesh_shape(vertices, corners, 0, condition=None, areas=mass)
-    rows = matrix_rows(matrix, shape.points, shape.frames, torch.arange(len(vertices)))
-    return AssembledOperator(rows, shape, "cotangent", {}, None)
+    centers = torch.arange(len(vertices))
+    rows = matrix_rows(matrix, shape.points, shape.frames, centers)
+    row = centers.repeat_interleave(rows.length)
+    diagonal = row == rows.col
+    weak = [-mass[row] * rows.laplacian, mass[row] * diagonal]
+    rim = boundary_faces(corners)
+    if len(rim):  # lumped, as the mass is
+        length = (vertices[rim[:, 0]] - vertices[rim[:, 1]]).norm(dim=1)
+        share = torch.zeros_like(mass).index_add(0, rim.flatten(), length.repeat_interleave(2) / 2)
+        weak.append(share[row] * diagonal)
+    pair = WeakPair(SparsePair(rows.crow, rows.col, torch.stack(weak)))
+    return AssembledOperator(rows, shape, "cotangent", {}, None, pair)
 
 
 def _finished(
@@ -203,4 +216,4 @@ def _finished(
             f"{share:.0%} of the points have only low-order rows, of first order at best; at most of them: {reason}. "
             f"{remedy[:1].upper()}{remedy[1:]}; `print(lb.report)` says more"
         )
-    return AssembledOperator(rows, shape, source, asdict(options), certificate)
+    return AssembledOperator(rows, shape, source, asdict(options), certificate, None)

@@ -18,17 +18,26 @@ from torchlb.stability.certificate import Certificate
 
 REAL_FIELDS = ("growth", "condition", "off_diagonal_ratio")
 REPORT_FIELDS = ("order", "normal_order", "num_neighbors", *REAL_FIELDS, "rule", "reason")
+PAIRS = ("weak", "linear")
+"""The weak pair (K, M), and the linear pair beside it, by the names of their buffers."""
 BUFFERS = ("crow", "col", "values", "gradient_values", "mass", "points", "frames", "normals")
 TRANSPOSE = ("crow_t", "col_t", "order_t")
 Storage = TypeVar("Storage", bound="OperatorStorage")
 BASIS = ("eigenvalues", "eigenvectors", "left", "decay_rates", "modal_transform")
 
 
+def _no_pairs() -> dict[str, Tensor]:
+    index, values = torch.zeros(0, dtype=torch.int64), torch.zeros(2, 0)
+    parts = {"crow": index, "col": index, "values": values}
+    return {f"{pair}_{part}": t.clone() for pair in PAIRS for part, t in parts.items()}
+
+
 class OperatorStorage(nn.Module):
     """Plain buffers of any size, which an empty instance takes from any `state_dict`.
 
     Attributes are those of `LaplaceBeltrami`; the transpose's pattern and, unless asked for, the basis are left out of
-    `state_dict`.
+    `state_dict`. ``weak_crow``, ``weak_col``, ``weak_values`` (2, nnz) are stiffness and mass matrix on one pattern,
+    (3, nnz) with the mass matrix of the boundary; ``linear_…`` those of linear elements, empty where they are the same.
     """
 
     crow: Tensor
@@ -40,6 +49,12 @@ class OperatorStorage(nn.Module):
     frames: Tensor
     normals: Tensor
     on_boundary: Tensor
+    weak_crow: Tensor
+    weak_col: Tensor
+    weak_values: Tensor
+    linear_crow: Tensor
+    linear_col: Tensor
+    linear_values: Tensor
     crow_t: Tensor
     col_t: Tensor
     order_t: Tensor
@@ -61,6 +76,8 @@ class OperatorStorage(nn.Module):
             self.register_buffer(name, torch.zeros(0))
         self.register_buffer("on_boundary", torch.zeros(0, dtype=torch.bool))
         self.crow, self.col = torch.zeros(1, dtype=torch.int64), torch.zeros(0, dtype=torch.int64)
+        for name, tensor in _no_pairs().items():
+            self.register_buffer(name, tensor)
         for name in REPORT_FIELDS:
             dtype = torch.get_default_dtype() if name in REAL_FIELDS else torch.int64
             self.register_buffer(f"report_{name}", torch.zeros(0, dtype=dtype))
@@ -106,9 +123,49 @@ class OperatorStorage(nn.Module):
         return lb
 
     @property
+    def tensors(self) -> dict[str, Tensor]:
+        """All buffers by name, also those that share their memory, as the patterns of Δ and K of the cotangent."""
+        return dict(self.named_buffers(remove_duplicate=False))
+
+    @property
     def num_points(self) -> int:
         """Number of points N."""
         return self.crow.shape[0] - 1
+
+    @property
+    def dim(self) -> int:
+        """Dimension d of the manifold."""
+        return self.frames.shape[-1]
+
+    @property
+    def order(self) -> int | None:
+        """Order p that was asked for; None where there is none, as for the cotangent operator."""
+        return self.options.get("order")
+
+    @property
+    def condition(self) -> str | None:
+        """What holds at the boundary, "neumann" or "dirichlet"; None if no datum is used there."""
+        return self.options.get("condition")
+
+    @property
+    def boundary(self) -> Tensor | None:
+        """(N,), mask of the points where `condition` holds; None on a closed shape."""
+        return self.on_boundary if len(self.on_boundary) else None
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """(N, N), of the matrix."""
+        return self.num_points, self.num_points
+
+    @property
+    def dtype(self) -> torch.dtype:
+        """Floating type of the matrix."""
+        return self.values.dtype
+
+    @property
+    def device(self) -> torch.device:
+        """Where the buffers are."""
+        return self.values.device
 
     @property
     def offsets(self) -> tuple[int, ...]:
@@ -233,7 +290,9 @@ class OperatorStorage(nn.Module):
             stored = f"{prefix}basis_{name}" in state_dict
             self.register_buffer(f"basis_{name}", self.values.new_zeros(0), persistent=stored)
         self._bounds = None
-        for name, buffer in list(self.named_buffers()):
+        for name, tensor in _no_pairs().items():  # as in a state of an older torchlb
+            state_dict.setdefault(prefix + name, tensor)
+        for name, buffer in self.tensors.items():
             incoming = state_dict.get(prefix + name)
             if incoming is not None:
                 setattr(self, name, torch.empty_like(incoming, device=buffer.device))

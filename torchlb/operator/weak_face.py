@@ -1,0 +1,107 @@
+"""The second face of an operator, its weak pair: spectrum, and the matrices behind diffusion and solves."""
+
+from __future__ import annotations
+
+import torch
+from jaxtyping import Bool
+from torch import Tensor
+
+from torchlb.errors import InputError
+from torchlb.linalg.sparse import csr_tensor
+from torchlb.operator.storage import OperatorStorage
+from torchlb.spectral.eigenbasis import Eigenbasis, check_num_pairs
+from torchlb.spectral.eigensolver import blockwise_eigenbasis
+from torchlb.stencils.conditions import CONDITIONS
+
+NO_PAIR = (
+    "{}: this operator has no weak pair (weak_form=False, or no triangle mesh); build it from a triangle mesh, "
+    "or use the stencil, lb.matrix"
+)
+
+
+class WeakFace(OperatorStorage):
+    """Stiffness and mass matrix where there is a weak pair, and the eigenbasis from it or else from the stencil."""
+
+    @property
+    def has_weak_form(self) -> bool:
+        """Whether there is a weak pair: on triangle meshes, unless built with weak_form=False."""
+        return self.weak_crow.shape[0] > 0
+
+    @property
+    def stiffness(self) -> Tensor:
+        """K, torch sparse CSR (N, N), ℓ^{d−2}: uᵀKv = ∫∇u·∇v. Symmetric, positive semidefinite, K1 = 0.
+
+        A view of the buffers. A Dirichlet condition leaves it as it is: K also says what values at the boundary, where
+        `fixed` is set, do inside; solves take out its rows and columns. Raises InputError without a weak pair.
+        """
+        return self._weak_matrix("stiffness", 0)
+
+    @property
+    def mass_matrix(self) -> Tensor:
+        """M, torch sparse CSR (N, N), ℓ^d: uᵀMv = ∫uv. Symmetric, positive definite; diagonal for the cotangent.
+
+        Raises InputError without a weak pair.
+        """
+        return self._weak_matrix("mass_matrix", 1)
+
+    @property
+    def boundary_mass(self) -> Tensor:
+        """B, torch sparse CSR (N, N), ℓ^{d−1}: uᵀBv = ∫uv along the boundary. Raises InputError where there is none."""
+        if self.has_weak_form and len(self.weak_values) < 3:
+            raise InputError("boundary_mass: the shape is closed")
+        return self._weak_matrix("boundary_mass", 2)
+
+    def _weak_matrix(self, name: str, number: int) -> Tensor:
+        if not self.has_weak_form:
+            raise InputError(NO_PAIR.format(name))
+        return csr_tensor(self.weak_crow, self.weak_col, self.weak_values[number], self.num_points)
+
+    @property
+    def linear_pair(self) -> tuple[Tensor, Tensor, Tensor]:
+        """(crow, col, values (2, nnz)) of the pair of linear elements, close to (K, M) and 20 times sparser."""
+        pair = "linear" if len(self.linear_crow) else "weak"
+        return tuple(getattr(self, f"{pair}_{part}") for part in ("crow", "col", "values"))  # type: ignore[return-value]
+
+    @property
+    def fixed(self) -> Bool[Tensor, " N"] | None:
+        """Mask of the points where a Dirichlet condition holds; None if there are none."""
+        if len(self.on_boundary) == 0:
+            return None
+        states = self.parts or [self.get_extra_state()]
+        holds = [state["options"].get("condition") == "dirichlet" for state in states]
+        sizes = self.sizes or (self.num_points,)
+        mask = torch.tensor(holds).repeat_interleave(torch.tensor(sizes)).to(self.on_boundary)
+        return mask & self.on_boundary if any(holds) else None
+
+    def eigenbasis(self, k: int, *, store: bool = False) -> Eigenbasis:
+        """The k smallest eigenpairs of −Δ: real, ascending, orthonormal in the mass; min(k, N) of them.
+
+        Solved once, in float64 on the CPU (`method.md`, section 7), and kept: a smaller k is a slice of what there is,
+        a larger one is solved anew. For a batch each shape has its own.
+
+        Parameters
+        ----------
+        k : number of pairs, the constants among them.
+        store : whether `state_dict` holds the basis from now on; it then loads into any operator.
+
+        Raises
+        ------
+        EigenbasisError : where the solver does not converge, or the operator is not stable.
+        """
+        return self.invariant_basis(k, store=store).truncate(k)
+
+    def invariant_basis(self, k: int, *, store: bool = False) -> Eigenbasis:
+        """At least k eigenpairs, all that are solved, so that their span is invariant under Δ; else as `eigenbasis`."""
+        k = check_num_pairs(k)
+        if self.basis_left.shape[-1] < min(k, max(self.sizes or (self.num_points,))):
+            matrix, rounding = self.to_scipy(), torch.finfo(self.dtype).eps
+            states = self.parts or [self.get_extra_state()]
+            conditions = [CONDITIONS.get(state["options"].get("condition")) for state in states]
+            outflow = not all(c is None or c.conserves for c in conditions)
+            options = {"outflow": outflow, "rounding": rounding}
+            self.keep_basis(blockwise_eigenbasis(matrix, self.mass, k, self.sizes, **options))
+        if store:
+            self.keep_basis(store=True)
+        basis = self.basis
+        assert basis is not None
+        return basis
