@@ -12,6 +12,7 @@ from torchlb.fits.weights import (
     _finish,
     _functionals,
     _height_residual,
+    _scaled_qr,
     _scaled_system,
 )
 
@@ -30,9 +31,7 @@ def polyharmonic_weights(
     radius, scaled, values, root = _scaled_system(coords, degree)
     batch, _, dim = coords.shape
     functionals = _functionals(dim, degree).to(coords)
-    system = root[..., None] * values
-    scale = system.norm(dim=1).clamp_min(torch.finfo(coords.dtype).tiny)
-    q, r = torch.linalg.qr(system / scale[:, None])
+    q, r, _ = _scaled_qr(root, values)
 
     nodes = torch.cat([scaled.new_zeros(batch, 1, dim), scaled], dim=1)
     # Distances from differences: |a|² − 2ab + |b|² would lose half the digits.

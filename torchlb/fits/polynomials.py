@@ -44,12 +44,14 @@ def exponents(dim: int, degree: int) -> Int[Tensor, "M d"]:
 
 
 def monomials(coords: Float[Tensor, "*batch d"], degree: int) -> Float[Tensor, "*batch M"]:
-    """Values y^α of the monomials 1 ≤ |α| ≤ `degree` at the points y, in the order of `exponents`.
+    """Values y^α of the monomials 1 ≤ |α| ≤ `degree` at the points y, in the order of `exponents`; none of degree 0.
 
     >>> monomials(torch.tensor([2.0, 3.0]), 2).tolist()
     [2.0, 3.0, 4.0, 6.0, 9.0]
     """
     dim = coords.shape[-1]
+    if degree == 0:
+        return coords[..., :0]
     columns = [coords[..., c] for c in range(dim)]
     first = list(range(dim))  # where the monomials of the previous degree that start with y_c begin
     previous = list(columns)
@@ -71,14 +73,20 @@ def monomial_derivatives(
     >>> monomial_derivatives(torch.tensor([2.0, 3.0]), 2).tolist()
     [[1.0, 0.0], [0.0, 1.0], [4.0, 0.0], [3.0, 2.0], [0.0, 6.0]]
     """
-    alpha = exponents(coords.shape[-1], degree).to(coords.device)
-    columns = []
-    for c in range(coords.shape[-1]):
-        lowered = alpha.clone()
-        lowered[:, c] = (alpha[:, c] - 1).clamp_min(0)
-        powers = (coords[..., None, :] ** lowered).prod(-1)
-        columns.append(alpha[:, c].to(coords.dtype) * powers)
-    return torch.stack(columns, dim=-1)
+    dim = coords.shape[-1]
+    lower = torch.cat([torch.ones_like(coords[..., :1]), monomials(coords, degree - 1)], dim=-1)
+    factor, place = _lowered(dim, degree)
+    return factor.to(coords) * lower[..., place.to(coords.device)]
+
+
+@lru_cache(maxsize=64)
+def _lowered(dim: int, degree: int) -> tuple[Float[Tensor, "M d"], Int[Tensor, "M d"]]:
+    """∂_c y^α = α_c y^(α − e_c): α_c, and the place of α − e_c among the constant and the monomials."""
+    alpha = exponents(dim, degree)
+    places = {tuple(beta): number for number, beta in enumerate([[0] * dim, *alpha.tolist()])}
+    lowered = (alpha[:, None, :] - torch.eye(dim, dtype=torch.int64)).tolist()
+    place = [[places.get(tuple(beta), 0) for beta in betas] for betas in lowered]
+    return alpha.double(), torch.tensor(place)
 
 
 def gradient_functional(dim: int, degree: int) -> Float[Tensor, "M d"]:

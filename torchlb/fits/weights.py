@@ -115,14 +115,78 @@ def _height_residual(
 
 
 def _scaled_system(
-    coords: Float[Tensor, "B neighbors d"], degree: int
+    coords: Float[Tensor, "B neighbors d"],
+    degree: int,
+    keep: Bool[Tensor, "B neighbors"] | None = None,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """ρ, y/ρ, the monomials V there and √ω."""
+    """ρ of those that are kept, y/ρ, the monomials V there and √ω."""
     distance = coords.norm(dim=-1)
-    radius = distance.amax(-1)
+    radius = (distance if keep is None else distance * keep).amax(-1)
     scaled = coords / radius[:, None, None]
     root = window(distance / radius[:, None]).sqrt()
-    return radius, scaled, monomials(scaled, degree), root
+    return radius, scaled, monomials(scaled, degree), root if keep is None else root * keep
+
+
+def _scaled_qr(
+    root: Float[Tensor, "B neighbors"], values: Float[Tensor, "B neighbors M"]
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Q, R of √ω V with its columns scaled to length one, and the lengths."""
+    system = root[..., None] * values
+    scale = system.norm(dim=1).clamp_min(torch.finfo(values.dtype).tiny)
+    q, r = torch.linalg.qr(system / scale[:, None])
+    return q, r, scale
+
+
+@dataclass(frozen=True)
+class CenteredFit:
+    """Fits u(y) = u_i + Σ_α y^α Σ_j coefficients[α, j] (u_j − u_i), y in units of the radius.
+
+    Attributes
+    ----------
+    coefficients : (B, M − 1, K − 1). Their rows of |α| = 1, over the radius, are the weights of the gradient.
+    radius : (B,), ℓ: distance ρ of the farthest neighbour in local coordinates.
+    condition : (B,): bound on that of the column-scaled √ω V, M − 1 times too large at most.
+    residual : (B,): largest violation of the moment equations of the first derivatives.
+    values : (B, K − 1, M − 1), the monomials V at the neighbours.
+    root : (B, K − 1), √ω.
+    """
+
+    coefficients: Float[Tensor, "B M neighbors"]
+    radius: Float[Tensor, " B"]
+    condition: Float[Tensor, " B"]
+    residual: Float[Tensor, " B"]
+    values: Float[Tensor, "B neighbors M"]
+    root: Float[Tensor, "B neighbors"]
+
+    def misfit(self, heights: Float[Tensor, "B neighbors n"]) -> Float[Tensor, " B"]:
+        """Largest weighted distance of the heights from their fit, over ρ."""
+        left = heights - self.values @ (self.coefficients @ heights)
+        return (self.root * left.norm(dim=-1)).amax(1) / self.radius
+
+
+def centered_fit(
+    coords: Float[Tensor, "B neighbors d"],
+    degree: int,
+    keep: Bool[Tensor, "B neighbors"] | None = None,
+) -> CenteredFit:
+    """The polynomials behind `least_squares_weights`, as functions of the values: R⁻¹Qᵀ√ω, by the same QR.
+
+    Arguments as there; K − 1 ≥ M − 1. Neighbours that are not kept have zero coefficients.
+
+    >>> line = torch.tensor([[[-1.0], [1.0]]], dtype=torch.float64)
+    >>> centered_fit(line, 2).coefficients.round(decimals=12).tolist()
+    [[[-0.5, 0.5], [0.5, 0.5]]]
+    """
+    radius, _, values, root = _scaled_system(coords, degree, keep)
+    q, r, scale = _scaled_qr(root, values)
+    inverse = torch.linalg.solve_triangular(
+        r, torch.eye(r.shape[-1]).to(r).expand_as(r), upper=True
+    )
+    coefficients = (inverse / scale[..., None]) @ (q * root[..., None]).mT
+    dim = coords.shape[-1]
+    first = coefficients[:, :dim] @ values - torch.eye(r.shape[-1])[:dim].to(r)
+    condition = inverse.flatten(1).norm(dim=1) * r.shape[-1] ** 0.5
+    return CenteredFit(coefficients, radius, condition, first.abs().amax((1, 2)), values, root)
 
 
 def least_squares_weights(
@@ -168,9 +232,7 @@ def least_squares_weights(
     if flux is not None:
         values, constant, root = _with_data(scaled, values, root, flux, share * radius, degree)
     functionals = _functionals(coords.shape[-1], degree).to(coords)
-    system = root[..., None] * values
-    scale = system.norm(dim=1).clamp_min(torch.finfo(coords.dtype).tiny)
-    q, r = torch.linalg.qr(system / scale[:, None])
+    q, r, scale = _scaled_qr(root, values)
     right = functionals / scale[..., None]
     solution = root[..., None] * (q @ torch.linalg.solve_triangular(r.mT, right, upper=False))
     residual = (values.mT @ solution - functionals).abs().amax((1, 2)) / functionals.abs().max()

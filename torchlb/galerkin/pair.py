@@ -1,26 +1,43 @@
-"""The weak pair as it is stored."""
+"""The weak pair of a mesh: K = PᵀK_FE P and M = PᵀM_FE P, and the positive mass (`method.md`, section 9)."""
 
 from __future__ import annotations
 
+from copy import copy
 from dataclasses import dataclass
+from typing import Any
 
+import numpy as np
+import torch
 from jaxtyping import Float, Int
+from scipy import sparse
 from torch import Tensor
+from torch.nn.functional import pad
+
+from torchlb.galerkin.assembly import assemble, assemble_mass, flat_metric
+from torchlb.galerkin.curving import CurvedMesh, Surface, curve
+from torchlb.galerkin.elements import segment, triangle
+from torchlb.galerkin.nodes import lagrange_nodes
+from torchlb.galerkin.prolongation import prolongation
+from torchlb.geometry.frames import vertex_normals
+from torchlb.geometry.vertex_fits import VertexFits
+
+SMALLEST = 0.1
+"""Share of its linear mass that the mass of a vertex has at least."""
 
 
 @dataclass(frozen=True)
 class SparsePair:
-    """Two symmetric matrices on one pattern: stiffness, dimensionless on a surface, and mass, ℓ².
+    """Symmetric matrices on one pattern: stiffness, without a unit on a surface, mass, ℓ², mass of the boundary, ℓ.
 
     Attributes
     ----------
     crow, col : (N + 1,), (nnz,), CSR with ascending columns.
-    values : (2, nnz), of K and of M.
+    values : (2, nnz), of K and of M; (3, nnz) on a shape with a boundary.
     """
 
     crow: Int[Tensor, " N_plus_1"]
     col: Int[Tensor, " nnz"]
-    values: Float[Tensor, "2 nnz"]
+    values: Float[Tensor, "terms nnz"]
 
 
 @dataclass(frozen=True)
@@ -30,15 +47,128 @@ class WeakPair:
     Attributes
     ----------
     matrices, linear : the pairs.
+    mass : (N,), ℓ², positive, sums to the area; None for that of the operator's shape.
+    fits : (4, N) of each vertex: degree of its fit, 0 if it is flat; why no higher, a place in `REASONS`; number of
+        edges; number of those that are curved.
     """
 
     matrices: SparsePair
     linear: SparsePair | None = None
+    mass: Float[Tensor, " N"] | None = None
+    fits: Int[Tensor, "4 N"] | None = None
 
     @property
     def buffers(self) -> dict[str, Tensor]:
-        """The tensors by their names in an operator."""
+        """The matrices by their names in an operator."""
         found = {f"weak_{name}": t for name, t in vars(self.matrices).items()}
         if self.linear is not None:
             found |= {f"linear_{name}": t for name, t in vars(self.linear).items()}
         return found
+
+
+ELEMENTS = {1: (2, (2,)), 2: (2, (2,)), 3: (2, (4, 2)), 4: (3, (4, 2)), 5: (4, (6, 4, 2))}
+"""Degree r of the elements, and degrees m of the fits, best first, by the order p; above 5 as for 5."""
+
+
+def mesh_pair(
+    points: Float[Tensor, "N n"], faces: Int[Tensor, "F 3"], fits: VertexFits, degree: int
+) -> WeakPair:
+    """The pair of a mesh in the plane or in space, from the fits of its vertices, with elements of degree r."""
+    if points.shape[1] == 2:
+        points, fits = pad(points, (0, 1)), copy(fits)
+        fits.frames, fits.heights = pad(fits.frames, (0, 0, 0, 1)), pad(fits.heights, (0, 1))
+    normals = vertex_normals(points, faces)
+    return weak_pair(Surface(points, normals, fits.frames, fits), faces, degree)
+
+
+def weak_pair(surface: Surface, faces: Int[Tensor, "F 3"], degree: int) -> WeakPair:
+    """The pair of a mesh with elements of degree r; r = 1 is the cotangent's, with its full mass.
+
+    Symmetric, K1 = 0, K ≥ 0, M > 0 whatever the fits are: rows of P sum to one, and it has full column rank.
+    """
+    count = len(surface.points)
+    mesh = curve(surface, lagrange_nodes(faces, count, max(degree, 2)))
+    flat = flat_metric(mesh.lengths)[:, None]
+    linear = assemble(flat.expand(-1, len(triangle(1).weights), 3), faces, triangle(1), count)
+    if degree == 1:
+        return WeakPair(_stored(linear), mass=torch.from_numpy(_row_sums(linear)))
+    shape, nodes = triangle(degree), mesh.nodes
+    p = prolongation(surface, mesh)
+    elements = assemble(mesh.metric, nodes.elements, shape, len(mesh.places))
+    pair = sparse.csr_array(p.T) @ (elements @ p)
+    weights = _row_sums(elements)
+    rim = None if len(mesh.rim) == 0 else p.T @ (_rim_mass(mesh) @ p)
+    ends = nodes.edges.flatten()
+    edges = [torch.bincount(e, minlength=count) for e in (ends, nodes.edges[mesh.curved].flatten())]
+    return WeakPair(
+        _stored(pair, rim),
+        _stored(linear),
+        torch.from_numpy(positive_mass(p, weights, mesh, linear)),
+        torch.stack([surface.fits.degree, surface.fits.reason, *edges]),
+    )
+
+
+def positive_mass(
+    p: Any,
+    weights: Float[np.ndarray, " NX"],
+    mesh: CurvedMesh,
+    linear: sparse.csr_array,
+) -> Float[np.ndarray, " N"]:
+    """Pᵀw, w = M_FE 1: weights of the vertices that integrate to high order and sum to the area.
+
+    Where one is below a tenth of that of linear elements, the rows of P that take from it are replaced by linear ones,
+    until none is; that ends, since linear rows take nothing from anybody.
+    """
+    nodes, count = mesh.nodes, p.shape[1]
+    least = SMALLEST * _row_sums(linear)
+    shares = (np.repeat(np.arange(len(nodes.shares)), 3) + count, nodes.corners.numpy().ravel())
+    straight = sparse.csr_array((nodes.shares.numpy().ravel(), shares), shape=p.shape)
+    entries = sparse.coo_array(p)
+    row, col = entries.coords
+    given = weights[row] * entries.data
+    lowered = np.zeros(p.shape[0], dtype=bool)
+    while True:
+        kept = np.where(lowered, 0.0, weights)
+        mass = p.T @ kept + straight.T @ (weights - kept)
+        taking = (mass < least)[col] & (given < 0) & ~lowered[row]
+        if not taking.any():
+            return mass
+        lowered[row[taking]] = True
+
+
+def _row_sums(pair: Any) -> Float[np.ndarray, " N"]:
+    """M1."""
+    sums: Any = pair.sum(axis=1)
+    return sums.imag.copy()
+
+
+def _rim_mass(mesh: CurvedMesh) -> sparse.csr_array:
+    """∫ φ_i φ_j along the boundary."""
+    nodes, shape = mesh.nodes, segment(mesh.nodes.degree)
+    on_edge = nodes.degree - 1
+    first = len(mesh.places) - len(nodes.shares)
+    between = first + mesh.rim[:, None] * on_edge + torch.arange(on_edge)
+    elements = torch.cat([nodes.edges[mesh.rim], between], 1)
+    speed = torch.einsum("qnd,gnc->gqc", shape.gradients, mesh.places[elements]).norm(dim=2)
+    return assemble_mass(speed, elements, shape, len(mesh.places))
+
+
+def _stored(pair: Any, rim: Any = None) -> SparsePair:
+    """Exactly symmetric, with rows of K that sum to zero, as real parts on one pattern."""
+    pair = sparse.csr_array(pair)
+    pair.sort_indices()
+    other = sparse.csr_array(pair.T)
+    other.sort_indices()
+    crow, col = (torch.from_numpy(part.astype(np.int64)) for part in (pair.indptr, pair.indices))
+    data = torch.from_numpy((pair.data + other.data) / 2)
+    values = torch.stack([data.real, data.imag])
+    count = len(crow) - 1
+    row = torch.arange(count).repeat_interleave(crow.diff())
+    values[0, row == col] -= torch.zeros(count).to(values).index_add(0, row, values[0])
+    if rim is not None:
+        line: Any = sparse.coo_array((rim + rim.T) / 2)
+        i, j = (torch.from_numpy(part.astype(np.int64)) for part in line.coords)
+        extra = torch.zeros_like(values[:1])
+        extra[0, torch.searchsorted(row * count + col, i * count + j)] = torch.from_numpy(line.data)
+        values = torch.cat([values, extra])
+    return SparsePair(crow, col, values)

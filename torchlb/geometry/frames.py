@@ -13,9 +13,10 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from torchlb.fits.weights import MAX_RESIDUAL, least_squares_weights, window
+from torchlb.fits.weights import MAX_RESIDUAL, centered_fit, window
 from torchlb.geometry.candidates import Candidate, Search
 from torchlb.geometry.neighbors import MIN_ALIGNMENT, GraphBalls, admissible
+from torchlb.geometry.vertex_fits import VertexFits
 
 MAX_GRADIENT_GROWTH = 15.0
 """A slope is trusted if ρ Σ|w| of its weights stays below this; good stencils have 2 to 8."""
@@ -78,10 +79,12 @@ def refine_frames(
     balls: GraphBalls,
     centers: Int[Tensor, " B"],
     candidates: list[Candidate],
+    fits: VertexFits | None = None,
 ) -> tuple[Float[Tensor, "B n d"], Int[Tensor, " B"]]:
     """Frames of order q at `centers`, by fits of degree q to the heights over those of `balls`.
 
-    Each centre takes the first candidate whose fit has full rank, bounded weights and a tilt below 60°.
+    Each centre takes the first candidate whose fit has full rank, bounded weights and a tilt below 60°. The fits of the
+    very first candidate are kept in `fits`, where the weak form finds them.
 
     Returns
     -------
@@ -95,13 +98,16 @@ def refine_frames(
         frame = frames[rows]
         offset = points[index[:, 1:]] - points[index[:, :1]]
         coords = offset @ frame
-        weights = least_squares_weights(coords, candidates[number].degree)
+        fit = centered_fit(coords, candidates[number].degree)
         heights = offset - coords @ frame.mT
-        slope = weights.gradient[:, 1:].mT @ heights  # (b, d, n), in the normal space
+        gradient = fit.coefficients[:, : coords.shape[-1]]
+        slope = gradient @ heights / fit.radius[:, None, None]  # (b, d, n), in the normal space
         refined, _ = torch.linalg.qr(frame + slope.mT)
-        growth = weights.radius * weights.gradient.abs().sum(1).amax(-1)
-        passed = (weights.residual <= MAX_RESIDUAL) & (growth <= MAX_GRADIENT_GROWTH)
+        growth = gradient.abs().sum(2).amax(-1)
+        passed = (fit.residual <= MAX_RESIDUAL) & (growth <= MAX_GRADIENT_GROWTH)
         passed &= _cosine_bound(slope) & refined.isfinite().all(-1).all(-1)
+        if fits is not None and number == 0:
+            fits.take(centers[rows], index, fit, heights)
         frames[rows[passed]] = refined[passed]
         order[rows[passed]] = candidates[number].degree
         search.settle(rows[passed])

@@ -7,11 +7,13 @@ from dataclasses import asdict, dataclass, replace
 from typing import Any, get_args
 
 import torch
+from torch.nn.functional import pad
 
 from torchlb.baseline.cotangent import cotangent_laplacian
 from torchlb.errors import InputError, warn
 from torchlb.fits.rules import WeightsName
-from torchlb.galerkin.pair import SparsePair, WeakPair
+from torchlb.galerkin.flips import flipped
+from torchlb.galerkin.pair import ELEMENTS, SparsePair, WeakPair, mesh_pair
 from torchlb.geometry.boundary import boundary_faces
 from torchlb.geometry.frames import Projection
 from torchlb.operator.checks import (
@@ -47,7 +49,8 @@ class Options:
     weights: WeightsName
     num_neighbors: int | None
     condition: ConditionName | None
-    certify: bool
+    weak_form: bool | None
+    certify: bool | None
 
     @property
     def q(self) -> int:
@@ -58,6 +61,18 @@ class Options:
     def held(self) -> Condition | None:
         """The condition at the boundary, as what it does to rows."""
         return None if self.condition is None else CONDITIONS[self.condition]
+
+    def settled(self, triangles: bool) -> Options:
+        """With the choices that were left open: a pair where there can be one, the certificate where there is none."""
+        if self.weak_form and not triangles:
+            raise InputError(
+                "weak_form: only triangle meshes in R² and R³ have one; leave it out, and the certificate makes the "
+                "stencil stable instead"
+            )
+        weak = triangles if self.weak_form is None else self.weak_form
+        return replace(
+            self, weak_form=weak, certify=not weak if self.certify is None else self.certify
+        )
 
     def check(self, num_points: int, ambient_dim: int, dim: int) -> None:
         """InputError for a choice that is none."""
@@ -101,6 +116,7 @@ def build_cloud(
     ambient = points.shape[1]
     d = check_dimension(points, dim, hypersurface=normals is not None)
     options.check(len(points), ambient, d)
+    options = options.settled(triangles=False)
     check_distinct(points)
     where = check_boundary(boundary, len(points))
     if where is None and options.condition == "dirichlet":
@@ -140,6 +156,10 @@ def build_mesh(
     corners = check_faces(faces, len(vertices))
     options.check(len(vertices), vertices.shape[1], corners.shape[1] - 1)
     corners = mended_faces(vertices, corners)
+    options = options.settled(corners.shape[1] == 3 and vertices.shape[1] <= 3)
+    degree, degrees = ELEMENTS[min(options.order, max(ELEMENTS))] if options.weak_form else (0, ())
+    if options.weak_form:  # for the stencil, too: who is whose neighbour, and the first normals
+        corners = flipped(pad(vertices, (0, 3 - vertices.shape[1])), corners)
     if isinstance(boundary, str) and boundary in CONDITIONS:
         raise InputError(
             f"boundary: expected where the condition holds, a mask of the vertices, got {boundary!r}; what holds there "
@@ -154,10 +174,16 @@ def build_mesh(
         num_neighbors=options.num_neighbors,
         boundary=None if isinstance(where, str) else where,
         condition=options.held,
+        fit_degrees=degrees,
         progress=progress,
     )
+    pair = None
+    if shape.fits is not None:
+        pair = mesh_pair(vertices, corners, shape.fits, degree)
+        assert pair.mass is not None
+        shape = replace(shape, areas=pair.mass)
     remedy = "a finer mesh, or one without noise, has better ones"
-    return _finished(shape, "mesh", options, remedy, progress)
+    return _finished(shape, "mesh", options, remedy, progress, pair)
 
 
 def build_cotangent(vertices: ArrayLike, faces: ArrayLike) -> AssembledOperator:
@@ -187,7 +213,12 @@ def build_cotangent(vertices: ArrayLike, faces: ArrayLike) -> AssembledOperator:
 
 
 def _finished(
-    shape: Shape, source: str, options: Options, remedy: str, progress: bool
+    shape: Shape,
+    source: str,
+    options: Options,
+    remedy: str,
+    progress: bool,
+    pair: WeakPair | None = None,
 ) -> AssembledOperator:
     """Rows from the candidates, certified if asked for; a warning if at most of the points there are only low ones."""
     stencils = Stencils(
@@ -216,4 +247,4 @@ def _finished(
             f"{share:.0%} of the points have only low-order rows, of first order at best; at most of them: {reason}. "
             f"{remedy[:1].upper()}{remedy[1:]}; `print(lb.report)` says more"
         )
-    return AssembledOperator(rows, shape, source, asdict(options), certificate, None)
+    return AssembledOperator(rows, shape, source, asdict(options), certificate, pair)

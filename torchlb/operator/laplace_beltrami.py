@@ -14,7 +14,7 @@ from torchlb.operator import build
 from torchlb.operator.batching import join_buffers, join_states, split_buffers
 from torchlb.operator.cleaning import ArrayLike, float_type
 from torchlb.operator.stencil_face import StencilFace
-from torchlb.operator.storage import REPORT_FIELDS
+from torchlb.operator.storage import FIT_FIELDS, REPORT_FIELDS
 from torchlb.operator.weak_face import WeakFace
 from torchlb.spectral.eigenbasis import (
     stack_eigenbases,
@@ -64,7 +64,8 @@ class LaplaceBeltrami(StencilFace, WeakFace):
         normals: ArrayLike | None = None,
         boundary: ArrayLike | Literal["detect"] | None = None,
         condition: ConditionName | None = "neumann",
-        certify: bool = True,
+        weak_form: bool | None = None,
+        certify: bool | None = None,
         progress: bool = True,
     ) -> LaplaceBeltrami:
         """Operator on a point cloud.
@@ -86,8 +87,9 @@ class LaplaceBeltrami(StencilFace, WeakFace):
             least a tenth of that to the farthest of the row. None uses no datum. That, and a boundary that is not
             declared, leaves stencils there one-sided; hardly one passes, and the low-order rows in their place have
             ∂_ν f = 0 at first order: Δx at the boundary of a disk is of size 1/h then, not 0.
-        certify : whether rows are lowered until the certificate of stability holds, whose π is then the mass. Without
-            it the operator is the raw one, which may blow up under diffusion, and the mass is that of Voronoi cells.
+        weak_form : whether to build the weak pair (K, M); by default where there can be one: on triangle meshes.
+        certify : whether rows of the stencil are lowered until the certificate of stability holds, whose π is then the
+            mass; by default where there is no weak pair. With neither of them the operator may blow up under diffusion.
         progress : whether to show a bar, on a terminal, for what takes longer than two seconds.
 
         Raises
@@ -96,7 +98,7 @@ class LaplaceBeltrami(StencilFace, WeakFace):
         StencilError : where not even the low-order row of a point can be built.
         """
         options = build.Options(
-            order, normal_order, projection, weights, num_neighbors, condition, certify
+            order, normal_order, projection, weights, num_neighbors, condition, weak_form, certify
         )
         built = build.build_cloud(
             points, dim, options, normals=normals, boundary=boundary, progress=progress
@@ -116,7 +118,8 @@ class LaplaceBeltrami(StencilFace, WeakFace):
         num_neighbors: int | None = None,
         boundary: ArrayLike | Literal["detect"] | None = None,
         condition: ConditionName | None = "neumann",
-        certify: bool = True,
+        weak_form: bool | None = None,
+        certify: bool | None = None,
         progress: bool = True,
     ) -> LaplaceBeltrami:
         """Operator on the vertices of a mesh; its faces say who is whose neighbour and give the first normals.
@@ -128,14 +131,16 @@ class LaplaceBeltrami(StencilFace, WeakFace):
             Also (F, 2) polylines and (F, 4) tetrahedra, for manifolds of dimension 1 and 3.
         boundary : (N,) mask of the part of the boundary where the condition holds; the rest has none. By default, or
             for "detect", all the boundary that the faces have, if any.
-        order, normal_order, projection, weights, num_neighbors, condition, certify, progress : as for `from_points`.
+        order, normal_order, projection, weights, num_neighbors, condition, weak_form, certify, progress : as for
+            `from_points`. The order chooses the elements of the weak pair, too (degree of elements, of fits): 1 and 2
+            (2, 2), 3 (2, 4), 4 (3, 4), 5 and above (4, 6).
 
         Raises
         ------
         InputError : for bad input, such as vertices that belong to no face.
         """
         options = build.Options(
-            order, normal_order, projection, weights, num_neighbors, condition, certify
+            order, normal_order, projection, weights, num_neighbors, condition, weak_form, certify
         )
         built = build.build_mesh(vertices, faces, options, boundary=boundary, progress=progress)
         return cls._from_assembled(built, vertices)
@@ -186,7 +191,7 @@ class LaplaceBeltrami(StencilFace, WeakFace):
         rows, shape = built.rows, built.shape
         points = shape.points
         report = {**vars(rows), "num_neighbors": rows.length, "normal_order": shape.normal_order}
-        buffers = {f"report_{name}": report[name] for name in REPORT_FIELDS} | {
+        buffers = {f"report_{n}": report[n] for n in REPORT_FIELDS if n not in FIT_FIELDS} | {
             "crow": rows.crow,
             "col": rows.col,
             "values": rows.laplacian,
@@ -196,6 +201,9 @@ class LaplaceBeltrami(StencilFace, WeakFace):
             "frames": shape.frames,
             "normals": points[:0] if shape.normals is None else shape.normals,
         }
+        fits = None if built.pair is None else built.pair.fits
+        fits = rows.length.new_zeros(4, len(points)) if fits is None else fits
+        buffers |= {f"report_{name}": t for name, t in zip(FIT_FIELDS, fits, strict=True)}
         if built.pair is not None:
             buffers |= built.pair.buffers
         if shape.boundary is not None and shape.boundary.mask.any():

@@ -9,6 +9,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from torchlb.fits.rules import WEIGHT_RULES, reference
+from torchlb.geometry.vertex_fits import REASONS
 from torchlb.stencils.rows import Reason
 
 
@@ -28,6 +29,9 @@ class StencilReport:
     off_diagonal_ratio : (N,), Σ_{j≠i}|w_ij| / |w_ii|; 1 for an M-matrix row.
     rule : (N,), place of the rule for the weights in `WEIGHT_RULES`; their number for a low-order row.
     reason : (N,), why the row is below the requested order, a `Reason`.
+    fit_degree : (N,), degree of the fit behind the weak pair; 0 where the surface is left flat.
+    fit_reason : (N,), why that is not higher, a place in `REASONS`.
+    edges, curved_edges : (N,), number of edges at each vertex, and of those that are curved; zero without a weak pair.
     """
 
     requested_order: int
@@ -40,6 +44,21 @@ class StencilReport:
     off_diagonal_ratio: Float[Tensor, " N"]
     rule: Int[Tensor, " N"]
     reason: Int[Tensor, " N"]
+    fit_degree: Int[Tensor, " N"]
+    fit_reason: Int[Tensor, " N"]
+    edges: Int[Tensor, " N"]
+    curved_edges: Int[Tensor, " N"]
+
+    @property
+    def curved_share(self) -> float:
+        """Share of the edges that the weak pair takes as curved; 0 where there is none."""
+        return float(self.curved_edges.sum() / self.edges.sum().clamp_min(1))
+
+    @property
+    def fit_counts(self) -> dict[int, int]:
+        """Number of vertices by the degree of their fit, highest first; 0 for those left flat."""
+        counts = torch.bincount(self.fit_degree).tolist()
+        return {m: counts[m] for m in range(len(counts) - 1, -1, -1) if counts[m]}
 
     @property
     def order_counts(self) -> dict[int, int]:
@@ -100,4 +119,13 @@ class StencilReport:
                 lines.append(f"  {name:<22}{middle:12.4g}{high:10.4g}{most:10.4g}")
             good = self.summary["reference_growth"]
             lines.append(f"  (growth of a good stencil of the requested order: {good:.3g})")
+        if self.edges.any():
+            lines.append(f"weak pair: {100 * self.curved_share:.2f} % of the edges curved")
+            for degree, count in self.fit_counts.items():
+                name = f"fit of degree {degree}" if degree else "flat"
+                lines.append(f"  {name:<31}{count:>9}  {100 * count / total:6.2f} %")
+            below = torch.bincount(self.fit_reason, minlength=len(REASONS)).tolist()
+            for text, count in zip(REASONS[1:], below[1:], strict=True):
+                if count:
+                    lines.append(f"  {text:<39}{count:>8}")
         return "\n".join(lines)

@@ -17,7 +17,11 @@ from torchlb.spectral.eigenbasis import Eigenbasis
 from torchlb.stability.certificate import Certificate
 
 REAL_FIELDS = ("growth", "condition", "off_diagonal_ratio")
-REPORT_FIELDS = ("order", "normal_order", "num_neighbors", *REAL_FIELDS, "rule", "reason")
+FIT_FIELDS = ("fit_degree", "fit_reason", "edges", "curved_edges")
+REPORT_FIELDS = (
+    *("order", "normal_order", "num_neighbors", *REAL_FIELDS, "rule", "reason"),
+    *FIT_FIELDS,
+)
 PAIRS = ("weak", "linear")
 """The weak pair (K, M), and the linear pair beside it, by the names of their buffers."""
 BUFFERS = ("crow", "col", "values", "gradient_values", "mass", "points", "frames", "normals")

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -27,6 +27,7 @@ from torchlb.geometry.orientation import (
     orient_normals,
     thin_sides,
 )
+from torchlb.geometry.vertex_fits import VertexFits, fit_size
 from torchlb.stencils.conditions import Condition, Neumann
 from torchlb.stencils.low_order import CloudLowOrder, MeshLowOrder
 
@@ -50,6 +51,7 @@ class Shape:
     low_order : M-matrix rows for points without a stencil; None if there are none to be had.
     boundary : its points and conormals; None for a closed shape, or where no condition holds.
     condition : what holds there.
+    fits : of functions at each vertex, where a weak pair is to be made from them.
     """
 
     points: Float[Tensor, "N n"]
@@ -61,6 +63,7 @@ class Shape:
     low_order: CloudLowOrder | MeshLowOrder | None
     boundary: Boundary | None
     condition: Condition
+    fits: VertexFits | None = None
 
     @property
     def on_mesh(self) -> bool:
@@ -111,12 +114,13 @@ def mesh_shape(
     boundary: Bool[Tensor, " N"] | None = None,
     condition: Condition | None = NEUMANN,
     areas: Float[Tensor, " N"] | None = None,
+    fit_degrees: tuple[int, ...] = (),
     progress: bool = True,
 ) -> Shape:
     """A mesh of triangles (or of segments, or tetrahedra in Rⁿ): graph and frames from the faces.
 
     `condition` holds on its boundary, or on the part of it that is the mask `boundary`; None leaves it alone. With
-    `areas` given there are no low-order rows.
+    `areas` given there are no low-order rows. `fit_degrees` asks for `fits` of the first of them that passes.
     """
     initial = mesh_frames(vertices, faces)
     graph = mesh_graph(faces, len(vertices))
@@ -126,9 +130,9 @@ def mesh_shape(
         if consistently_wound(faces):
             candidates = nearest_neighbors(vertices, min(CANDIDATES[2], len(vertices)))
             sides = thin_sides(vertices, reference, nearest_pairs(candidates))
-    balls, order = _refined(
-        GraphBalls(vertices, graph, initial, sides), normal_order, num_neighbors, progress
-    )
+    start = GraphBalls(vertices, graph, initial, sides)
+    fits = VertexFits(start, fit_degrees) if fit_degrees else None
+    balls, order = _refined(start, normal_order, num_neighbors, progress, fits)
     edge = None
     if condition is not None or boundary is not None:
         edge = boundary_of_mesh(vertices, faces, balls.frames, normal_order)
@@ -143,7 +147,8 @@ def mesh_shape(
             else CloudLowOrder(balls, edge, surface=False)
         )
         areas = low_order.areas()
-    return _oriented(balls, reference, order, areas, low_order, edge, condition)
+    shape = _oriented(balls, reference, order, areas, low_order, edge, condition)
+    return replace(shape, fits=None if fits is None else fits.complete(start))
 
 
 def _part(boundary: Boundary | None, mask: Bool[Tensor, " N"]) -> Boundary | None:
@@ -173,19 +178,28 @@ def _turned(normals: Tensor, reference: Tensor) -> Tensor:
 
 
 def _refined(
-    balls: GraphBalls, degree: int, num_neighbors: int | None, progress: bool
+    balls: GraphBalls,
+    degree: int,
+    num_neighbors: int | None,
+    progress: bool,
+    fits: VertexFits | None = None,
 ) -> tuple[GraphBalls, Int[Tensor, " N"]]:
-    """The same neighbourhoods with frames of order q, in chunks; the initial ones if q = 0 or in a flat space."""
+    """The same neighbourhoods with frames of order q, in chunks; the initial ones if q = 0 or in a flat space.
+
+    The `fits` are filled on the way where they ask for the same polynomials of the same points.
+    """
     points, initial = balls.points, balls.frames
     if degree == 0 or initial.shape[1] == initial.shape[2]:
         return balls, torch.full((len(points),), degree)
     candidates = list_candidates(
         initial.shape[-1], range(degree, 0, -1), num_neighbors=num_neighbors
     )
+    shared = candidates[0].size == fit_size(initial.shape[-1], degree)
+    fits = fits if fits is not None and shared and degree == fits.degrees[0] else None
     parts = chunks(len(points), candidates, initial.shape[-1])
     bar = tqdm(parts, "tangent frames", delay=2, disable=not progress, leave=False)
     found, order = zip(
-        *(refine_frames(balls, centers, candidates) for centers in bar),
+        *(refine_frames(balls, centers, candidates, fits) for centers in bar),
         strict=True,
     )
     frames = torch.cat(found)

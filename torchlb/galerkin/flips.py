@@ -1,0 +1,110 @@
+"""Folded triangles and slivers flipped away (`method.md`, section 9): for the integrals only.
+
+Flipping everything to intrinsic Delaunay would be wrong: good meshes follow the curvature, and lose by it.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from torchlb.galerkin.elements import EDGES
+from torchlb.geometry.frames import vertex_normals
+
+ALIGNED = 0.5
+"""Least cosine between a triangle's normal and those of its vertices."""
+GOOD = 0.1
+"""Least quality 4√3 area/Σℓ² of a triangle; 1 if it is equilateral."""
+ROUNDS = 50
+
+
+def flipped(vertices: Tensor, faces: Tensor) -> Tensor:
+    """The faces, with an edge flipped of every folded triangle or sliver that gains by it.
+
+    Only edges of two triangles, and only where the new edge is not there yet. The normals are renewed each round.
+    """
+    faces = faces.clone()
+    for _ in range(ROUNDS):
+        normals = vertex_normals(vertices, faces)
+        alignment, quality = _scores(vertices, normals, faces)
+        bad = ((alignment < ALIGNED) | (quality < GOOD)).nonzero()[:, 0]
+        pairs = _flips(faces, bad)
+        if pairs is None:
+            return faces
+        left, right, after = pairs
+        before = torch.stack([faces[left], faces[right]], dim=1)
+        gain = _value(vertices, normals, after) - _value(vertices, normals, before)
+        chosen = _independent(gain, left, right, after, len(faces))
+        if len(chosen) == 0:
+            return faces
+        faces[left[chosen]], faces[right[chosen]] = after[chosen, 0], after[chosen, 1]
+    return faces
+
+
+def _scores(vertices: Tensor, normals: Tensor, faces: Tensor) -> tuple[Tensor, Tensor]:
+    """Least cosine between the normal and those of the corners, and quality."""
+    corners = vertices[faces]
+    sides = corners.roll(-1, dims=-2) - corners
+    normal = torch.linalg.cross(sides[..., 0, :], sides[..., 1, :])
+    twice = normal.norm(dim=-1, keepdim=True)
+    unit = normal / twice.clamp_min(torch.finfo(normal.dtype).tiny)
+    alignment = (unit[..., None, :] * normals[faces]).sum(-1).amin(-1)
+    return alignment, 2 * 3**0.5 * twice[..., 0] / sides.square().sum((-1, -2))
+
+
+def _value(vertices: Tensor, normals: Tensor, pairs: Tensor) -> Tensor:
+    """What a flip is to raise: the lesser alignment of the two, as far as it lacks, then the lesser quality."""
+    alignment, quality = _scores(vertices, normals, pairs)
+    return 1e3 * alignment.amin(1).clamp_max(ALIGNED) + quality.amin(1)
+
+
+def _flips(faces: Tensor, bad: Tensor) -> tuple[Tensor, Tensor, Tensor] | None:
+    """Flips of the edges of the bad faces: the two faces (a, b, c), (b, a, d) and (c, d, b), (d, c, a) instead."""
+    count, size = len(faces), int(faces.max()) + 1
+    half = torch.cat(
+        [faces[:, list(edge)] for edge in EDGES]
+    )  # of face h mod F, the corner after is opposite
+    opposite = torch.cat([faces[:, 2], faces[:, 0], faces[:, 1]])
+    low, high = half.amin(1), half.amax(1)
+    unique, edge, uses = torch.unique(low * size + high, return_inverse=True, return_counts=True)
+    order = edge.argsort(stable=True)
+    first = uses.cumsum(0) - uses
+    twin = torch.full_like(edge, -1)
+    two = first[uses == 2]
+    twin[order[two]], twin[order[two + 1]] = order[two + 1], order[two]
+    sides = (bad[:, None] + count * torch.arange(3)).flatten()
+    sides = sides[twin[sides] >= 0]
+    other = twin[sides]
+    c, d = opposite[sides], opposite[other]
+    known = torch.isin(torch.minimum(c, d) * size + torch.maximum(c, d), unique)
+    wound = half[sides, 0] == half[other, 1]
+    keep = wound & (c != d) & ~known
+    sides, other, c, d = sides[keep], other[keep], c[keep], d[keep]
+    if len(sides) == 0:
+        return None
+    a, b = half[sides].unbind(1)
+    after = torch.stack([torch.stack([c, d, b], 1), torch.stack([d, c, a], 1)], dim=1)
+    return sides % count, other % count, after
+
+
+def _independent(
+    gain: Tensor,
+    left: Tensor,
+    right: Tensor,
+    after: Tensor,
+    num_faces: int,
+) -> Tensor:
+    """Flips that gain, best first, none of which shares a face or makes an edge with a better one."""
+    order = gain.argsort(descending=True, stable=True)
+    order = order[gain[order] > 1e-9]
+    rank = torch.arange(len(order))
+    far = torch.full((num_faces,), len(order))
+    for face in (left[order], right[order]):
+        far.scatter_reduce_(0, face, rank, "amin")
+    free = (far[left[order]] == rank) & (far[right[order]] == rank)
+    order = order[free]
+    made = after[order, 0, :2].sort(dim=1).values
+    _, place = torch.unique(made, dim=0, return_inverse=True)
+    best = torch.full((int(place.max()) + 1 if len(place) else 0,), len(order))
+    best.scatter_reduce_(0, place, torch.arange(len(order)), "amin")
+    return order[best[place] == torch.arange(len(order))]

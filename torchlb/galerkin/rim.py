@@ -1,0 +1,119 @@
+"""Curves through the boundary of a mesh, so that the domain is of high order, too (`method.md`, section 9).
+
+Between two boundary vertices the curve is the polynomial through the nearest ones along the boundary, over arc length.
+The same weights give the values of a function there, so that what vanishes at the boundary vertices vanishes on it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from math import cos, radians
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+SHARP = cos(radians(60))
+"""A boundary that turns by more at a vertex has a corner there."""
+KINK, OUTSTANDING = cos(radians(20)), 3.0
+"""And one that turns by more than this, and so many times more than at the vertices beside it."""
+
+
+@dataclass(frozen=True)
+class RimCurves:
+    """A polynomial curve over each boundary edge.
+
+    Attributes
+    ----------
+    index : (G, S), the vertices that it goes through, both ends of the edge first.
+    valid : (G, S), whether an entry counts.
+    arc : (G, S), ℓ: their places along the boundary, 0 at the edge's first end.
+    """
+
+    index: Int[Tensor, "G S"]
+    valid: Bool[Tensor, "G S"]
+    arc: Float[Tensor, "G S"]
+
+    def weights(self, share: Float[Tensor, "G q"]) -> Float[Tensor, "G q S"]:
+        """Lagrange weights of the vertices at shares of the edge, 0 at its first end and 1 at its second."""
+        size = self.index.shape[1]
+        at = share * self.arc[:, 1:2]
+        other = self.valid[:, None, :] & ~torch.eye(size, dtype=torch.bool)
+        gap = torch.where(other, self.arc[:, :, None] - self.arc[:, None, :], 1.0)
+        to = torch.where(other[:, None], at[:, :, None, None] - self.arc[:, None, None, :], 1.0)
+        return (to / gap[:, None]).prod(-1) * self.valid[:, None]
+
+
+def rim_curves(points: Float[Tensor, "N n"], rim: Int[Tensor, "G 2"], width: int) -> RimCurves:
+    """Curves through `width` vertices, fewer where corners are near, over the boundary edges `rim`."""
+    mate = _mates(points, rim)
+    walks = [_walk(points, rim, mate, side, width - 2) for side in (0, 1)]
+    (left, left_arc, left_length, wrapped), (right, right_arc, right_length, _) = walks
+    extra = torch.where(wrapped, left_length.clamp_max(width - 2), width - 2)
+    ahead = torch.minimum(right_length, torch.maximum(extra // 2, extra - left_length))
+    behind = torch.minimum(left_length, extra - ahead)
+    place = torch.arange(width - 2)
+    first = torch.zeros(len(rim), 1).to(points)
+    length = (points[rim[:, 1]] - points[rim[:, 0]]).norm(dim=1, keepdim=True)
+    return RimCurves(
+        torch.cat([rim, right, left], 1),
+        torch.cat(
+            [
+                torch.ones_like(rim, dtype=torch.bool),
+                place < ahead[:, None],
+                place < behind[:, None],
+            ],
+            1,
+        ),
+        torch.cat([first, length, length + right_arc, -left_arc], 1),
+    )
+
+
+def _mates(points: Float[Tensor, "N n"], rim: Int[Tensor, "G 2"]) -> Int[Tensor, " two_G"]:
+    """Of end s of edge e, number e + G s, the end of another edge that continues it smoothly; −1 for none."""
+    count = len(rim)
+    vertex = torch.cat([rim[:, 0], rim[:, 1]])
+    order = vertex.argsort(stable=True)
+    _, uses = torch.unique_consecutive(vertex[order], return_counts=True)
+    first = uses.cumsum(0) - uses
+    one, two = order[first[uses == 2]], order[first[uses == 2] + 1]
+    mate = torch.full_like(vertex, -1)
+    mate[one], mate[two] = two, one
+    away = points[torch.cat([rim[:, 1], rim[:, 0]])] - points[vertex]
+    away = torch.nn.functional.normalize(away)
+    straight = torch.where(mate >= 0, -(away * away[mate]).sum(1), -1.0)  # cosine of the turn
+    angle = straight.clamp(-1, 1).acos()
+    far = torch.cat([angle[count:], angle[:count]])  # at the other end of the same edge
+    beside = torch.maximum(far, far[mate])
+    corner = straight < SHARP
+    corner |= (straight < KINK) & (angle > OUTSTANDING * beside)
+    return torch.where(corner, -1, mate)
+
+
+def _walk(
+    points: Float[Tensor, "N n"],
+    rim: Int[Tensor, "G 2"],
+    mate: Int[Tensor, " two_G"],
+    side: int,
+    steps: int,
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """(vertices, arc lengths, their number, whether the walk came round) beyond one end of every edge."""
+    count = len(rim)
+    end, start = rim[:, side], rim[:, 1 - side]
+    half = torch.arange(count) + count * side
+    alive, wrapped = (torch.full((count,), value) for value in (True, False))
+    at, arc = end, points.new_zeros(count)
+    vertices, arcs, length = [], [], torch.zeros(count, dtype=torch.int64)
+    for _ in range(steps):
+        following = mate[half]
+        alive &= following >= 0
+        half = torch.where(alive, (following + count) % (2 * count), half)  # the far end
+        next_at = torch.cat([rim[:, 0], rim[:, 1]])[half]
+        wrapped |= alive & (next_at == start)
+        alive &= next_at != start
+        arc = arc + torch.where(alive, (points[next_at] - points[at]).norm(dim=1), 0.0)
+        at = torch.where(alive, next_at, at)
+        length += alive
+        vertices.append(at)
+        arcs.append(arc)
+    return torch.stack(vertices, 1), torch.stack(arcs, 1), length, wrapped
