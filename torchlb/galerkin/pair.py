@@ -130,7 +130,7 @@ def positive_mass(
     while True:
         kept = np.where(lowered, 0.0, weights)
         mass = p.T @ kept + straight.T @ (weights - kept)
-        taking = (mass < least)[col] & (given < 0) & ~lowered[row]
+        taking = (mass < least)[col] & (given < 0) & (row >= count) & ~lowered[row]
         if not taking.any():
             return mass
         lowered[row[taking]] = True
