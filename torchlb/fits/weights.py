@@ -145,7 +145,8 @@ class CenteredFit:
     ----------
     coefficients : (B, M − 1, K − 1). Their rows of |α| = 1, over the radius, are the weights of the gradient.
     radius : (B,), ℓ: distance ρ of the farthest neighbour in local coordinates.
-    condition : (B,): bound on that of the column-scaled √ω V, M − 1 times too large at most.
+    condition : (B,): Frobenius norm of the inverse of the R of the column-scaled √ω V, which is its condition up to a
+        factor √(M − 1).
     residual : (B,): largest violation of the moment equations of the first derivatives.
     values : (B, K − 1, M − 1), the monomials V at the neighbours.
     root : (B, K − 1), √ω.
@@ -185,7 +186,7 @@ def centered_fit(
     coefficients = (inverse / scale[..., None]) @ (q * root[..., None]).mT
     dim = coords.shape[-1]
     first = coefficients[:, :dim] @ values - torch.eye(r.shape[-1])[:dim].to(r)
-    condition = inverse.flatten(1).norm(dim=1) * r.shape[-1] ** 0.5
+    condition = inverse.flatten(1).norm(dim=1)
     return CenteredFit(coefficients, radius, condition, first.abs().amax((1, 2)), values, root)
 
 

@@ -66,9 +66,7 @@ def _squares(shape: Element) -> Float[Tensor, "Q n_times_n"]:
     return (shape.values[:, :, None] * shape.values[:, None, :]).flatten(1)
 
 
-def _summed(
-    blocks: Float[Tensor, "T n_times_n"], nodes: Int[Tensor, "T n"], num_nodes: int
-) -> sparse.csr_array:
+def _summed(blocks: Tensor, nodes: Int[Tensor, "T n"], num_nodes: int) -> sparse.csr_array:
     size = nodes.shape[1]
     row, col = nodes.repeat_interleave(size, dim=1).flatten(), nodes.repeat(1, size).flatten()
     where = row.int().numpy(), col.int().numpy()

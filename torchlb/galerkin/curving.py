@@ -33,14 +33,15 @@ class Surface:
 
     Attributes
     ----------
-    points, normals : (N, 3), ℓ, unit or zero.
+    points : (N, 3), ℓ.
     frames : (N, 3, 2), orthonormal, under the fits.
+    normals : (N, 3), orthogonal to the frames, on the side of the faces; zero where these have none.
     fits : of functions, and of the surface.
     """
 
     points: Float[Tensor, "N 3"]
-    normals: Float[Tensor, "N 3"]
     frames: Float[Tensor, "N 3 2"]
+    normals: Float[Tensor, "N 3"]
     fits: VertexFits
 
 

@@ -28,7 +28,7 @@ def flipped(vertices: Tensor, faces: Tensor) -> Tensor:
         normals = vertex_normals(vertices, faces)
         alignment, quality = _scores(vertices, normals, faces)
         bad = ((alignment < ALIGNED) | (quality < GOOD)).nonzero()[:, 0]
-        pairs = _flips(faces, bad)
+        pairs = _flips(faces, bad) if len(bad) else None
         if pairs is None:
             return faces
         left, right, after = pairs
@@ -61,9 +61,7 @@ def _value(vertices: Tensor, normals: Tensor, pairs: Tensor) -> Tensor:
 def _flips(faces: Tensor, bad: Tensor) -> tuple[Tensor, Tensor, Tensor] | None:
     """Flips of the edges of the bad faces: the two faces (a, b, c), (b, a, d) and (c, d, b), (d, c, a) instead."""
     count, size = len(faces), int(faces.max()) + 1
-    half = torch.cat(
-        [faces[:, list(edge)] for edge in EDGES]
-    )  # of face h mod F, the corner after is opposite
+    half = torch.cat([faces[:, list(edge)] for edge in EDGES])  # h is of face h mod F
     opposite = torch.cat([faces[:, 2], faces[:, 0], faces[:, 1]])
     low, high = half.amin(1), half.amax(1)
     unique, edge, uses = torch.unique(low * size + high, return_inverse=True, return_counts=True)
@@ -103,8 +101,9 @@ def _independent(
         far.scatter_reduce_(0, face, rank, "amin")
     free = (far[left[order]] == rank) & (far[right[order]] == rank)
     order = order[free]
-    made = after[order, 0, :2].sort(dim=1).values
-    _, place = torch.unique(made, dim=0, return_inverse=True)
+    one, two = after[order, 0, :2].unbind(1)
+    made = torch.minimum(one, two) * (int(after.max()) + 1) + torch.maximum(one, two)
+    _, place = torch.unique(made, return_inverse=True)
     best = torch.full((int(place.max()) + 1 if len(place) else 0,), len(order))
     best.scatter_reduce_(0, place, torch.arange(len(order)), "amin")
     return order[best[place] == torch.arange(len(order))]

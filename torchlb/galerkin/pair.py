@@ -18,7 +18,7 @@ from torchlb.galerkin.curving import CurvedMesh, Surface, curve
 from torchlb.galerkin.elements import segment, triangle
 from torchlb.galerkin.nodes import lagrange_nodes
 from torchlb.galerkin.prolongation import prolongation
-from torchlb.geometry.frames import vertex_normals
+from torchlb.geometry.frames import normals_of_frames, vertex_normals
 from torchlb.geometry.vertex_fits import VertexFits
 
 SMALLEST = 0.1
@@ -77,8 +77,10 @@ def mesh_pair(
     if points.shape[1] == 2:
         points, fits = pad(points, (0, 1)), copy(fits)
         fits.frames, fits.heights = pad(fits.frames, (0, 0, 0, 1)), pad(fits.heights, (0, 1))
-    normals = vertex_normals(points, faces)
-    return weak_pair(Surface(points, normals, fits.frames, fits), faces, degree)
+    outward = vertex_normals(points, faces)
+    normals = normals_of_frames(fits.frames)
+    normals = normals * (normals * outward).sum(1, keepdim=True).sign()
+    return weak_pair(Surface(points, fits.frames, normals, fits), faces, degree)
 
 
 def weak_pair(surface: Surface, faces: Int[Tensor, "F 3"], degree: int) -> WeakPair:

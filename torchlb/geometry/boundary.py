@@ -47,8 +47,15 @@ def boundary_faces(faces: Int[Tensor, "F v"]) -> Int[Tensor, "G w"]:
     sides = torch.cat(
         [faces[:, [c for c in range(corners) if c != left]] for left in range(corners)]
     )
-    unique, count = torch.unique(sides.sort(dim=1).values, dim=0, return_counts=True)
-    return unique[count == 1]
+    sides = sides.sort(dim=1).values
+    base = int(faces.max()) + 1
+    key = sides[:, 0]
+    for column in sides.T[1:]:
+        key = key * base + column
+    order = key.argsort(stable=True)
+    _, count = torch.unique_consecutive(key[order], return_counts=True)
+    first = (count.cumsum(0) - count)[count == 1]
+    return sides[order[first]]
 
 
 def boundary_of_mesh(

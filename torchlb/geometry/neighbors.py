@@ -53,7 +53,8 @@ def _smallest_singular_value(
         return product[:, 0, 0].abs()
     if dim == 2:  # σ² are the roots of s² − |A|²s + det² = 0
         frobenius = product.square().sum((-1, -2))
-        discriminant = (frobenius.square() - 4 * torch.linalg.det(product).square()).clamp_min(0)
+        (a, b), (c, d) = (row.unbind(-1) for row in product.unbind(-2))
+        discriminant = (frobenius.square() - 4 * (a * d - b * c).square()).clamp_min(0)
         return ((frobenius - discriminant.sqrt()) / 2).clamp_min(0).sqrt()
     return torch.linalg.svdvals(product)[:, -1]
 
@@ -168,7 +169,8 @@ class GraphBalls:
         offset = self.points[others] - self.points[centers[local]]
         distance = offset.square().sum(-1)
         distance[others == centers[local]] = -1.0  # before all that coincide with it
-        order = np.lexsort((others.numpy(), distance.numpy(), local.numpy()))
+        order = distance.argsort(stable=True)  # equal ones stay in the order of the points
+        order = order[local[order].argsort(stable=True)]
         local, others = local[order], others[order]
         total = torch.bincount(local, minlength=len(centers))
         rank = torch.arange(len(local)) - (total.cumsum(0) - total)[local]

@@ -123,5 +123,5 @@ def consistently_wound(faces: Int[Tensor, "F v"]) -> bool:
     """
     if faces.shape[1] == 2:
         return all(len(torch.unique(end)) == len(end) for end in faces.T)
-    edges = torch.cat([faces[:, [a, (a + 1) % 3]] for a in range(3)])
-    return len(torch.unique(edges, dim=0)) == len(edges)
+    edges = torch.cat([faces[:, a] * (faces.max() + 1) + faces[:, a - 2] for a in range(3)])
+    return len(torch.unique(edges)) == len(edges)
