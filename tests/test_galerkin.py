@@ -13,17 +13,10 @@ from torchlb.galerkin.elements import lattice, segment, triangle
 from torchlb.galerkin.flips import flipped
 from torchlb.galerkin.pair import mesh_pair
 from torchlb.galerkin.rim import rim_curves
-from torchlb.geometry.boundary import boundary_faces
 from torchlb.geometry.frames import complete_frames, vertex_normals
 from torchlb.geometry.neighbors import GraphBalls, mesh_graph
 from torchlb.geometry.vertex_fits import VertexFits
 from torchlb.surfaces import Hemisphere, Sphere, Torus, UnitDisk, deserno_points
-
-TRIANGLE = torch.tensor([[0.0, 0, 0], [1, 0, 0], [0, 1, 0]], dtype=torch.float64)
-TETRAHEDRON = torch.tensor(
-    [[1.0, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1]], dtype=torch.float64
-)
-FACES = torch.tensor([[0, 1, 2], [0, 3, 1], [0, 2, 3], [1, 3, 2]])
 
 
 def pair_of(lb):
@@ -111,6 +104,11 @@ def hair():
     return torch.cat([lower, lower + torch.tensor([0, 1e-7, 0])]), faces.flatten(0, 1)
 
 
+def tetrahedron():
+    corners = torch.tensor([[1.0, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1]])
+    return corners.double(), torch.tensor([[0, 1, 2], [0, 3, 1], [0, 2, 3], [1, 3, 2]])
+
+
 SHAPES = [
     sphere,
     with_noise,
@@ -119,7 +117,7 @@ SHAPES = [
     with_zero_area,
     five_at_an_edge,
 ]
-SHAPES += [two_pieces, hair, lambda: (TRIANGLE, FACES[:1]), lambda: (TETRAHEDRON, FACES)]
+SHAPES += [two_pieces, hair, tetrahedron]
 
 
 @pytest.mark.filterwarnings("ignore")
@@ -139,9 +137,8 @@ def test_the_pair_is_symmetric_and_positive_on_anything(shape, order):
     assert linalg.eigvalsh(mass / scale / scale[:, None]).min() > 1e-9
     spectrum = linalg.eigvalsh(stiffness, mass)
     components = 2 if shape is two_pieces else 1
-    zero = 1e-9 * spectrum.max()
-    assert (np.abs(spectrum[:components]) < zero).all()
-    assert (spectrum[components:] > zero / 1e3).all()
+    zero = np.abs(spectrum[:components]).max()
+    assert zero < min(1e-14 * spectrum.max(), spectrum[components] / 100)
     assert (lb.mass > 0).all()
     np.testing.assert_allclose(float(lb.mass.sum()), mass.sum(), rtol=1e-12)
 
@@ -160,7 +157,7 @@ def test_linear_elements_are_the_cotangent_with_its_full_mass(surface):
         assert abs(ours - matrix).max() < 1e-12
 
 
-CASES = [(1, 3.5, 3e-6), (3, 3.8, 3e-6), (4, 4.5, 4e-8)]
+CASES = [(1, 3.5, 3e-6), (3, 3.8, 3e-6), (4, 4.2, 4e-8)]
 
 
 @pytest.mark.parametrize(("order", "slope", "finest"), CASES)
@@ -172,7 +169,7 @@ def test_eigenvalues_of_the_sphere_converge(order, slope, finest):
         points = deserno_points(size)
         lb = LaplaceBeltrami.from_mesh(points, Sphere().triangulate(points), order=order)
         errors.append(np.abs(eigenvalues(lb, 25)[1:] / exact[1:] - 1).max())
-    assert errors[-1] < finest
+    assert errors[-1] < finest, errors
     assert -2 * np.polyfit(np.log(sizes), np.log(errors), 1)[0] > slope
 
 
@@ -188,8 +185,8 @@ def test_order_5_has_ten_digits_on_the_sphere():
 @pytest.mark.parametrize(("surface", "order", "slope", "finest"), [
     (UnitDisk(), 1, 3.5, 1e-4),
     (UnitDisk(), 3, 3.5, 5e-5),
-    (Hemisphere(), 3, 3.5, 4e-5),
-    (Hemisphere(), 5, 5.0, 5e-8),
+    (Hemisphere(), 4, 4.5, 3e-7),
+    (Hemisphere(), 5, 6.0, 3e-9),
 ])  # fmt: skip
 def test_domains_with_a_boundary_are_of_high_order_too(surface, order, slope, finest, condition):
     """First 12 eigenvalues, natural Neumann or rows and columns taken out, and curved edges along the rim."""
@@ -199,7 +196,7 @@ def test_domains_with_a_boundary_are_of_high_order_too(surface, order, slope, fi
         lb = LaplaceBeltrami.from_mesh(*surface.mesh(size), order=order, condition=condition)
         error = np.abs(eigenvalues(lb, 12) - exact)[exact > 0] / exact[exact > 0]
         errors.append(error.max())
-    assert errors[-1] < finest
+    assert errors[-1] < finest, errors
     assert -2 * np.polyfit(np.log(sizes), np.log(errors), 1)[0] > slope
 
 
@@ -311,14 +308,17 @@ def test_the_pair_travels(dtype):
 def test_where_there_can_be_no_pair():
     """Clouds, polylines: a clear error where it is asked for, none where it is left open."""
     vertices, faces = Sphere().mesh(100)
+    around = torch.arange(20, dtype=torch.float64) * torch.pi / 10
+    circle = torch.stack([around.cos(), around.sin()], 1)
+    segments = torch.stack([torch.arange(20), torch.arange(1, 21) % 20], 1)
     for build in (
         lambda **o: LaplaceBeltrami.from_points(vertices, order=1, **o),
-        lambda **o: LaplaceBeltrami.from_mesh(
-            vertices, boundary_faces(faces[:60]).unique(dim=0), order=1, **o
-        ),
+        lambda **o: LaplaceBeltrami.from_mesh(circle, segments, order=1, **o),
     ):
         with pytest.raises(InputError, match="weak_form"):
             build(weak_form=True)
+    with pytest.raises(InputError, match="3 points are fewer"):
+        LaplaceBeltrami.from_mesh(torch.eye(3), torch.tensor([[0, 1, 2]]))
     cloud = LaplaceBeltrami.from_points(vertices, order=1)
     assert not cloud.has_weak_form
     assert cloud.certificate.holds

@@ -38,7 +38,7 @@ class RimCurves:
         """Lagrange weights of the vertices at shares of the edge, 0 at its first end and 1 at its second."""
         size = self.index.shape[1]
         at = share * self.arc[:, 1:2]
-        other = self.valid[:, None, :] & ~torch.eye(size, dtype=torch.bool)
+        other = self.valid[:, None, :] & self.valid[:, :, None] & ~torch.eye(size, dtype=torch.bool)
         gap = torch.where(other, self.arc[:, :, None] - self.arc[:, None, :], 1.0)
         to = torch.where(other[:, None], at[:, :, None, None] - self.arc[:, None, None, :], 1.0)
         return (to / gap[:, None]).prod(-1) * self.valid[:, None]
