@@ -1,0 +1,111 @@
+"""Block Lanczos for the smallest eigenpairs of a symmetric pencil K u = λ M u (`method.md`, section 12)."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from scipy import linalg, sparse
+
+from torchlb.errors import EigenbasisError
+from torchlb.linalg.factor import cholesky
+
+BLOCK = 16
+"""Vectors at a time, the largest multiplicity that is surely found; 8 to 32 take about the same time."""
+CHECK = 2
+"""Blocks between two looks at the residuals."""
+LOOSE = 1e-4
+"""Above this tolerance one pass of orthogonalisation is enough."""
+
+Inverse = Callable[[Float[np.ndarray, "N C"]], Float[np.ndarray, "N C"]]
+Pairs = tuple[Float[np.ndarray, " k"], Float[np.ndarray, "N k"]]
+
+
+def inverse(matrix: sparse.csr_array) -> Inverse:
+    """The product with A⁻¹, by a Cholesky factor."""
+    factor = cholesky(matrix)
+    return lambda b: factor.solve(torch.from_numpy(b)).numpy()
+
+
+def lanczos(
+    stiffness: sparse.csr_array,
+    mass_matrix: sparse.csr_array,
+    k: int,
+    *,
+    shift: float,
+    tolerance: float,
+    more: int = 0,
+    null: Float[np.ndarray, " N"] | None = None,
+) -> Pairs:
+    """The k smallest eigenpairs but a null vector, ascending and M-orthonormal, and `more` that are less accurate.
+
+    Krylov space of (K + shift M)⁻¹M from random vectors, fixed ones, orthogonalised in full; no restarts. It is some
+    2.5 (k + more) vectors long.
+
+    Parameters
+    ----------
+    stiffness, mass_matrix : K, positive semidefinite, and M, positive definite, (N, N).
+    shift : small and positive, in the unit of λ.
+    tolerance : bound on the residuals in the M-norm, relative to the eigenvalues 1/(λ + shift); errors of the
+        eigenvalues are of the order of its square.
+    null : null vector of K, M-normalised, which is left out.
+
+    Raises
+    ------
+    EigenbasisError : if all N vectors do not suffice.
+    """
+    size, count = len(stiffness.diagonal()), k + more
+    solve = inverse(sparse.csr_array(stiffness + shift * mass_matrix))
+    generator = np.random.default_rng(0)
+    first = 0 if null is None else 1
+    basis, dual = (np.empty((min(4 * count + 4 * BLOCK, size), size)) for _ in range(2))  # V, MV
+    if null is not None:
+        basis[0], dual[0] = null, mass_matrix @ null
+    h, end = np.zeros((first, first)), first
+    z, look = generator.standard_normal((BLOCK, size)), first + count + BLOCK
+    while end + BLOCK <= size:
+        coupling = _orthogonalise(z, basis[:end], dual[:end], 1 if tolerance > LOOSE else 2)
+        h[:, max(end - BLOCK, first) : end] = coupling.T if end > first else 0.0
+        try:
+            z, mz, r = _orthonormal(z, mass_matrix)
+        except np.linalg.LinAlgError:  # the space is invariant: go on from new vectors
+            z = generator.standard_normal((BLOCK, size))
+            _orthogonalise(z, basis[:end], dual[:end], 2)
+            z, mz, r = _orthonormal(z, mass_matrix)
+            r = np.zeros_like(r)
+        if end >= look:
+            theta, y = linalg.eigh(np.triu(h[first:, first:]), lower=False)
+            theta, y = theta[: -count - 1 : -1], y[:, : -count - 1 : -1]
+            if (np.linalg.norm(r @ y[-BLOCK:, :k], axis=0) <= tolerance * theta[:k]).all():
+                return 1 / theta - shift, basis[first:end].T @ y
+            look = end + CHECK * BLOCK
+        if end + BLOCK > len(basis):
+            basis, dual = (np.concatenate([x, np.empty_like(x)]) for x in (basis, dual))
+        basis[end : end + BLOCK], dual[end : end + BLOCK] = z, mz
+        h, end = np.pad(h, (0, BLOCK)), end + BLOCK
+        z = np.ascontiguousarray(solve(np.ascontiguousarray(mz.T)).T)
+    raise EigenbasisError(
+        f"eigenbasis: block Lanczos did not find {k} pairs of {size} points to {tolerance:.1g}; ask for fewer"
+    )
+
+
+def _orthogonalise(z: np.ndarray, basis: np.ndarray, dual: np.ndarray, passes: int) -> np.ndarray:
+    """Take from the rows of z, in place, their parts in the basis; the coefficients."""
+    total = np.zeros((len(z), len(basis)))
+    for _ in range(passes):
+        coefficients = z @ dual.T
+        z -= coefficients @ basis
+        total += coefficients
+    return total
+
+
+def _orthonormal(
+    z: np.ndarray, mass_matrix: sparse.csr_array
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Rows made M-orthonormal, their products with M, and R with z = Rᵀ × rows; LinAlgError if they are dependent."""
+    mz = np.ascontiguousarray((mass_matrix @ np.ascontiguousarray(z.T)).T)
+    lower = np.linalg.cholesky(z @ mz.T)
+    back = linalg.inv(lower)
+    return back @ z, back @ mz, lower.T
