@@ -50,11 +50,16 @@ class Eigenbasis:
     eigenvectors : Φ, (N, k), ΦᵀΠΦ = I; the first is constant. For a batch, those of each shape on its own rows; a
         shape of fewer than k points has zero columns at the end.
     mass : π, (N,), ℓ^d.
-    left : W, (N, k), WᵀΦ = I: left eigenvectors of Δ, for the oblique projector ΦWᵀ. Equal to ΠΦ if ΠΔ is symmetric.
+    left : W, (N, k), WᵀΦ = I: left eigenvectors of Δ, for the oblique projector ΦWᵀ. Equal to ΠΦ if ΠΔ is symmetric,
+        to MΦ for a symmetric pair (K, M).
     sizes : numbers of points of the shapes of a batch; None for a single shape.
     decay_rates : (2, k) or (S, 2, k): real and imaginary parts of the eigenvalues of B = −WᵀΔΦ, in 1/ℓ².
     modal_transform : (3, k, k) or (S, 3, k, k): V, V⁻¹ and JV⁻¹ with BV = V(decay_rates[0] − decay_rates[1] J), J a
         quarter turn in each conjugate pair. Both are there only where the span is invariant: see `is_invariant`.
+    is_symmetric : whether they are eigenpairs of a symmetric pair, KΦ = MΦΛ with ΦᵀMΦ = I. Coefficients are then those
+        of the full mass matrix, decay rates the eigenvalues, every part of the span is invariant, and the two above
+        are None.
+    relative_errors : (k,) or (S, k), estimates for the eigenvalues of a symmetric pair; None if they were not made.
     """
 
     def __init__(
@@ -66,10 +71,14 @@ class Eigenbasis:
         sizes: tuple[int, ...] | None = None,
         decay_rates: Float[Tensor, "*S 2 k"] | None = None,
         modal_transform: Float[Tensor, "*S 3 k k"] | None = None,
+        *,
+        is_symmetric: bool = False,
+        relative_errors: Float[Tensor, "*S k"] | None = None,
     ) -> None:
         self.eigenvalues, self.eigenvectors = eigenvalues, eigenvectors
         self.mass, self.left, self.sizes = mass, left, sizes
         self.decay_rates, self.modal_transform = decay_rates, modal_transform
+        self.is_symmetric, self.relative_errors = is_symmetric, relative_errors
 
     def __repr__(self) -> str:
         n, k = self.eigenvectors.shape
@@ -80,17 +89,21 @@ class Eigenbasis:
     @property
     def is_invariant(self) -> bool:
         """Whether the span is invariant under Δ, and the exact e^{tΔ} on it is at hand."""
-        return self.modal_transform is not None
+        return self.is_symmetric or self.modal_transform is not None
 
     def truncate(self, k: int) -> Eigenbasis:
         """The first k of the pairs; itself if there are no more."""
         if k >= self.eigenvectors.shape[1]:
             return self
         cut = (self.eigenvalues[..., :k], self.eigenvectors[:, :k], self.mass, self.left[:, :k])
-        return Eigenbasis(*cut, sizes=self.sizes)
+        errors = None if self.relative_errors is None else self.relative_errors[..., :k]
+        symmetric = {"is_symmetric": self.is_symmetric, "relative_errors": errors}
+        return Eigenbasis(*cut, sizes=self.sizes, **symmetric)
 
     def to_basis(self, f: Float[Tensor, "*B N C"]) -> Float[Tensor, "*S k C"]:
-        """Coefficients Φᵀ(πf), (…, k, C), or (…, S, k, C) for a batch of shapes."""
+        """Coefficients Φᵀ(πf), ΦᵀMf for a symmetric pair, (…, k, C), or (…, S, k, C) for a batch of shapes."""
+        if self.is_symmetric:
+            return self._analyse(self.left, f)
         return self._analyse(self.eigenvectors, self.mass.to(f.dtype)[:, None] * f)
 
     def to_basis_obliquely(self, f: Float[Tensor, "*B N C"]) -> Float[Tensor, "*S k C"]:
@@ -129,7 +142,9 @@ def unstack_eigenbases(basis: Eigenbasis) -> list[Eigenbasis]:
         k = int((vectors != 0).any(0).sum())
         pairs = (basis.eigenvalues[s, :k], vectors[:, :k], mass, left[:, :k])
         if basis.decay_rates is None or basis.modal_transform is None:
-            parts.append(Eigenbasis(*pairs))
+            errors = None if basis.relative_errors is None else basis.relative_errors[s, :k]
+            symmetric = {"is_symmetric": basis.is_symmetric, "relative_errors": errors}
+            parts.append(Eigenbasis(*pairs, **symmetric))
         else:
             modes = (basis.decay_rates[s, :, :k], basis.modal_transform[s, :, :k, :k])
             parts.append(Eigenbasis(*pairs, None, *modes))
@@ -143,8 +158,15 @@ def stack_eigenbases(bases: list[Eigenbasis]) -> Eigenbasis:
     def padded(t: Tensor, sides: int) -> Tensor:
         return torch.nn.functional.pad(t, (0, k - t.shape[-1]) * sides)
 
-    decay_rates = modal_transform = None
-    if all(basis.is_invariant for basis in bases):
+    def extended(t: Tensor) -> Tensor:
+        return torch.cat([t, t[-1:].expand(k - len(t))])
+
+    decay_rates = modal_transform = relative_errors = None
+    is_symmetric = all(basis.is_symmetric for basis in bases)
+    if is_symmetric and all(basis.relative_errors is not None for basis in bases):
+        errors = [b.relative_errors for b in bases if b.relative_errors is not None]
+        relative_errors = torch.stack([extended(each) for each in errors])
+    if all(basis.modal_transform is not None for basis in bases):
         decay_rates = torch.stack(
             [padded(b.decay_rates, 1) for b in bases if b.decay_rates is not None]
         )
@@ -152,16 +174,13 @@ def stack_eigenbases(bases: list[Eigenbasis]) -> Eigenbasis:
             [padded(b.modal_transform, 2) for b in bases if b.modal_transform is not None]
         )
     return Eigenbasis(
-        torch.stack(
-            [
-                torch.cat([b.eigenvalues, b.eigenvalues[-1:].expand(k - len(b.eigenvalues))])
-                for b in bases
-            ]
-        ),
+        torch.stack([extended(b.eigenvalues) for b in bases]),
         torch.cat([padded(b.eigenvectors, 1) for b in bases]),
         torch.cat([b.mass for b in bases]),
         torch.cat([padded(b.left, 1) for b in bases]),
         tuple(len(b.mass) for b in bases),
         decay_rates,
         modal_transform,
+        is_symmetric=is_symmetric,
+        relative_errors=relative_errors,
     )

@@ -1,0 +1,338 @@
+r"""Eigenpairs of a symmetric weak pair K u = λ M u (`method.md`, section 12).
+
+Block Lanczos for the linear pair (K₁, M₁), whose factor is 20 times sparser than that of K; Rayleigh–Ritz in (K, M);
+then sweeps. In a sweep each eigenvector u is corrected by some steps of conjugate gradients for (K − λM)w = Ku − λMu on
+the complement of what is known, as in the Jacobi–Davidson method, and Rayleigh–Ritz on [U, W] follows. The steps are
+taken in float32, which costs no digits: what they give is a direction. Their preconditioner is a cycle of two levels,
+Chebyshev smoothing in K around a solve with a graph Laplacian on the edges of K₁.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float
+from scipy import linalg, sparse
+from scipy.sparse import csgraph
+from torch import Tensor
+
+from torchlb.errors import EigenbasisError
+from torchlb.linalg.lanczos import Inverse, inverse, lanczos
+from torchlb.linalg.sparse import multiply
+from torchlb.spectral.eigenbasis import Eigenbasis
+from torchlb.spectral.eigensolver import GAP
+
+TOLERANCE = 1e-5
+DENSE, SHARE = 600, 6
+"""Up to this many points, or where a sixth of the spectrum is wanted, a dense solve is as fast."""
+GUARD = 16
+"""Vectors carried beyond those wanted: they keep λ away from the rest of the spectrum."""
+SHIFT = 10.0
+"""Of the factors, over the area of a component: about half of its first eigenvalue, were it a disk."""
+START, EXACT = 1e-2, 1e-8
+"""Residuals of Lanczos for the linear pair, whose distance from (K, M) is of that order, and for a pair alone."""
+STEPS, MOST_STEPS, SWEEPS = 4, 32, 20
+"""Steps of conjugate gradients in the first sweep, doubled in the next ones up to a bound; bound on the sweeps."""
+SAFETY = 4.0
+"""On the estimated errors, which the preconditioner makes too small where K is softer than it takes it for."""
+
+TINY, DEPENDENT, STIFFER = 1e-300, 1e-12, 1e3
+FIRST, SECOND = np.float32(160 / 41), np.float32(-128 / 41)
+
+Sparse = sparse.csr_array
+Blocks = tuple[np.ndarray, np.ndarray, np.ndarray]  # U, KU, MU
+
+
+class _Part(NamedTuple):
+    """One component, its free points only."""
+
+    points: np.ndarray
+    stiffness: Sparse
+    mass_matrix: Sparse
+    linear: tuple[Sparse, Sparse, Sparse] | None  # K₁, M₁, and what the preconditioner takes for K
+    conserving: bool  # no point is fixed, so that constants have the eigenvalue 0
+
+
+def pencil_eigenbasis(
+    stiffness: Sparse,
+    mass_matrix: Sparse,
+    mass: Float[Tensor, " N"],
+    k: int,
+    *,
+    linear: tuple[Sparse, Sparse] | None = None,
+    fixed: Bool[np.ndarray, " N"] | None = None,
+    tolerance: float = TOLERANCE,
+) -> Eigenbasis:
+    """The min(k, N) smallest eigenpairs of K u = λ M u, and more where a group of equal ones would be split.
+
+    Parameters
+    ----------
+    stiffness, mass_matrix : K, positive semidefinite with K1 = 0, and M, positive definite, (N, N).
+    mass : diagonal mass, stored with the basis.
+    linear : K₁ and M₁ of the same points, spectrally close, with fewer entries. None if (K, M) are that themselves:
+        the eigenvalues are then exact to 1e-12 or so.
+    fixed : points where functions vanish (Dirichlet).
+    tolerance : bound on the estimated relative error of every eigenvalue; those closer than that are not separated.
+
+    Raises
+    ------
+    EigenbasisError : where that is not reached, or K has a negative eigenvalue.
+
+    Examples
+    --------
+    >>> path = sparse.csr_array([[1.0, -1.0], [-1.0, 1.0]])
+    >>> pencil_eigenbasis(path, sparse.eye_array(2).tocsr(), torch.ones(2), 2).eigenvalues
+    tensor([0., 2.], dtype=torch.float64)
+    """
+    held = np.zeros(len(mass), dtype=bool) if fixed is None else np.asarray(fixed, dtype=bool)
+    matrices = [sparse.csr_array(x, dtype=np.float64) for x in (stiffness, mass_matrix)]
+    parts = _parts(matrices[0], matrices[1], linear, held)
+    tolerance = EXACT**2 if linear is None else tolerance
+    found = [_pairs(part, k, tolerance) for part in parts]
+    return _merged(parts, found, matrices[1], mass, k, tolerance)
+
+
+def _parts(
+    stiffness: Sparse, mass_matrix: Sparse, linear: tuple[Sparse, Sparse] | None, fixed: np.ndarray
+) -> list[_Part]:
+    """The components, as both matrices connect them, without their fixed points.
+
+    They are numbered along the surface (Cuthill–McKee), which halves the time of the products.
+    """
+    joint = sparse.csr_array(abs(stiffness) + abs(mass_matrix))
+    count, component = csgraph.connected_components(joint, directed=False)
+    levels = None
+    if linear is not None:
+        k1, m1 = (sparse.csr_array(x, dtype=np.float64) for x in linear)
+        levels = (k1, m1, _coarse(stiffness, k1))
+    pattern = joint if levels is None else sparse.csr_array(abs(levels[0]) + abs(levels[1]))
+    order = csgraph.reverse_cuthill_mckee(pattern, symmetric_mode=True)
+    parts = []
+    for c in range(count):
+        whole = order[component[order] == c]
+        free = whole[~fixed[whole]]
+        k, m, *own = (
+            sparse.csr_array(matrix[free][:, free])
+            for matrix in (stiffness, mass_matrix, *(levels or ()))
+        )
+        if len(free):
+            parts.append(
+                _Part(
+                    free, k, m, (own[0], own[1], own[2]) if own else None, len(free) == len(whole)
+                )
+            )
+    return parts
+
+
+def _constant(mass_matrix: Sparse) -> np.ndarray:
+    return np.full(len(mass_matrix.diagonal()), float(mass_matrix.sum()) ** -0.5)
+
+
+def _pairs(part: _Part, k: int, tolerance: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """The k smallest eigenvalues of a component, or all, with groups whole, eigenvectors, and relative errors."""
+    size, zero = len(part.points), int(part.conserving)
+    count = min(k + GUARD, size)
+    if size <= max(DENSE, SHARE * count):
+        dense = (part.stiffness.toarray(), part.mass_matrix.toarray())
+        values, u = linalg.eigh(*dense, subset_by_index=(0, count - 1))
+        errors = np.zeros(count)
+    else:
+        k1, m1, *_ = part.linear or (part.stiffness, part.mass_matrix)
+        null, shift = _constant(m1) if zero else None, SHIFT / float(m1.sum())
+        accuracy = EXACT if part.linear is None else START
+        values, u = lanczos(
+            k1, m1, k - zero, shift=shift, tolerance=accuracy, more=GUARD, null=null
+        )
+        if null is not None:
+            values, u = np.append(0.0, values), np.column_stack([null, u])
+        errors = np.full(len(values), tolerance)
+        if part.linear is not None:
+            values, u, errors = _swept(part, u, k, shift, tolerance)
+    if zero:
+        values[0], u[:, 0], errors[0] = 0.0, _constant(part.mass_matrix), 0.0
+    if (values[zero:] <= 0).any():
+        raise EigenbasisError(
+            f"eigenbasis: the stiffness has the eigenvalue {values[zero:].min():.3g} on a component of {size} points, "
+            "where it should be positive"
+        )
+    keep = _closed(values, k, tolerance)
+    return values[:keep], u[:, :keep], errors[:keep]
+
+
+def _closed(values: np.ndarray, k: int, tolerance: float) -> int:
+    """The least number of pairs, k or more, that splits no group of equal eigenvalues; all if there is none."""
+    gaps = np.append(np.diff(values) > max(GAP, tolerance) * values[1:], True)
+    gaps[: min(k, len(values)) - 1] = False
+    return int(gaps.argmax()) + 1
+
+
+def _coarse(stiffness: Sparse, linear: Sparse) -> Sparse:
+    """Graph Laplacian of the positive weights of K₁, each edge as much stiffer as the diagonal of K is at its ends.
+
+    Rows of the fits with large weights make K up to a thousand times stiffer than K₁ at single points.
+    """
+    edges = sparse.coo_array(linear)
+    row, col = edges.coords
+    ratio = np.sqrt(stiffness.diagonal() / np.maximum(linear.diagonal(), TINY)).clip(max=STIFFER)
+    weight = np.where(row == col, 0.0, np.maximum(-1.0 * edges.data, 0.0)) * ratio[row] * ratio[col]
+    weights = sparse.csr_array((weight, (row, col)), shape=stiffness.shape)
+    degrees = np.bincount(row, weight, len(ratio))
+    return sparse.csr_array(sparse.csr_array(sparse.diags_array(degrees)) - weights)
+
+
+def _swept(
+    part: _Part, start: np.ndarray, k: int, shift: float, tolerance: float
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Sweeps from the linear pair's eigenvectors until the first k eigenvalues are accurate."""
+    stiffness, mass_matrix = part.stiffness, part.mass_matrix
+    assert part.linear is not None
+    _, linear_mass, coarse = part.linear
+    cycle, product = _two_levels(stiffness, sparse.csr_array(coarse + shift * linear_mass))
+    single = linear_mass.astype(np.float32)
+
+    def shifted(p: np.ndarray, shifts: np.ndarray) -> np.ndarray:
+        return product(p) - (single @ p) * shifts
+
+    count, zero = start.shape[1], int(part.conserving)
+    nothing = np.zeros((len(start), 0))
+    values, known = np.zeros(0), (nothing, nothing, nothing)
+    new = np.ascontiguousarray(start)
+    for sweep in range(SWEEPS):
+        blocks = (new, stiffness @ new, mass_matrix @ new)
+        values, known = _ritz(values, known, blocks, count)
+        u, ku, mu = known
+        residual = ku - mu * values
+        size = np.maximum(linalg.norm(residual, axis=0), TINY)
+        r = (residual / size).astype(np.float32)
+        z = cycle(r)
+        errors = SAFETY * np.abs(_dots(r, z)) * size**2 / np.maximum(np.abs(values), TINY)
+        errors[:zero] = 0.0
+        keep = _closed(values, k, tolerance)
+        if errors[:keep].max() <= tolerance:
+            return values, u, errors
+        active = np.flatnonzero(errors[:keep] > tolerance / SAFETY)
+        small = (u.astype(np.float32), mu.astype(np.float32))
+        right = (r[:, active], z[:, active], values[active].astype(np.float32))
+        steps = min(STEPS << sweep, MOST_STEPS)
+        new = _correction(shifted, cycle, small, right, steps).astype(np.float64)
+        new -= u @ (mu.T @ new)
+    raise EigenbasisError(
+        f"eigenbasis: after {SWEEPS} sweeps the estimated relative error of some of {k} eigenvalues is above "
+        f"{tolerance:.1g}; ask for a larger tolerance"
+    )
+
+
+def _correction(
+    shifted: Callable[[np.ndarray, np.ndarray], np.ndarray],
+    cycle: Inverse,
+    known: tuple[np.ndarray, np.ndarray],
+    right: tuple[np.ndarray, np.ndarray, np.ndarray],
+    steps: int,
+) -> np.ndarray:
+    """Conjugate gradients for every column of (K − λM)w = r, M-orthogonal to U; of [U, MU] and [r, cycle(r), λ]."""
+    (u, mu), (r, z, shifts) = known, right
+    w, p, square = np.zeros_like(r), np.zeros_like(r), np.ones(r.shape[1], dtype=r.dtype)
+    for step in range(steps):
+        z = z - u @ (mu.T @ z)
+        before, square = square, _dots(r, z)
+        p = z + p * (square / before)
+        product = shifted(p, shifts)
+        curvature = _dots(p, product)
+        length = np.where(curvature > 0, square / np.where(curvature > 0, curvature, 1), 0)
+        w += p * length
+        if step < steps - 1:
+            r = r - product * length
+            z = cycle(r)
+    return w
+
+
+def _two_levels(stiffness: Sparse, coarse: Sparse) -> tuple[Inverse, Inverse]:
+    """An approximate inverse of K, symmetric and definite, and the product with K, both in float32.
+
+    Smoothing is of degree 2 over the upper three quarters of the spectrum of D⁻¹K, D its absolute row sums.
+    """
+    solve = inverse(coarse)
+    crow, col = (
+        torch.from_numpy(x.astype(np.int64)) for x in (stiffness.indptr, stiffness.indices)
+    )
+    entries = torch.from_numpy(stiffness.data.astype(np.float32))
+    scale = (1 / np.asarray(abs(stiffness).sum(axis=1)).ravel()).astype(np.float32)[:, None]
+
+    def product(x: np.ndarray) -> np.ndarray:
+        return multiply(crow, col, entries, torch.from_numpy(x)).numpy()
+
+    def smooth(r: np.ndarray) -> np.ndarray:
+        # The residual polynomial is T₂((5 − 8x)/3) / T₂(5/3), 1 − x(a + bx) with these a and b.
+        p = scale * r
+        return FIRST * p + SECOND * (scale * product(p))
+
+    def cycle(r: np.ndarray) -> np.ndarray:
+        x = smooth(r)
+        x += solve(r - product(x))
+        return x + smooth(r - product(x))
+
+    return cycle, product
+
+
+def _dots(x: np.ndarray, y: np.ndarray) -> np.ndarray:
+    return np.einsum("ij,ij->j", x, y)
+
+
+def _ritz(values: np.ndarray, known: Blocks, new: Blocks, count: int) -> tuple[np.ndarray, Blocks]:
+    """Rayleigh–Ritz on the span of Ritz vectors, with their values, and of new directions."""
+    u, (w, kw, mw) = known[0], new
+    corner_k, corner_m = u.T @ kw, u.T @ mw
+    a = np.block([[np.diag(values), corner_k], [corner_k.T, w.T @ kw]])
+    b = np.block([[np.eye(len(values)), corner_m], [corner_m.T, w.T @ mw]])
+    scale = 1 / np.sqrt(b.diagonal())
+    squares, q = linalg.eigh(b * scale * scale[:, None])
+    q = scale[:, None] * (q / np.sqrt(np.maximum(squares, TINY)))[:, squares > DEPENDENT]
+    values, y = linalg.eigh(q.T @ a @ q, subset_by_index=(0, count - 1))
+    y = q @ y
+    top, bottom = y[: u.shape[1]], y[u.shape[1] :]
+    u, ku, mu = (x @ top + z @ bottom for x, z in zip(known, new, strict=True))
+    return np.asarray(values), (u, ku, mu)
+
+
+def _merged(
+    parts: list[_Part],
+    found: list[tuple[np.ndarray, np.ndarray, np.ndarray]],
+    mass_matrix: Sparse,
+    mass: Tensor,
+    k: int,
+    tolerance: float,
+) -> Eigenbasis:
+    """The components side by side, ascending; their constants recombined so that the first is global."""
+    values, errors = (np.concatenate([f[i] for f in found] or [np.zeros(0)]) for i in (0, 2))
+    columns = np.cumsum([0, *(len(f[0]) for f in found)])
+    phi = np.zeros((len(mass), len(values)))
+    for part, (_, u, _), at in zip(parts, found, columns[:-1], strict=True):
+        phi[part.points, at : at + u.shape[1]] = u
+    constants = [at for part, at in zip(parts, columns[:-1], strict=True) if part.conserving]
+    rest = np.setdiff1d(np.arange(len(values)), constants)
+    rest = rest[np.argsort(values[rest], kind="stable")]
+    order = np.concatenate([np.array(constants, dtype=int), rest])
+    values, errors, phi = values[order], errors[order], phi[:, order]
+    phi *= np.where(phi[np.abs(phi).argmax(0), np.arange(phi.shape[1])] < 0, -1.0, 1.0)
+    count = len(constants)
+    if count:
+        nulls = [part for part in parts if part.conserving]
+        root = np.sqrt([part.mass_matrix.sum() for part in nulls])
+        t = np.linalg.qr(np.column_stack([root, np.eye(count)[:, : count - 1]]))[0]
+        phi[:, :count] = phi[:, :count] @ (t * np.sign(t[0, 0]))
+        phi[np.concatenate([part.points for part in nulls]), 0] = 1 / linalg.norm(root)
+    keep = _closed(values, k, tolerance) if len(values) else 0
+    phi = np.ascontiguousarray(phi[:, :keep])
+    arrays = [torch.from_numpy(x) for x in (values[:keep].copy(), phi, mass_matrix @ phi)]
+    eigenvalues, eigenvectors, left = arrays
+    return Eigenbasis(
+        eigenvalues,
+        eigenvectors,
+        mass.detach().cpu().double(),
+        left,
+        is_symmetric=True,
+        relative_errors=torch.from_numpy(errors[:keep].copy()),
+    )
