@@ -2,12 +2,18 @@
 
 import sys
 
+import igl
 import numpy as np
 import pytest
 import torch
-from scipy import sparse
+import trimesh
+from scipy import linalg, sparse
 
+from torchlb.errors import EigenbasisError
 from torchlb.linalg.factor import cholesky
+from torchlb.linalg.lanczos import lanczos
+from torchlb.spectral.eigenbasis import stack_eigenbases, unstack_eigenbases
+from torchlb.spectral.pencil import pencil_eigenbasis
 
 
 def path_matrix(size, shift):
@@ -47,3 +53,159 @@ def test_a_factor_does_without_cholespy(monkeypatch):
     factor = cholesky(matrix)
     assert not factor.is_cholesky
     torch.testing.assert_close(factor.solve(b), solution)
+
+
+def cycle_matrix(size):
+    """Graph Laplacian of a cycle: eigenvalues 2 − 2 cos 2πj/N, twice each but the first (and the last if N is even)."""
+    step = sparse.eye_array(size, k=1) + sparse.eye_array(size, k=1 - size)
+    return sparse.csr_array(2 * sparse.eye_array(size) - step - step.T)
+
+
+def grid_pair(rows, columns):
+    """Laplacian of a grid with the eigenvalues (2 − 2 cos πi/R) + (2 − 2 cos πj/C), and the identity."""
+    parts = [path_matrix(rows, 0.0), path_matrix(columns, 0.0)]
+    return sparse.csr_array(sparse.kronsum(*parts)), sparse.csr_array(
+        sparse.eye_array(rows * columns)
+    )
+
+
+def grid_values(rows, columns):
+    i, j = np.ogrid[:rows, :columns]
+    return np.sort(np.ravel(4 - 2 * np.cos(np.pi * i / rows) - 2 * np.cos(np.pi * j / columns)))
+
+
+def solved(k_matrix, m_matrix, k, **options):
+    mass = torch.from_numpy(np.asarray(m_matrix.sum(axis=1)).ravel())
+    return pencil_eigenbasis(k_matrix, m_matrix, mass, k, **options)
+
+
+def weak_pair(rows, columns):
+    """A pair close to the grid's: K = K₁ + K₁²/12, its next order, M = I + K₁/20; the same eigenvectors."""
+    k1, m1 = grid_pair(rows, columns)
+    return sparse.csr_array(k1 + k1 @ k1 / 12), sparse.csr_array(m1 + k1 / 20), (k1, m1)
+
+
+def check_pairs(basis, k_matrix, m_matrix, tolerance=1e-9):
+    """ΦᵀMΦ = I, ΦᵀKΦ = Λ, left = MΦ."""
+    values, phi = basis.eigenvalues.numpy(), basis.eigenvectors.numpy()
+    np.testing.assert_allclose(phi.T @ (m_matrix @ phi), np.eye(len(values)), atol=1e-9)
+    np.testing.assert_allclose(
+        phi.T @ (k_matrix @ phi), np.diag(values), atol=tolerance * values[-1]
+    )
+    np.testing.assert_allclose(basis.left.numpy(), m_matrix @ phi)
+
+
+def test_lanczos_finds_multiplicities_larger_than_one():
+    size, shift = 2000, 1e-5
+    values, vectors = lanczos(
+        cycle_matrix(size), sparse.eye_array(size).tocsr(), 20, shift=shift, tolerance=1e-8
+    )
+    exact = np.sort(2 - 2 * np.cos(2 * np.pi * np.arange(size) / size))[:20]
+    np.testing.assert_allclose(values, exact, atol=1e-14)
+    np.testing.assert_allclose(vectors.T @ vectors, np.eye(20), atol=1e-12)
+
+
+def test_lanczos_goes_on_where_the_space_is_invariant():
+    diagonal = sparse.diags_array(np.repeat([1.0, 2.0, 3.0], [40, 40, 120])).tocsr()
+    values, _ = lanczos(diagonal, sparse.eye_array(200).tocsr(), 50, shift=1.0, tolerance=1e-8)
+    np.testing.assert_allclose(values, np.repeat([1.0, 2.0], [40, 10]))
+
+
+@pytest.mark.parametrize("size", [30, 2500])  # dense, sparse
+def test_a_pair_alone_has_exact_eigenvalues(size):
+    matrices = cycle_matrix(size), sparse.eye_array(size).tocsr()
+    basis = solved(*matrices, 9)
+    exact = np.sort(2 - 2 * np.cos(2 * np.pi * np.arange(size) / size))[:9]
+    np.testing.assert_allclose(basis.eigenvalues, exact, rtol=1e-9, atol=1e-13)
+    check_pairs(basis, *matrices)
+
+
+def test_a_group_of_equal_eigenvalues_is_not_split():
+    assert len(solved(cycle_matrix(30), sparse.eye_array(30).tocsr(), 8).eigenvalues) == 9
+
+
+@pytest.mark.parametrize("tolerance", [1e-5, 1e-10])
+def test_a_weak_pair_reaches_its_tolerance(tolerance):
+    stiffness, mass_matrix, linear = weak_pair(37, 41)
+    basis = solved(stiffness, mass_matrix, 30, linear=linear, tolerance=tolerance)
+    x = grid_values(37, 41)[: len(basis.eigenvalues)]
+    exact = (x + x**2 / 12) / (1 + x / 20)
+    np.testing.assert_allclose(basis.eigenvalues, exact, rtol=tolerance)
+    assert basis.eigenvalues[0] == 0
+    assert basis.relative_errors.max() <= tolerance
+    check_pairs(basis, stiffness, mass_matrix)
+
+
+def test_fewer_pairs_are_the_first_of_more():
+    stiffness, mass_matrix, linear = weak_pair(37, 41)
+    few, many = (solved(stiffness, mass_matrix, k, linear=linear) for k in (6, 40))
+    k = len(few.eigenvalues)
+    torch.testing.assert_close(few.eigenvalues, many.eigenvalues[:k], rtol=2e-5, atol=0)
+
+
+def test_a_sphere_has_the_eigenvalues_of_a_dense_solve():
+    sphere = trimesh.creation.icosphere(subdivisions=4)
+    stiffness = sparse.csr_array(-igl.cotmatrix(sphere.vertices, sphere.faces))
+    mass_matrix = sparse.csr_array(
+        igl.massmatrix(sphere.vertices, sphere.faces, igl.MASSMATRIX_TYPE_FULL)
+    )
+    mass_matrix = mass_matrix * (1 + np.random.default_rng(0).random(stiffness.shape[0]) / 2)
+    mass_matrix = sparse.csr_array((mass_matrix + mass_matrix.T) / 2)
+    exact = linalg.eigh(stiffness.toarray(), mass_matrix.toarray(), subset_by_index=(0, 29))[0]
+    basis = solved(stiffness, mass_matrix, 30)
+    np.testing.assert_allclose(basis.eigenvalues[1:30], exact[1:], rtol=1e-10)
+    check_pairs(basis, stiffness, mass_matrix)
+
+
+@pytest.mark.parametrize("size", [4, 900])
+def test_components_have_one_zero_eigenvalue_each_and_a_global_constant(size):
+    block = cycle_matrix(size)
+    stiffness = sparse.block_diag([block, 2 * block, block], format="csr")
+    mass_matrix = sparse.diags_array(np.repeat([1.0, 3.0, 2.0], size)).tocsr()
+    basis = solved(stiffness, mass_matrix, 12)
+    assert (basis.eigenvalues == 0).sum() == 3
+    constant = basis.eigenvectors[:, 0]
+    assert (constant == constant[0]).all()
+    np.testing.assert_allclose(constant[0], (6 * size) ** -0.5)
+    check_pairs(basis, stiffness, mass_matrix)
+
+
+@pytest.mark.parametrize("size", [50, 3000])
+def test_fixed_points_are_zeros_of_the_eigenvectors(size):
+    stiffness, mass_matrix = path_matrix(size, 0.0), sparse.eye_array(size).tocsr()
+    fixed = np.isin(np.arange(size), [0, size - 1])
+    basis = solved(stiffness, mass_matrix, 5, fixed=fixed)
+    exact = 2 - 2 * np.cos(np.pi * np.arange(1, 6) / (size - 1))
+    np.testing.assert_allclose(basis.eigenvalues, exact, rtol=1e-8)
+    assert (basis.eigenvectors[fixed] == 0).all()
+
+
+@pytest.mark.parametrize("size", [1, 2, 3])
+def test_tiny_shapes_have_as_many_pairs_as_points(size):
+    stiffness = sparse.csr_array(size * np.eye(size) - np.ones((size, size)))
+    basis = solved(stiffness, sparse.eye_array(size).tocsr(), 5)
+    np.testing.assert_allclose(basis.eigenvalues, [0.0] + [size] * (size - 1))
+
+
+def test_the_basis_of_a_pair_projects_in_the_full_mass_and_keeps_its_errors():
+    stiffness, mass_matrix, linear = weak_pair(5, 6)
+    basis = solved(stiffness, mass_matrix, 30, linear=linear)
+    f = torch.randn(30, 2, dtype=torch.float64)
+    assert basis.is_invariant
+    assert basis.modal_transform is None
+    torch.testing.assert_close(basis.from_basis(basis.to_basis(f)), f)
+    first, second = unstack_eigenbases(stack_eigenbases([basis, basis.truncate(4)]))
+    assert second.is_invariant
+    assert len(second.relative_errors) == 4
+    torch.testing.assert_close(first.relative_errors, basis.relative_errors)
+
+
+def test_a_negative_eigenvalue_is_an_error():
+    with pytest.raises(EigenbasisError, match="should be positive"):
+        solved(-cycle_matrix(10), sparse.eye_array(10).tocsr(), 3)
+
+
+def test_a_tolerance_beyond_rounding_is_an_error():
+    stiffness, mass_matrix, linear = weak_pair(37, 41)
+    with pytest.raises(EigenbasisError, match="larger tolerance"):
+        solved(stiffness, mass_matrix, 5, linear=linear, tolerance=0.0)
