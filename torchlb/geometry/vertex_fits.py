@@ -13,7 +13,7 @@ from torchlb.fits.rules import SIZE_FACTORS
 from torchlb.fits.weights import CenteredFit, centered_fit
 from torchlb.geometry.neighbors import GraphBalls
 
-MAX_CONDITION = 1e4
+MAX_CONDITION = 1e5
 MAX_MISFIT = {2: 0.3}
 """Of the heights of a quadratic, which is the last resort; all others have to follow them to `FAITHFUL`."""
 FAITHFUL = 0.05

@@ -1,0 +1,56 @@
+"""Preconditioned conjugate gradients for many right-hand sides at once."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from torchlb.errors import DiffusionError
+
+Linear = Callable[[Tensor], Tensor]
+
+
+def conjugate_gradients(
+    product: Linear,
+    b: Float[Tensor, "N C"],
+    precondition: Linear,
+    *,
+    tolerance: float = 1e-10,
+    max_steps: int = 1000,
+) -> tuple[Float[Tensor, "N C"], int]:
+    """A⁻¹b for a symmetric A ≥ 0, and the number of steps; each column has its own step lengths.
+
+    Ends where the residuals r have √(rᵀBr) ≤ `tolerance` times that of b, B the preconditioner: an estimate of the
+    error in the norm of A, relative to the solution. b has to be in the range of A.
+
+    Raises
+    ------
+    DiffusionError : where that is not reached in `max_steps`.
+
+    >>> a = torch.tensor([[2.0, 1.0], [1.0, 3.0]])
+    >>> x, steps = conjugate_gradients(lambda v: a @ v, torch.tensor([[3.0], [4.0]]), lambda r: r, tolerance=1e-5)
+    >>> x.T.round(decimals=4).tolist(), steps
+    ([[1.0, 1.0]], 2)
+    """
+    x, r = torch.zeros_like(b), b
+    z = precondition(r)
+    p, square = z, (r * z).sum(0)
+    enough = tolerance**2 * square
+    for step in range(max_steps):
+        if bool((square <= enough).all()):
+            return x, step
+        q = product(p)
+        curvature = (p * q).sum(0)
+        length = torch.where(square > enough, square / curvature, 0.0)
+        x, r = x + length * p, r - length * q
+        z = precondition(r)
+        before, square = square, (r * z).sum(0)
+        p = z + torch.where(before > 0, square / before, 0.0) * p
+    left = float((square / enough.clamp_min(1e-300)).max()) ** 0.5 * tolerance
+    raise DiffusionError(
+        f"conjugate gradients: {left:.1e} of the residual is left after {max_steps} steps, not {tolerance:.0e}. "
+        "Some triangles are too degenerate: merge vertices that nearly coincide, or raise `tolerance`"
+    )

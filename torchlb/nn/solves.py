@@ -1,0 +1,201 @@
+"""Implicit steps and Poisson problems on a shape, differentiable (`method.md`, section 12)."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from torchlb.errors import InputError
+from torchlb.linalg.sparse import csr_product
+from torchlb.nn.checks import check_shape
+from torchlb.nn.systems import system
+from torchlb.operator.laplace_beltrami import LaplaceBeltrami
+
+TOLERANCE = 1e-10
+
+
+def implicit_step(
+    lb: LaplaceBeltrami,
+    f: Float[Tensor, "*B N C"] | Float[Tensor, " N"],
+    t: float | Tensor,
+    *,
+    boundary_values: Tensor | None = None,
+    flux: Tensor | None = None,
+    tolerance: float = TOLERANCE,
+) -> Tensor:
+    """(1 − tΔ)⁻¹f, one implicit Euler step of heat flow; differentiable in f, t and the boundary's data.
+
+    (M + tK)u = Mf + tB·flux with the weak pair, by conjugate gradients that the linear pair preconditions; without one
+    (1 − tL)u = f with the stencil, by LU. Solved in float64; the result has the type of f.
+
+    Parameters
+    ----------
+    lb : operator of one shape, or of a batch.
+    f : (N,), (N, C) or (B, N, C).
+    t : time ≥ 0 in ℓ², one for all channels or (C,).
+    boundary_values : u at the points of a Dirichlet condition, a number or of the shape of f, of which only those
+        points count; 0 by default.
+    flux : ∂_ν u along the rest of the boundary, units of f by 1/ℓ, in the same way; 0 by default.
+    tolerance : of the solver, relative.
+
+    Raises
+    ------
+    InputError : for wrong shapes, times that are negative or not finite, data for a boundary that is not there.
+    DiffusionError : where the solver does not converge.
+
+    Examples
+    --------
+    >>> from torchlb.surfaces import Sphere
+    >>> vertices, faces = Sphere().mesh(300)
+    >>> lb = LaplaceBeltrami.from_mesh(vertices, faces)
+    >>> u = implicit_step(lb, vertices[:, 2], 0.5)  # z is an eigenfunction: z / (1 + 2t)
+    >>> bool((u - vertices[:, 2] / 2).abs().max() < 1e-4)
+    True
+    """
+    x = f[:, None] if f.ndim == 1 else f
+    check_shape(x, lb)
+    time = torch.as_tensor(t, dtype=torch.float64, device=x.device)
+    if not bool(((time >= 0) & time.isfinite()).all()):
+        raise InputError(f"t: expected finite times of at least 0, got {time.detach().cpu()}")
+    columns, time = _columns(x, time.expand(x.shape[-1]))
+    given, poured = (_data(lb, d, n, f) for d, n in ((boundary_values, 0), (flux, 1)))
+    right = _mass(lb, columns)
+    if poured is not None:
+        right = right + time * _product(lb, 2, poured)
+    if given is not None:
+        right = right - _product(lb, 1, given) - time * _product(lb, 0, given)
+    u = _Solve.apply(right, time, lb, tolerance)
+    return _shaped(u if given is None else u + given, f)
+
+
+def poisson_solve(
+    lb: LaplaceBeltrami,
+    f: Float[Tensor, "*B N C"] | Float[Tensor, " N"],
+    *,
+    boundary_values: Tensor | None = None,
+    flux: Tensor | None = None,
+    tolerance: float = TOLERANCE,
+) -> Tensor:
+    """u with −Δu = f; differentiable in f and the boundary's data. Units of f by ℓ².
+
+    Ku = Mf + B·flux with the weak pair, −Lu = f with the stencil. On a component without a Dirichlet condition u has
+    mean zero, and f and flux are made compatible: their total is taken off f, evenly. Arguments and errors as for
+    `implicit_step`.
+
+    Examples
+    --------
+    >>> from torchlb.surfaces import Sphere
+    >>> vertices, faces = Sphere().mesh(300)
+    >>> lb = LaplaceBeltrami.from_mesh(vertices, faces)
+    >>> u = poisson_solve(lb, vertices[:, 2])
+    >>> bool((u - vertices[:, 2] / 2).abs().max() < 1e-4)
+    True
+    """
+    x = f[:, None] if f.ndim == 1 else f
+    check_shape(x, lb)
+    columns, _ = _columns(x, None)
+    given, poured = (_data(lb, d, n, f) for d, n in ((boundary_values, 0), (flux, 1)))
+    right = _mass(lb, columns)
+    if poured is not None:
+        right = right + _product(lb, 2, poured)
+    if given is not None:
+        right = right - _product(lb, 0, given)
+    u = _Solve.apply(right, None, lb, tolerance)
+    return _shaped(u if given is None else u + given, f)
+
+
+def _columns(x: Tensor, time: Tensor | None) -> tuple[Tensor, Tensor]:
+    """The surfaces of a stack (B, N, C) as further channels, in float64, with a time for each."""
+    time = x.new_zeros(0) if time is None else time
+    if x.ndim == 2:
+        return x.double(), time
+    return x.double().transpose(0, 1).flatten(1), time.repeat(len(x))
+
+
+def _shaped(u: Tensor, f: Tensor) -> Tensor:
+    """Columns in the shape and type of f."""
+    if f.ndim == 3:
+        u = u.view(f.shape[1], f.shape[0], f.shape[2]).transpose(0, 1)
+    return (u[:, 0] if f.ndim == 1 else u).to(f.dtype)
+
+
+def _data(lb: LaplaceBeltrami, data: Tensor | float | None, kind: int, f: Tensor) -> Tensor | None:
+    """Boundary data as columns, zero where they do not count: Dirichlet values (kind 0) or fluxes (1)."""
+    if data is None:
+        return None
+    name = ("boundary_values", "flux")[kind]
+    if not lb.has_weak_form:
+        raise InputError(f"{name}: a stencil has no place for them; build from a triangle mesh")
+    if kind == 0 and lb.fixed is None:
+        raise InputError(
+            "boundary_values: no Dirichlet condition; build with condition='dirichlet'"
+        )
+    if kind == 1 and len(lb.weak_values) < 3:
+        raise InputError("flux: the shape is closed; it has no boundary that one could pass")
+    values = torch.as_tensor(data, dtype=torch.float64, device=f.device)
+    try:
+        values = values.expand(f.shape)
+    except RuntimeError as error:
+        raise InputError(
+            f"{name}: expected the shape of f, {tuple(f.shape)}, got {tuple(values.shape)}"
+        ) from error
+    values = values[:, None] if f.ndim == 1 else values
+    columns, _ = _columns(values, None)
+    return columns * lb.fixed[:, None] if kind == 0 and lb.fixed is not None else columns
+
+
+def _product(lb: LaplaceBeltrami, number: int, x: Tensor) -> Tensor:
+    """K, M or B times x."""
+    crow, col = lb.weak_crow, lb.weak_col
+    pattern = [crow, col, crow, col, torch.arange(len(col), device=col.device)]
+    return csr_product(pattern, lb.weak_values[number].double(), x)
+
+
+def _mass(lb: LaplaceBeltrami, x: Tensor) -> Tensor:
+    return _product(lb, 1, x) if lb.has_weak_form else x
+
+
+class _Solve(torch.autograd.Function):
+    """u of S(t)u = b: (M + tK)u = b, or Ku = b for a time of None; zero at Dirichlet points.
+
+    Its derivatives are solves with the same matrix: S⁻ᵀg in b, and −⟨S⁻ᵀg, S'(t)u⟩ in t.
+    """
+
+    @staticmethod
+    def forward(ctx: Any, b: Tensor, time: Tensor | None, lb: Any, tolerance: float) -> Tensor:  # pyright: ignore
+        u = solve_columns(lb, b, time, tolerance)
+        ctx.save_for_backward(time, u)
+        ctx.rest = lb, tolerance
+        return u
+
+    @staticmethod
+    def backward(ctx: Any, g: Tensor) -> tuple[Any, ...]:  # pyright: ignore
+        time, u = ctx.saved_tensors
+        lb, tolerance = ctx.rest
+        w = solve_columns(lb, g, time, tolerance, transposed=True)
+        grad_t = None
+        if time is not None and ctx.needs_input_grad[1]:
+            slope = _product(lb, 0, u) if lb.has_weak_form else -lb(u)
+            grad_t = -(w * slope).sum(0)
+        return w, grad_t, None, None
+
+
+@torch.compiler.disable
+def solve_columns(
+    lb: LaplaceBeltrami,
+    b: Float[Tensor, "N C"],
+    time: Float[Tensor, " C"] | None,
+    tolerance: float,
+    transposed: bool = False,
+) -> Float[Tensor, "N C"]:
+    """Columns of one time are solved together; a time of 0 has M, or 1, to invert."""
+    if time is None:
+        return system(lb, None).solve(b, tolerance, transposed)
+    u = torch.zeros_like(b, dtype=torch.float64)
+    for t in time.detach().unique().tolist():
+        where = time == t
+        u[:, where] = system(lb, t).solve(b[:, where], tolerance, transposed)
+    return u

@@ -1,0 +1,164 @@
+"""The linear systems behind implicit steps and Poisson problems, by the weak pair or by the stencil.
+
+A system is a K + b M with the rows and columns of Dirichlet points taken out. The weak pair is solved by conjugate
+gradients; the factor of the linear pair, which is spectrally close and 20 times sparser, preconditions them
+(`method.md`, section 12). Factors are kept as long as the operator that they belong to.
+"""
+
+from __future__ import annotations
+
+from collections import OrderedDict
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from scipy import sparse
+from scipy.sparse import csgraph
+from torch import Tensor
+from torch.utils.weak import WeakIdKeyDictionary
+
+from torchlb.linalg.conjugate_gradients import conjugate_gradients
+from torchlb.linalg.factor import cholesky, factorized
+from torchlb.linalg.sparse import multiply
+from torchlb.operator.laplace_beltrami import LaplaceBeltrami
+
+KEPT = 8
+"""Factors that are kept for each operator."""
+SHIFT = 1e-9
+"""Of an inverted stencil that is singular, in units of its diagonal."""
+_SYSTEMS: Any = WeakIdKeyDictionary()
+System = "PairSystem | StencilSystem"
+
+
+def system(lb: LaplaceBeltrami, t: float | None) -> PairSystem | StencilSystem:
+    """That of an implicit step of a time t, or of a Poisson problem for None."""
+    kept = _SYSTEMS.setdefault(lb.values, OrderedDict())
+    device = lb.values.device
+    if (t, device) not in kept:
+        kept[t, device] = PairSystem(lb, t) if lb.has_weak_form else StencilSystem(lb, t)
+        if len(kept) > KEPT:
+            kept.popitem(last=False)
+    kept.move_to_end((t, device))
+    return kept[t, device]
+
+
+class _Components:
+    """Means over the connected components of a shape, and which of them have a Dirichlet point."""
+
+    def __init__(self, lb: LaplaceBeltrami, crow: Tensor, col: Tensor) -> None:
+        n = lb.num_points
+        where = (np.ones(len(col)), col.cpu().numpy(), crow.cpu().numpy())
+        number = csgraph.connected_components(sparse.csr_array(where, shape=(n, n)), False)[1]
+        self.of = torch.from_numpy(number.astype(np.int64)).to(col.device)
+        self.count = int(number.max()) + 1
+        fixed = torch.zeros(n, dtype=torch.bool) if lb.fixed is None else lb.fixed
+        held = torch.zeros(self.count, device=col.device).index_add(
+            0, self.of, fixed.to(col.device, torch.float32)
+        )
+        self.free = (held == 0)[self.of][:, None]  # points whose component has no Dirichlet point
+
+    def sums(self, x: Float[Tensor, "N C"]) -> Float[Tensor, "N C"]:
+        """Of every point the sum over its component."""
+        return x.new_zeros(self.count, x.shape[1]).index_add(0, self.of, x)[self.of]
+
+
+class PairSystem:
+    """K, or M + tK, of a weak pair."""
+
+    def __init__(self, lb: LaplaceBeltrami, t: float | None) -> None:
+        stiffness, mass = (v.detach().double() for v in lb.weak_values[:2])
+        crow, col, linear = lb.linear_pair
+        self.pattern = lb.weak_crow, lb.weak_col
+        self.values = stiffness if t is None else mass + t * stiffness
+        self.stiffness, self.mass, self.singular = stiffness, mass, t is None
+        self.free = None if lb.fixed is None else (~lb.fixed).double()[:, None]
+        self.components = _Components(lb, crow, col) if t is None else None
+        self.ones_mass = multiply(*self.pattern, mass, torch.ones_like(lb.mass.double())[:, None])
+        self.steps = 0
+        n = lb.num_points
+        first, second = (
+            sparse.csr_array(
+                (v.detach().double().cpu().numpy(), col.cpu().numpy(), crow.cpu().numpy()),
+                shape=(n, n),
+            )
+            for v in linear[:2]
+        )
+        if self.components is None:
+            matrix = second + t * first
+        else:
+            area = self.components.sums(self.ones_mass)[:, 0]
+            scale = sparse.diags_array(area.rsqrt().cpu().numpy())
+            matrix = first + scale @ second @ scale
+        if self.free is not None:
+            free = self.free[:, 0].cpu().numpy()
+            keep = sparse.diags_array(free)
+            matrix = keep @ matrix @ keep + sparse.diags_array((1 - free) * matrix.diagonal())
+        self.factor = cholesky((matrix + matrix.T) / 2)
+
+    def solve(
+        self, b: Float[Tensor, "N C"], tolerance: float, transposed: bool = False
+    ) -> Float[Tensor, "N C"]:
+        """The solution, zero at Dirichlet points, of mean zero on the other components of a Poisson problem."""
+        b = self._compatible(self._inside(b.double()))
+        x, self.steps = conjugate_gradients(
+            lambda v: self._inside(multiply(*self.pattern, self.values, v)),
+            b,
+            lambda r: self._inside(self.factor.solve(r)),
+            tolerance=tolerance,
+        )
+        return self._centered(x)
+
+    def _inside(self, x: Tensor) -> Tensor:
+        return x if self.free is None else x * self.free
+
+    def _compatible(self, b: Tensor) -> Tensor:
+        """Without the mean over components that no Dirichlet point holds: Πᵀb, Π as below."""
+        if self.components is None:
+            return b
+        mean = self.components.sums(b) / self.components.sums(self.ones_mass)
+        return b - torch.where(self.components.free, self.ones_mass * mean, 0.0)
+
+    def _centered(self, x: Tensor) -> Tensor:
+        """Πx = x less its mean, in M, over the same components."""
+        if self.components is None:
+            return x
+        mean = self.components.sums(self.ones_mass * x) / self.components.sums(self.ones_mass)
+        return x - torch.where(self.components.free, mean, 0.0)
+
+
+class StencilSystem:
+    """−L, or 1 − tL, of a stencil L, by sparse LU on the CPU."""
+
+    def __init__(self, lb: LaplaceBeltrami, t: float | None) -> None:
+        n = lb.num_points
+        matrix = sparse.csr_array(lb.to_scipy(), dtype=np.float64)
+        self.components = None
+        shift = 1.0
+        if t is None:
+            self.components = _Components(lb, lb.crow, lb.col)
+            shift = SHIFT * float(np.median(np.abs(matrix.diagonal())))
+            t = 1.0
+        self.free = None if lb.fixed is None else (~lb.fixed).double()[:, None]
+        self.mass = lb.mass.detach().double()[:, None]
+        self.lu = factorized(sparse.csc_array(shift * sparse.eye_array(n) - t * matrix), 1e-2)
+
+    def solve(
+        self, b: Float[Tensor, "N C"], tolerance: float, transposed: bool = False
+    ) -> Float[Tensor, "N C"]:
+        """As for the pair; `transposed` for the transposed matrix."""
+        b = b.double() if self.free is None else b.double() * self.free
+        if self.components is not None:
+            b = self._without(b, transposed)
+        x = self.lu.solve(b.detach().cpu().numpy(), "T" if transposed else "N")
+        result = torch.from_numpy(x).to(b)
+        result = result if self.free is None else result * self.free
+        return result if self.components is None else self._without(result, transposed)
+
+    def _without(self, x: Tensor, transposed: bool) -> Tensor:
+        """Without constants, in the mass π, or without π, in the sum."""
+        assert self.components is not None
+        area = self.components.sums(self.mass)
+        one, other = (1.0, self.mass) if transposed else (self.mass, 1.0)
+        less = other * self.components.sums(one * x) / area
+        return x - torch.where(self.components.free, less, 0.0)
