@@ -1,9 +1,10 @@
 """Heat flow e^{tΔ}f, for given times and for learned ones (`method.md`, section 8).
 
-method="deflated", the default, is exact at every scale: on the span of the slow eigenvectors by their own small matrix,
-on the rest, split off by the oblique projector, by a short Chebyshev series, since nothing of it is left after about
-16/λ_k. "spectral" is the first part alone: everything beyond the basis is dropped, also as t → 0. "chebyshev" and
-"contour" need no basis.
+With a weak pair e^{−tM⁻¹K}, without one e^{tL} of the stencil. method="deflated", the layer's default, splits off
+the span of the slow eigenvectors, where the flow is exact; the rest, of which nothing is left after about 16/λ_k, takes
+a short Chebyshev series: of the stencil, or of the linear pair with lumped mass, since the mesh hardly resolves what is
+beyond the basis. "spectral" is the first part alone: everything beyond the basis is dropped, also as t → 0. "chebyshev"
+and "contour" need no basis, and are exact to the tolerance; with a pair both are the solves of `pair_flow`.
 """
 
 from __future__ import annotations
@@ -20,6 +21,7 @@ from torch.nn.functional import softplus
 from torchlb.errors import DiffusionError, InputError
 from torchlb.linalg.exponential import heat
 from torchlb.nn.checks import check_choice, check_features, check_shape
+from torchlb.nn.pair_flow import pair_flow
 from torchlb.operator.laplace_beltrami import LaplaceBeltrami
 from torchlb.spectral.eigenbasis import Eigenbasis
 
@@ -35,7 +37,7 @@ def heat_flow(
     f: Float[Tensor, "*B N C"] | Float[Tensor, " N"],
     t: float | Tensor,
     *,
-    method: Method = "deflated",
+    method: Method | None = None,
     k: int = 128,
     tolerance: float = TOLERANCE,
 ) -> Tensor:
@@ -48,7 +50,8 @@ def heat_flow(
     lb : operator of one shape, or of a batch.
     f : (N,), (N, C) or (B, N, C).
     t : time ≥ 0 in ℓ², one for all channels or (C,). (In a time t a peak spreads to a width of √(2t).)
-    method : "deflated", "spectral", "chebyshev" or "contour".
+    method : "deflated", "spectral", "chebyshev" or "contour"; by default one that is exact to the tolerance: "contour"
+        with a weak pair, "deflated" with a stencil.
     k : number of eigenpairs, for the first two.
     tolerance : of the error in the norm of π, relative to |f|. Values that are smaller than that everywhere around,
         as far away from a heated point, are noise: logarithms and directions of them (geodesics) need an implicit step.
@@ -66,7 +69,7 @@ def heat_flow(
     >>> bool(torch.allclose(heat_flow(lb, theta.cos(), 0.5), math.exp(-0.5) * theta.cos(), atol=1e-2))
     True
     """
-    method = checked_method(method)
+    method = checked_method(method or ("contour" if lb.has_weak_form else "deflated"))
     x = f[:, None] if f.ndim == 1 else f
     check_shape(x, lb)
     dtype = torch.promote_types(torch.promote_types(x.dtype, lb.values.dtype), torch.float32)
@@ -100,7 +103,11 @@ def _flow(
     if method == "spectral":
         return _spectral(lb.eigenbasis(k), x, time)
     if method == "deflated":
-        return _deflated(lb, lb.invariant_basis(k), x, time, tolerance)
+        basis = lb.invariant_basis(k)
+        deflated = _deflated_pair if basis.is_symmetric else _deflated
+        return deflated(lb, basis, x, time, tolerance)
+    if lb.has_weak_form:
+        return _solved(lb, x, time, tolerance)
     return _expanded(lb, x, time, method, tolerance)
 
 
@@ -136,6 +143,55 @@ def _deflated(
         fastest = torch.where(incomplete, fastest, torch.inf).amin()
     enough = math.log(1 / tolerance) / fastest
     return slow + _expanded(lb, rest, torch.minimum(time, enough), "either", tolerance)
+
+
+def _deflated_pair(
+    lb: LaplaceBeltrami, basis: Eigenbasis, x: Tensor, time: Tensor, tolerance: float
+) -> Tensor:
+    """e^{−λt} on the span, the flow of the linear pair with lumped mass on the rest, from which it does not return."""
+    if lb.fixed is not None:
+        x = x * ~lb.fixed[:, None]
+    values, coefficients = basis.eigenvalues.to(x.dtype), basis.to_basis(x)
+    slow = basis.from_basis(torch.exp(-values[..., None] * time) * coefficients)
+    k = basis.eigenvectors.shape[1]
+    if max(basis.sizes or (lb.num_points,)) <= k:
+        return slow
+    fastest = values.amax(-1)
+    if basis.sizes is not None:  # a shape whose basis is complete has no rest
+        incomplete = torch.tensor([size > k for size in basis.sizes], device=x.device)
+        fastest = torch.where(incomplete, fastest, torch.inf).amin()
+    whole, time = time, torch.minimum(time, math.log(1 / tolerance) / fastest)
+    pattern, matrix, root = _linear_flow(lb)
+    options = lb.bounds, "either", tolerance, lb.sizes or (lb.num_points,)
+    rest = root.to(x.dtype)[:, None] * (x - basis.from_basis(coefficients))
+    columns = rest if x.ndim == 2 else rest.transpose(0, 1).flatten(1)
+    times = time if x.ndim == 2 else time.repeat(len(x))
+    rest = heat(pattern, matrix.to(x.dtype), columns, times, *options)
+    if x.ndim == 3:
+        rest = rest.view(x.shape[1], x.shape[0], x.shape[2]).transpose(0, 1)
+    rest = rest / root.to(x.dtype)[:, None] * torch.exp(-fastest * (whole - time))
+    return slow + rest - basis.from_basis(basis.to_basis(rest))
+
+
+def _linear_flow(lb: LaplaceBeltrami) -> tuple[list[Tensor], Tensor, Tensor]:
+    """Pattern and values of −D^{−½}K₁D^{−½}, and D^½, D the row sums of M₁; nothing joins Dirichlet points."""
+    crow, col, (stiffness, mass, *_) = lb.linear_pair
+    row = torch.arange(lb.num_points, device=col.device).repeat_interleave(
+        crow.diff(), output_size=len(col)
+    )
+    root = torch.zeros_like(lb.mass).index_add(0, row, mass.to(lb.mass)).sqrt()
+    values = -stiffness / (root[row] * root[col])
+    if lb.fixed is not None:
+        values = torch.where(lb.fixed[row] | lb.fixed[col], 0.0, values)
+    return [crow, col, crow, col, torch.arange(len(col), device=col.device)], values, root
+
+
+def _solved(lb: LaplaceBeltrami, x: Tensor, time: Tensor, tolerance: float) -> Tensor:
+    """The exact flow of the pair; the surfaces of a stack (B, N, C) become channels."""
+    if x.ndim == 2:
+        return pair_flow(lb, x, time, tolerance).to(x.dtype)
+    y = pair_flow(lb, x.transpose(0, 1).flatten(1), time.repeat(len(x)), tolerance)
+    return y.view(x.shape[1], x.shape[0], x.shape[2]).transpose(0, 1).to(x.dtype)
 
 
 def _expanded(

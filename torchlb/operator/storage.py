@@ -7,7 +7,9 @@ from dataclasses import asdict
 from math import isnan
 from typing import Any, TypeVar
 
+import numpy as np
 import torch
+from scipy import sparse
 from torch import Tensor, nn
 
 from torchlb.errors import InputError, warn
@@ -27,7 +29,7 @@ PAIRS = ("weak", "linear")
 BUFFERS = ("crow", "col", "values", "gradient_values", "mass", "points", "frames", "normals")
 TRANSPOSE = ("crow_t", "col_t", "order_t")
 Storage = TypeVar("Storage", bound="OperatorStorage")
-BASIS = ("eigenvalues", "eigenvectors", "left", "decay_rates", "modal_transform")
+BASIS = ("eigenvalues", "eigenvectors", "left", "decay_rates", "modal_transform", "relative_errors")
 
 
 def _no_pairs() -> dict[str, Tensor]:
@@ -67,6 +69,7 @@ class OperatorStorage(nn.Module):
     basis_left: Tensor
     basis_decay_rates: Tensor
     basis_modal_transform: Tensor
+    basis_relative_errors: Tensor
 
     def __init__(self) -> None:
         super().__init__()
@@ -179,7 +182,10 @@ class OperatorStorage(nn.Module):
 
     @property
     def spectral_bounds(self) -> Bounds:
-        """The ellipse that holds the spectrum of Δ, 1/ℓ²; found when the operator is built, and stored with it."""
+        """The ellipse that holds the spectrum of Δ, 1/ℓ²; found when the operator is built, and stored with it.
+
+        Beside a weak pair that of −D⁻¹K₁, the linear pair with lumped mass, by which flows beyond the basis are made.
+        """
         radius, height = self.bounds.tolist()
         return Bounds(radius, None if isnan(height) else height)
 
@@ -187,11 +193,21 @@ class OperatorStorage(nn.Module):
     def bounds(self) -> Tensor:
         """`spectral_bounds` as a float64 tensor (2,) on the CPU, NaN for no height, which compiled code can take."""
         if self._bounds is None:  # from a file or state of an older torchlb
-            n = self.num_points
-            matrix = to_scipy(self.crow, self.col, self.values.double(), (n, n))
-            self.set_bounds(spectral_bounds(matrix, self.mass.detach().cpu().double().numpy()))
+            self.set_bounds(spectral_bounds(*self._flow_matrix()))
         assert self._bounds is not None
         return self._bounds
+
+    def _flow_matrix(self) -> tuple[sparse.csr_array, np.ndarray]:
+        """The matrix that Chebyshev series expand, and its inner product: Δ, or −D⁻¹K₁ beside a weak pair."""
+        shape = (self.num_points, self.num_points)
+        if len(self.weak_crow) == 0:
+            matrix = to_scipy(self.crow, self.col, self.values.double(), shape)
+            return matrix, self.mass.detach().cpu().double().numpy()
+        pair = "linear" if len(self.linear_crow) else "weak"
+        crow, col, values = (getattr(self, f"{pair}_{part}") for part in ("crow", "col", "values"))
+        stiffness, mass = (to_scipy(crow, col, v.double(), shape) for v in values[:2])
+        lumped: Any = mass.sum(axis=1)
+        return sparse.csr_array(sparse.diags_array(-1 / lumped) @ stiffness), lumped
 
     def set_bounds(self, bounds: Bounds | None) -> None:
         """Hold what is known of the spectrum; it is neither rounded nor moved with the buffers."""
@@ -212,7 +228,9 @@ class OperatorStorage(nn.Module):
             return None
         modes = (self.basis_decay_rates, self.basis_modal_transform)
         pairs = (self.basis_eigenvalues, self.basis_eigenvectors, self.mass, self.basis_left)
-        return Eigenbasis(*pairs, self.sizes, *(t if len(t) else None for t in modes))
+        errors = self.basis_relative_errors if len(self.basis_relative_errors) else None
+        symmetric = {"is_symmetric": errors is not None, "relative_errors": errors}
+        return Eigenbasis(*pairs, self.sizes, *(t if len(t) else None for t in modes), **symmetric)
 
     def keep_basis(self, basis: Eigenbasis | None = None, *, store: bool | None = None) -> None:
         """Hold a basis (None: the one there is) in buffers, in `state_dict` or not (None: as it was)."""

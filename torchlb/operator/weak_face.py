@@ -7,10 +7,11 @@ from jaxtyping import Bool
 from torch import Tensor
 
 from torchlb.errors import InputError
-from torchlb.linalg.sparse import csr_tensor
+from torchlb.linalg.sparse import csr_tensor, to_scipy
 from torchlb.operator.storage import OperatorStorage
-from torchlb.spectral.eigenbasis import Eigenbasis, check_num_pairs
+from torchlb.spectral.eigenbasis import Eigenbasis, check_num_pairs, stack_eigenbases
 from torchlb.spectral.eigensolver import blockwise_eigenbasis
+from torchlb.spectral.pencil import pencil_eigenbasis
 from torchlb.stencils.conditions import CONDITIONS
 
 NO_PAIR = (
@@ -94,14 +95,45 @@ class WeakFace(OperatorStorage):
         """At least k eigenpairs, all that are solved, so that their span is invariant under Δ; else as `eigenbasis`."""
         k = check_num_pairs(k)
         if self.basis_left.shape[-1] < min(k, max(self.sizes or (self.num_points,))):
-            matrix, rounding = self.to_scipy(), torch.finfo(self.dtype).eps
-            states = self.parts or [self.get_extra_state()]
-            conditions = [CONDITIONS.get(state["options"].get("condition")) for state in states]
-            outflow = not all(c is None or c.conserves for c in conditions)
-            options = {"outflow": outflow, "rounding": rounding}
-            self.keep_basis(blockwise_eigenbasis(matrix, self.mass, k, self.sizes, **options))
+            solved = self._pair_eigenbasis(k) if self.has_weak_form else self._stencil_eigenbasis(k)
+            self.keep_basis(solved)
         if store:
             self.keep_basis(store=True)
         basis = self.basis
         assert basis is not None
         return basis
+
+    def _stencil_eigenbasis(self, k: int) -> Eigenbasis:
+        """From the rows of Δ, in the inner product of the mass."""
+        matrix = to_scipy(self.crow, self.col, self.values, self.shape)
+        states = self.parts or [self.get_extra_state()]
+        conditions = [CONDITIONS.get(state["options"].get("condition")) for state in states]
+        outflow = not all(c is None or c.conserves for c in conditions)
+        options = {"outflow": outflow, "rounding": torch.finfo(self.dtype).eps}
+        return blockwise_eigenbasis(matrix, self.mass, k, self.sizes, **options)
+
+    def _pair_eigenbasis(self, k: int) -> Eigenbasis:
+        """From the weak pair of each shape; the more exact, the higher the order."""
+        pairs = [(self.weak_crow, self.weak_col, self.weak_values), self.linear_pair]
+        (stiffness, mass), linear = (
+            [to_scipy(crow, col, v.double(), self.shape) for v in values[:2]]
+            for crow, col, values in pairs
+        )
+        fixed = None if self.fixed is None else self.fixed.cpu().numpy()
+        tolerance = 10.0 ** -(2 * max(self.options.get("order") or 3, 3) + 1)
+        bases = []
+        for start, end in zip(self.offsets[:-1], self.offsets[1:], strict=True):
+            block = slice(start, end)
+            near = None if len(self.linear_crow) == 0 else [m[block, block] for m in linear]
+            bases.append(
+                pencil_eigenbasis(
+                    stiffness[block, block],
+                    mass[block, block],
+                    self.mass[block].detach().cpu().double(),
+                    k,
+                    linear=None if near is None else (near[0], near[1]),
+                    fixed=None if fixed is None or not fixed[block].any() else fixed[block],
+                    tolerance=tolerance,
+                )
+            )
+        return bases[0] if self.sizes is None else stack_eigenbases(bases)
