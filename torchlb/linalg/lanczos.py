@@ -16,6 +16,8 @@ BLOCK = 16
 """Vectors at a time, the largest multiplicity that is surely found; 8 to 32 take about the same time."""
 CHECK = 2
 """Blocks between two looks at the residuals."""
+LONGEST = 20
+"""Bound on the space, in multiples of what is asked for; it is 2.5 where things are well."""
 LOOSE = 1e-4
 """Above this tolerance one pass of orthogonalisation is enough."""
 
@@ -54,7 +56,7 @@ def lanczos(
 
     Raises
     ------
-    EigenbasisError : if all N vectors do not suffice.
+    EigenbasisError : if all N vectors do not suffice, or `LONGEST` times those asked for.
     """
     size, count = len(stiffness.diagonal()), k + more
     solve = inverse(sparse.csr_array(stiffness + shift * mass_matrix))
@@ -65,7 +67,7 @@ def lanczos(
         basis[0], dual[0] = null, mass_matrix @ null
     h, end = np.zeros((first, first)), first
     z, look = generator.standard_normal((BLOCK, size)), first + count + BLOCK
-    while end + BLOCK <= size:
+    while end + BLOCK <= min(size, LONGEST * (count + BLOCK)):
         coupling = _orthogonalise(z, basis[:end], dual[:end], 1 if tolerance > LOOSE else 2)
         h[:, max(end - BLOCK, first) : end] = coupling.T if end > first else 0.0
         try:
