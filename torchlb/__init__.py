@@ -1,9 +1,10 @@
 """High-order Laplace–Beltrami operators on meshes and point clouds, for PyTorch.
 
 The packages, lowest first: `linalg`, matrices without shapes; `fits`, weights from local polynomials; `geometry`,
-neighbours, frames, boundaries; `baseline`, libigl and robust_laplacian; `stencils`, rows of Δ and ∇; `stability`, the
-certificate; `spectral`, eigenpairs and signatures; `operator`, the module that holds it all; `nn`, layers that take it
-as an argument; `io` and `interop`, files and other libraries. `surfaces` are shapes with exact answers.
+neighbours, frames, boundaries; `baseline`, libigl and robust_laplacian; `stencils`, rows of Δ and ∇; `galerkin`, the
+weak pair; `stability`, the certificate; `spectral`, eigenpairs and signatures; `operator`, the module that holds it all;
+`nn`, solves and layers that take it as an argument; `io` and `interop`, files and other libraries. `surfaces` are
+shapes with exact answers.
 """
 
 from torchlb import surfaces
@@ -22,7 +23,9 @@ from torchlb.io.cache import load_operator, load_or_build, operator_key, save_op
 from torchlb.io.precompute import PrecomputeReport, ShapeResult, precompute_operators
 from torchlb.nn.diffusion import Diffusion, heat_flow
 from torchlb.nn.diffusion_net import DiffusionNet, DiffusionNetBlock
+from torchlb.nn.geodesics import geodesic_distance
 from torchlb.nn.gradient_features import GradientFeatures
+from torchlb.nn.solves import implicit_step, poisson_solve
 from torchlb.nn.spectral_conv import SpectralConv
 from torchlb.operator.cleaning import clean_mesh, clean_points
 from torchlb.operator.collate import collate
@@ -66,11 +69,14 @@ __all__ = [
     "collate",
     "diffusion_distance",
     "diffusion_map",
+    "geodesic_distance",
     "heat_flow",
     "heat_kernel_signature",
+    "implicit_step",
     "load_operator",
     "load_or_build",
     "operator_key",
+    "poisson_solve",
     "precompute_operators",
     "save_operator",
     "spectral_wavelets",

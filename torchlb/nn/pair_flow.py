@@ -120,7 +120,8 @@ def _coefficients(ratio: float, tolerance: float) -> tuple[np.ndarray, np.ndarra
     def slope(s: np.ndarray) -> np.ndarray:
         return -(2 / (1 + s) - 1) * flow(s)
 
-    c, derivative = (chebyshev.chebinterpolate(g, POINTS) for g in (flow, slope))
+    interpolate: Any = chebyshev.chebinterpolate
+    c, derivative = interpolate(flow, POINTS), interpolate(slope, POINTS)
     count = int((np.cumsum(np.abs(c[::-1]))[::-1] > tolerance / 10).sum())
     c[count:] = derivative[count:] = 0
     c[0] += 1 - c.sum()
