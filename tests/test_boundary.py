@@ -8,6 +8,7 @@ import pytest
 import torch
 from scipy import special
 
+from builders import stencil_of_mesh
 from torchlb import LaplaceBeltrami
 from torchlb.geometry.boundary import boundary_of_mesh
 from torchlb.geometry.frames import mesh_frames
@@ -27,7 +28,7 @@ def spectrum(lb, count):
 def operators(surface, n, order):
     vertices, faces = surface.mesh(n)
     mask = surface.boundary_mask(vertices)
-    yield LaplaceBeltrami.from_mesh(vertices, faces, order=order)
+    yield stencil_of_mesh(vertices, faces, order=order)
     yield LaplaceBeltrami.from_points(vertices, dim=2, order=order, boundary=mask)
 
 
@@ -52,7 +53,7 @@ def test_spectrum_converges_at_the_order(surface, condition, order):
     """Slope of the worst of the first 10 eigenvalues ≥ p − 0.5 over N = 350, 700, 1400 (the zero is exact)."""
     sizes, errors = [350, 700, 1400], []
     for n in sizes:
-        lb = LaplaceBeltrami.from_mesh(*surface.mesh(n), order=order, condition=condition)
+        lb = stencil_of_mesh(*surface.mesh(n), order=order, condition=condition)
         exact = surface.eigenvalues(10, condition=condition)
         values, _ = spectrum(lb, 10)
         errors.append(float(((values - exact).abs()[1:] / exact[1:]).max()))
@@ -70,7 +71,7 @@ def test_dirichlet_spectrum(surface, order, bound):
     mask = surface.boundary_mask(vertices)
     exact = surface.eigenvalues(10, condition="dirichlet")
     for lb in (
-        LaplaceBeltrami.from_mesh(vertices, faces, order=order, condition="dirichlet"),
+        stencil_of_mesh(vertices, faces, order=order, condition="dirichlet"),
         LaplaceBeltrami.from_points(
             vertices, dim=2, order=order, boundary=mask, condition="dirichlet"
         ),
@@ -86,7 +87,7 @@ def test_dirichlet_rows():
     """Values on the boundary reach no other point and decay by themselves; xy(1 − r²) has the right Laplacian."""
     vertices, faces = UnitDisk().mesh(1000)
     mask = UnitDisk().boundary_mask(vertices)
-    lb = LaplaceBeltrami.from_mesh(vertices, faces, order=3, condition="dirichlet")
+    lb = stencil_of_mesh(vertices, faces, order=3, condition="dirichlet")
     matrix = lb.matrix.to_dense()
     assert (matrix[~mask][:, mask] == 0).all()
     assert torch.equal(matrix[mask], torch.diag(matrix.diagonal())[mask])
@@ -124,7 +125,7 @@ def test_the_sides_of_a_slit_may_coincide():
     upper = torch.arange(289).scatter(0, seam, 289 + torch.arange(len(seam)))
     above = (y[faces] >= 0.5).all(1)
     faces[above] = upper[faces[above]]
-    lb = LaplaceBeltrami.from_mesh(
+    lb = stencil_of_mesh(
         torch.cat([vertices, vertices[seam]]), faces, condition="dirichlet", certify=False
     )
     assert lb.values.isfinite().all()
@@ -135,7 +136,7 @@ def test_heat_leaves_through_a_dirichlet_boundary_only():
     vertices, faces = UnitDisk().mesh(300)
     ball, shell = Sphere().mesh(300)
     both = torch.cat([vertices, ball + 5])
-    lb = LaplaceBeltrami.from_mesh(both, torch.cat([faces, shell + 300]), condition="dirichlet")
+    lb = stencil_of_mesh(both, torch.cat([faces, shell + 300]), condition="dirichlet")
     assert lb.certificate.holds
     assert lb.certificate.components == 2
     rate = lb.mass @ lb.matrix.to_dense()
@@ -173,7 +174,7 @@ def cut_torus(n):
 
 @cache
 def first_eigenvalue(shape, condition):
-    lb = LaplaceBeltrami.from_mesh(*shape(2000)[:2], order=3, condition=condition)
+    lb = stencil_of_mesh(*shape(2000)[:2], order=3, condition=condition)
     return spectrum(lb, 2)[0][int(condition == "neumann")]
 
 
@@ -185,7 +186,7 @@ def test_curved_boundaries(shape, condition, order):
     vertices, faces, mask = shape(700)
     exact = first_eigenvalue(shape, condition)
     for lb in (
-        LaplaceBeltrami.from_mesh(vertices, faces, order=order, condition=condition),
+        stencil_of_mesh(vertices, faces, order=order, condition=condition),
         LaplaceBeltrami.from_points(vertices, order=order, boundary=mask, condition=condition),
     ):
         assert lb.certificate.holds
@@ -245,7 +246,7 @@ def test_a_boundary_may_be_a_few_points(count, condition):
 def test_gradient_at_the_boundary_serves_any_function():
     """x has ∂x/∂ν ≠ 0 on the rim, and its gradient is e_x up to there."""
     vertices, faces = UnitDisk().mesh(700)
-    lb = LaplaceBeltrami.from_mesh(vertices, faces, order=3)
+    lb = stencil_of_mesh(vertices, faces, order=3)
     error = lb.gradient(vertices[:, 0]) - torch.tensor([1.0, 0, 0]).double()
     assert error.norm(dim=1).max() < 1e-8
 
@@ -253,7 +254,7 @@ def test_gradient_at_the_boundary_serves_any_function():
 def test_boundary_can_be_left_alone():
     """Without a condition x keeps Δx = 0 on the rows of full order up to the rim."""
     vertices, faces = UnitDisk().mesh(700)
-    lb = LaplaceBeltrami.from_mesh(vertices, faces, order=2, condition=None, certify=False)
+    lb = stencil_of_mesh(vertices, faces, order=2, condition=None, certify=False)
     exact_rows = lb.report.order == 2
     assert lb(vertices[:, 0])[exact_rows].abs().max() < 1e-8
 
@@ -266,7 +267,7 @@ def test_bad_boundaries_are_refused(bad):
 
 def test_bad_boundary_of_a_mesh_is_refused():
     with pytest.raises(ValueError, match="boundary"):
-        LaplaceBeltrami.from_mesh(*UnitDisk().mesh(300), boundary="robin")
+        stencil_of_mesh(*UnitDisk().mesh(300), boundary="robin")
 
 
 class Robin(Neumann):

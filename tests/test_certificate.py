@@ -12,6 +12,7 @@ from scipy import sparse
 from scipy.sparse import csgraph
 
 import torchlb
+from builders import stencil_of_mesh
 from torchlb import LaplaceBeltrami, StabilityError, StabilityWarning
 from torchlb.errors import warn
 from torchlb.geometry.neighbors import GraphBalls, nearest_graph, nearest_neighbors
@@ -103,7 +104,7 @@ def test_total_mass_is_the_area():
     vertices, faces = surface.mesh(1000)
     corners = vertices[faces]
     triangles = torch.linalg.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    mesh = LaplaceBeltrami.from_mesh(vertices, faces).mass.sum()
+    mesh = stencil_of_mesh(vertices, faces).mass.sum()
     torch.testing.assert_close(mesh, triangles.norm(dim=1).sum() / 2)
     cloud = LaplaceBeltrami.from_points(vertices).mass.sum()
     assert abs(cloud / surface.area - 1) < 0.01
@@ -134,9 +135,7 @@ def test_parts_of_a_mesh_may_be_of_two_scales(condition):
 
     def build(factor):
         both = torch.cat([factor * vertices, ring + 9])
-        return LaplaceBeltrami.from_mesh(
-            both, torch.cat([faces, corners + 500]), condition=condition
-        )
+        return stencil_of_mesh(both, torch.cat([faces, corners + 500]), condition=condition)
 
     unscaled, lb = build(1.0), build(2.0**-20)
     assert lb.certificate.holds
@@ -298,7 +297,7 @@ def test_meshes_of_random_vertices_keep_their_order_and_accuracy(order, bound):
     hull = trimesh.convex.convex_hull(points.numpy())
     vertices, faces = torch.as_tensor(hull.vertices), torch.as_tensor(hull.faces)
     assert len(vertices) == 2000
-    lb = LaplaceBeltrami.from_mesh(vertices, faces, order=order)
+    lb = stencil_of_mesh(vertices, faces, order=order)
     assert lb.certificate.holds
     assert lb.report.order_counts[order] >= 0.995 * 2000
     exact = Sphere().laplacian(smooth_function, vertices)
@@ -343,13 +342,13 @@ def test_coincident_vertices_have_each_its_own_row():
         half = own[: len(own) // 2]
         faces[half] = torch.where(faces[half] == vertex, len(vertices), faces[half])
         vertices = torch.cat([vertices, vertices[vertex : vertex + 1]])
-    lb = LaplaceBeltrami.from_mesh(vertices, faces, condition=None, certify=False)
+    lb = stencil_of_mesh(vertices, faces, condition=None, certify=False)
     diagonal = dense(lb).diagonal()
     assert diagonal.max() < 0.1 * diagonal.median()
     assert (lb.report.order == 3).all()
     error = lb(smooth_function(vertices)) - Sphere().laplacian(smooth_function, vertices)
     assert error.abs().max() < 5e-3
-    assert LaplaceBeltrami.from_mesh(vertices, faces, condition=None).certificate.holds
+    assert stencil_of_mesh(vertices, faces, condition=None).certificate.holds
 
 
 def test_uncertified_operator_says_so():

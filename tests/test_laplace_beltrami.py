@@ -42,7 +42,7 @@ BUILDERS = {
         Ellipsoid(),
         lambda: LaplaceBeltrami.from_points(points_of(Ellipsoid(), 300), order=2),
     ),
-    "mesh": (Torus(), lambda: LaplaceBeltrami.from_mesh(*mesh_of(Torus(), 400))),
+    "mesh": (Torus(), lambda: LaplaceBeltrami.from_mesh(*mesh_of(Torus(), 400), certify=True)),
     "cotangent": (Torus(), lambda: LaplaceBeltrami.from_cotangent(*mesh_of(Torus(), 400))),
     "polyharmonic": (
         Sphere(2.0),
@@ -333,7 +333,9 @@ def assert_identical(actual, expected):
 
 @functools.cache
 def disk(condition="dirichlet"):
-    return LaplaceBeltrami.from_mesh(*mesh_of(UnitDisk(), 150), order=2, condition=condition)
+    return LaplaceBeltrami.from_mesh(
+        *mesh_of(UnitDisk(), 150), order=2, condition=condition, certify=True
+    )
 
 
 def test_unbatch_is_the_inverse_of_batch():

@@ -11,6 +11,7 @@ import torch
 import torch._dynamo.testing
 from torch.utils.data import DataLoader
 
+from builders import stencil_of_mesh
 from torchlb import (
     Diffusion,
     DiffusionNet,
@@ -62,7 +63,7 @@ def shapes(dtype=torch.float32):
     built = [LaplaceBeltrami.from_points(points.to(dtype)) for points in clouds]
     for surface in (Sphere(), Ellipsoid(), Torus()):
         vertices, faces = surface.mesh(100)
-        built.append(LaplaceBeltrami.from_mesh(vertices.to(dtype), faces))
+        built.append(stencil_of_mesh(vertices.to(dtype), faces))
     vertices, faces = Sphere().mesh(110)
     built.append(LaplaceBeltrami.from_cotangent(3 * vertices.to(dtype), faces))
     vertices, faces = Sphere().mesh(20)
@@ -188,7 +189,7 @@ def graphs_of_sizes(name, batched):
     layer, backend = layer_of(name), torch._dynamo.testing.CompileCounterWithBackend("aot_eager")
     compiled = torch.compile(layer, backend=backend, fullgraph=True)
     meshes = [Sphere().mesh(n) for n in range(60, 180, 12)]
-    clouds = [LaplaceBeltrami.from_mesh(v.float(), f, order=1) for v, f in meshes]
+    clouds = [stencil_of_mesh(v.float(), f, order=1) for v, f in meshes]
     for lb in clouds:
         lb.eigenbasis(K)
     for i, alone in enumerate(clouds):
@@ -253,7 +254,7 @@ def test_float32_is_close_to_float64(name):
 @every_layer
 def test_one_rule_of_types(name):
     """The parameters' type is that of x, which the result has; the operator may have any. Else an error names both."""
-    double = LaplaceBeltrami.from_mesh(*Torus().mesh(100))
+    double = stencil_of_mesh(*Torus().mesh(100))
     layer, x = layer_of(name), features(double).float()
     y = layer(x, double)
     assert y.dtype == torch.float32

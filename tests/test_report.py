@@ -6,6 +6,7 @@ import pytest
 import torch
 import trimesh
 
+from builders import stencil_of_mesh
 from torchlb import LaplaceBeltrami
 from torchlb.fits.rules import reference
 from torchlb.stencils.assemble import Stencils, assemble
@@ -21,7 +22,7 @@ def cube():
     for _ in range(3):
         mesh = mesh.subdivide()
     vertices, faces = torch.tensor(mesh.vertices), torch.tensor(mesh.faces)
-    return vertices.double(), LaplaceBeltrami.from_mesh(vertices.double(), faces.long(), order=3)
+    return vertices.double(), stencil_of_mesh(vertices.double(), faces.long(), order=3)
 
 
 @cache
@@ -90,7 +91,7 @@ def test_half_the_rows_at_low_order_are_named():
     vertices, faces = Sphere().mesh(300)
     noisy = vertices + 0.05 * torch.randn_like(vertices)
     with pytest.warns(UserWarning, match=r"% of the points have only low-order rows.*finer mesh"):
-        LaplaceBeltrami.from_mesh(noisy, faces, order=3, certify=False)
+        stencil_of_mesh(noisy, faces, order=3, certify=False)
 
 
 def test_it_prints_a_summary():
@@ -135,7 +136,7 @@ def rippled():
 
 def test_unresolved_ripples_are_reported():
     """Most points ask for more than order 3 can follow, whatever stencils would pass otherwise."""
-    report = LaplaceBeltrami.from_mesh(*rippled(), order=3, certify=False).report
+    report = stencil_of_mesh(*rippled(), order=3, certify=False).report
     assert report.reason_counts["points do not resolve the surface"] > 1200
     cloud = LaplaceBeltrami.from_points(rippled()[0], order=3, certify=False).report
     assert cloud.reason_counts["points do not resolve the surface"] > 100
@@ -144,7 +145,7 @@ def test_unresolved_ripples_are_reported():
 def test_eigenvalues_of_an_unresolved_mesh_are_those_of_its_triangles():
     """Within 1 % of robust_laplacian's on the mesh refined by midpoints; smooth fits alone are 3 % above."""
     vertices, faces = rippled()
-    lb = LaplaceBeltrami.from_mesh(vertices, faces, order=3)
+    lb = stencil_of_mesh(vertices, faces, order=3)
     finer, smaller = trimesh.remesh.subdivide(vertices.numpy(), faces.numpy())
     exact = LaplaceBeltrami.from_cotangent(torch.tensor(finer), torch.tensor(smaller))
     found, expected = (each.eigenbasis(10).eigenvalues[1:] for each in (lb, exact))

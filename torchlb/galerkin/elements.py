@@ -52,15 +52,20 @@ def lattice(degree: int) -> Float[Tensor, "n 3"]:
 
 @cache
 def triangle(degree: int) -> Element:
-    """The element of degree r ≥ 1 with its nodes on `lattice`, and the collapsed product rule of (r + 1)² points."""
+    """The element of degree r ≥ 1 with its nodes on `lattice`.
+
+    Its rule is the collapsed product rule of (r + 1)² points, turned to each corner, so that their order is irrelevant.
+    """
     x, wx = np.polynomial.legendre.leggauss(degree + 1)
     y, wy = roots_jacobi(
         degree + 1, 1, 0
     )  # weight 1 − y, the width of the triangle at η = (1 + y)/2
     x, y = np.meshgrid((1 + x) / 2, (1 + y) / 2, indexing="ij")
-    points = np.stack([x * (1 - y), y], axis=-1).reshape(-1, 2)
-    weights = torch.from_numpy(np.outer(wx, wy).reshape(-1) / 8)
-    return _element(torch.from_numpy(points), weights, lattice(degree)[:, 1:], degree)
+    points = torch.from_numpy(np.stack([x * (1 - y), y], axis=-1).reshape(-1, 2))
+    shares = torch.cat([1 - points.sum(1, keepdim=True), points], 1)
+    points = torch.cat([shares.roll(corner, 1)[:, 1:] for corner in range(3)])
+    weights = torch.from_numpy(np.outer(wx, wy).reshape(-1) / 24).repeat(3)
+    return _element(points, weights, lattice(degree)[:, 1:], degree)
 
 
 @cache

@@ -2,5 +2,6 @@
 
 `voronoi`: cells in the tangent plane. `neighbors`: who may enter a stencil, and graph balls. `candidates`: the
 neighbourhoods that a point tries. `frames`: tangent planes, refined by fits, and coordinates in them. `orientation`:
-which way is out, and the two sides of thin shapes. `boundary`: its points and conormals.
+which way is out, and the two sides of thin shapes. `vertex_fits`: one polynomial a vertex, of functions and of the
+surface. `boundary`: its points and conormals.
 """

@@ -93,6 +93,8 @@ def get_operators(
     if verts.ndim != 2 or verts.shape[1] != 3:
         raise InputError(f"verts: expected shape (V, 3), got {tuple(verts.shape)}")
     arguments: dict[str, Any] = {"operator": operator, "progress": False, **options}
+    if operator == "stencil" and not symmetric:
+        arguments.setdefault("certify", True)
     if cloud and normals is not None:
         arguments["normals"] = normals
     double = verts.detach().double()
@@ -144,13 +146,20 @@ def _tuple(
     index = torch.stack([row, lb.col])
     gradient = torch.einsum("exd,de->xe", turn[row], lb.gradient_values)
     weak = -lb.mass[row] * lb.values
-    if symmetric:
+    if symmetric and lb.has_weak_form:
+        rows = torch.arange(lb.num_points).repeat_interleave(lb.weak_crow.diff())
+        matrix = _coo(torch.stack([rows, lb.weak_col]), lb.weak_values[0], like)
+    elif symmetric:
         matrix = _coo(torch.cat([index, index.flip(0)], 1), torch.cat([weak, weak]) / 2, like)
     else:
         matrix = _coo(index, weak, like)
     if k_eig > 0:
         basis = lb.eigenbasis(k_eig)
-        pairs = basis.eigenvalues, basis.eigenvectors
+        # Orthonormal in M; in the diagonal mass after Gram–Schmidt, which leaves the first constant.
+        gram = basis.eigenvectors.mT @ (lb.mass[:, None] * basis.eigenvectors)
+        lower = torch.linalg.cholesky(gram)
+        vectors = torch.linalg.solve_triangular(lower, basis.eigenvectors.mT, upper=False).mT
+        pairs = basis.eigenvalues, vectors
     else:
         pairs = lb.mass.new_zeros(0), lb.mass.new_zeros(lb.num_points, 0)
     dense = [part.to(like) for part in (frames, lb.mass, *pairs)]

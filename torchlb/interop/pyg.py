@@ -15,6 +15,7 @@ from typing import Any, Literal
 import torch
 from jaxtyping import Int
 from torch import Tensor
+from torch.nn.functional import pad
 from torch_geometric.data import Batch, Data
 from torch_geometric.data.datapipes import functional_transform
 from torch_geometric.transforms import BaseTransform
@@ -24,10 +25,13 @@ from torchlb.io.cache import load_or_build
 from torchlb.operator.batching import join_states
 from torchlb.operator.dispatch import Operator, build_operator
 from torchlb.operator.laplace_beltrami import LaplaceBeltrami
-from torchlb.operator.storage import BASIS
+from torchlb.operator.storage import BASIS, PAIRS
 from torchlb.spectral.eigenbasis import Eigenbasis, stack_eigenbases
 
 __all__ = ["LaplaceBeltramiTransform", "to_operator"]
+
+KINDS = (lambda k: [], lambda k: [(2, k), (3, k, k)], lambda k: [(k,)])
+"""Shapes of what an eigenbasis has beside its pairs: nothing; the flow on its invariant span; errors of a pair's."""
 
 
 @functional_transform("laplace_beltrami")
@@ -46,8 +50,11 @@ class LaplaceBeltramiTransform(BaseTransform):
     lb_pos             (N, n)       the points, by which `to_operator` sees whether `pos` was changed since
     lb_normals         (N, n)       unit normals of a hypersurface
     lb_boundary        (N,)         mask of the points where the boundary condition holds, if any
+    lb_weak_index      (2, nnz)     [i; j] of every entry of the weak pair, where there is one; ascending
+    lb_weak_values     (nnz, 3)     stiffness, mass matrix, mass matrix of the boundary
+    lb_linear_…                     the same of the linear pair
     lb_basis           (…,)         with k > 0: all parts of the eigenbasis in one vector, for `to_operator`
-    lb_basis_size      (1, 2)       number of eigenpairs, and whether its span is invariant
+    lb_basis_size      (1, 2)       number of eigenpairs, and their `KINDS`
     lb_info            str          source, options, certificate, bounds as JSON
     =================  ===========  ============================================================================
 
@@ -141,11 +148,18 @@ def _keys(lb: LaplaceBeltrami, k: int) -> dict[str, Any]:
     for name, tensor in (("lb_normals", lb.normals), ("lb_boundary", lb.on_boundary)):
         if len(tensor):
             keys[name] = tensor
+    if lb.has_weak_form:
+        matrices = {"weak": (lb.weak_crow, lb.weak_col, lb.weak_values), "linear": lb.linear_pair}
+        for name, (crow, col, values) in matrices.items():
+            rows = torch.arange(lb.num_points).repeat_interleave(crow.diff())
+            keys[f"lb_{name}_index"] = torch.stack([rows, col])
+            keys[f"lb_{name}_values"] = pad(values, (0, 0, 0, 3 - len(values))).T.contiguous()
     if k > 0:
         basis = lb.invariant_basis(k)
         parts = [getattr(basis, name) for name in BASIS]
         keys["lb_basis"] = torch.cat([part.flatten() for part in parts if part is not None])
-        size = [basis.eigenvectors.shape[1], int(basis.is_invariant)]
+        kind = 2 if basis.is_symmetric else int(basis.is_invariant)
+        size = [basis.eigenvectors.shape[1], kind]
         keys["lb_basis_size"] = torch.tensor([size])
     return keys
 
@@ -182,7 +196,16 @@ def _buffers(data: Any, sizes: Int[Tensor, " S"]) -> dict[str, Tensor]:
     entries = torch.diff(ends, prepend=ends.new_zeros(1))
     order_t = data.lb_order_t + (ends - entries).repeat_interleave(entries)
     points = data.pos.to(data.lb_mass)
-    return {
+    pairs = {}
+    for name in PAIRS if "lb_weak_index" in data else ():
+        rows, columns = data[f"lb_{name}_index"]
+        values = data[f"lb_{name}_values"].T.contiguous()
+        pairs |= {
+            f"{name}_crow": _starts(rows, len(data.pos)),
+            f"{name}_col": columns.contiguous(),
+            f"{name}_values": values if values[2].any() else values[:2],
+        }
+    return pairs | {
         "crow": crow,
         "col": col.contiguous(),
         "crow_t": _starts(col, len(data.pos)),
@@ -225,15 +248,16 @@ def _starts(index: Int[Tensor, " nnz"], size: int) -> Int[Tensor, " size_plus_1"
 def _bases(data: Any, sizes: list[int]) -> list[Eigenbasis]:
     """The eigenbasis of each shape out of the common vector."""
     shapes = []
-    for n, (k, closed) in zip(sizes, data.lb_basis_size.tolist(), strict=True):
-        parts = [(k,), (n, k), (n, k), *([(2, k), (3, k, k)] if closed else [])]
+    for n, (k, kind) in zip(sizes, data.lb_basis_size.tolist(), strict=True):
+        parts = [(k,), (n, k), (n, k), *KINDS[kind](k)]
         shapes.append([torch.Size(part) for part in parts])
     pieces = iter(data.lb_basis.split([part.numel() for parts in shapes for part in parts]))
     bases = []
     for parts, mass in zip(shapes, data.lb_mass.split(sizes), strict=True):
         values, vectors, left, *rest = (next(pieces).view(part) for part in parts)
-        rates, modal = rest or (None, None)
-        bases.append(
-            Eigenbasis(values, vectors, mass, left, decay_rates=rates, modal_transform=modal)
-        )
+        if len(rest) == 1:
+            more = {"is_symmetric": True, "relative_errors": rest[0]}
+        else:
+            more = dict(zip(("decay_rates", "modal_transform"), rest, strict=False))
+        bases.append(Eigenbasis(values, vectors, mass, left, **more))
     return bases

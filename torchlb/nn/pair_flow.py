@@ -34,7 +34,7 @@ def pair_flow(
 
     Zero at Dirichlet points. The error is `tolerance` in the norm of M, relative to x.
     """
-    return _Flow.apply(x.double(), time.double(), lb, tolerance)
+    return _flow(x.double(), time.double(), lb, tolerance)
 
 
 class _Flow(torch.autograd.Function):
@@ -54,7 +54,9 @@ class _Flow(torch.autograd.Function):
         return grad_x, (slope * x).sum(0), None, None
 
 
-@torch.compiler.disable
+_flow: Any = torch.compiler.disable(_Flow.apply)
+
+
 def _summed(
     lb: LaplaceBeltrami, x: Tensor, time: Tensor, tolerance: float, transposed: bool
 ) -> tuple[Tensor, Tensor]:

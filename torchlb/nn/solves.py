@@ -67,7 +67,7 @@ def implicit_step(
         right = right + time * _product(lb, 2, poured)
     if given is not None:
         right = right - _product(lb, 1, given) - time * _product(lb, 0, given)
-    u: Any = _Solve.apply(right, time, lb, tolerance)
+    u = _solve(right, time, lb, tolerance)
     return _shaped(u if given is None else u + given, f)
 
 
@@ -103,7 +103,7 @@ def poisson_solve(
         right = right + _product(lb, 2, poured)
     if given is not None:
         right = right - _product(lb, 0, given)
-    u: Any = _Solve.apply(right, None, lb, tolerance)
+    u = _solve(right, None, lb, tolerance)
     return _shaped(u if given is None else u + given, f)
 
 
@@ -183,7 +183,9 @@ class _Solve(torch.autograd.Function):
         return w, grad_t, None, None
 
 
-@torch.compiler.disable
+_solve: Any = torch.compiler.disable(_Solve.apply)
+
+
 def solve_columns(
     lb: LaplaceBeltrami,
     b: Float[Tensor, "N C"],

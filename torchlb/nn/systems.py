@@ -34,7 +34,7 @@ Fixed = Tensor | None
 def system(
     lb: LaplaceBeltrami, t: float | None, natural: bool = False
 ) -> PairSystem | StencilSystem:
-    """That of an implicit step of a time t, or of a Poisson problem for None; `natural` leaves Dirichlet points free."""
+    """That of an implicit step of a time t, or of a Poisson problem for None; `natural`: without Dirichlet points."""
     kept = _SYSTEMS.setdefault(lb.values, OrderedDict())
     fixed = None if natural else lb.fixed
     key = t, lb.values.device, fixed is None

@@ -13,7 +13,7 @@ from torch.nn.functional import pad
 
 from torchlb.errors import InputError
 from torchlb.linalg.spectral_bounds import Bounds, join_bounds
-from torchlb.operator.storage import PAIRS
+from torchlb.operator.storage import PAIRS, no_pairs
 
 Buffers = dict[str, Tensor]
 BY_POINT = ("mass", "points", "frames", "normals", "on_boundary")
@@ -63,13 +63,9 @@ def join_buffers(shapes: Sequence[Buffers]) -> Buffers:
 
 
 def _join_pairs(shapes: Sequence[Buffers]) -> Buffers:
-    """The weak pairs and, if any shape has one of its own, the linear ones."""
-    paired = [len(s["weak_crow"]) > 0 for s in shapes]
-    if any(paired) and not all(paired):
-        raise InputError(
-            f"batch: shape {paired.index(False)} has no weak pair, shape {paired.index(True)} has one; build all of "
-            "them with weak_form=False, or all with it"
-        )
+    """The weak pairs, if all shapes have one, and, if any shape has one of its own, the linear ones."""
+    if not all(len(s["weak_crow"]) for s in shapes):
+        shapes = [s | no_pairs(s["values"]) for s in shapes]
     joined = {}
     points = _starts([len(s["mass"]) for s in shapes])
     for pair in PAIRS:

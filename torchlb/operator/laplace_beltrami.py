@@ -7,7 +7,7 @@ from typing import Literal
 
 import torch
 
-from torchlb.errors import InputError
+from torchlb.errors import InputError, warn
 from torchlb.fits.rules import WeightsName
 from torchlb.geometry.frames import Projection
 from torchlb.operator import build
@@ -163,12 +163,19 @@ class LaplaceBeltrami(StencilFace, WeakFace):
         """Several shapes as one block-diagonal operator, which every layer takes like any other.
 
         Features are the shapes' below each other, (ΣN, C). Indices of shape s (its faces, say) move by
-        ``lb.offsets[s]``. Eigenbases that the shapes hold are taken over; the others are solved when asked for.
+        ``lb.offsets[s]``. The weak pair is there if all have one. Eigenbases that the shapes hold are taken over; the others are solved when asked for.
         Raises InputError for shapes of different dimension, floating type or device, or for none.
         """
         if len(shapes) == 0:
             raise InputError("batch: got no shapes")
         sizes = [n for shape in shapes for n in shape.sizes or (shape.num_points,)]
+        if not all(shape.has_weak_form for shape in shapes):
+            bare = [s.source == "mesh" and s.has_weak_form and not s.certificate for s in shapes]
+            if any(bare):
+                warn(
+                    f"batch: not all shapes have a weak pair, so that the stencils do its work, and that of shape "
+                    f"{bare.index(True)} is not certified; build it with certify=True"
+                )
         _ = [shape.bounds for shape in shapes]  # of one from an old state they are found here, once
         state = join_states([shape.get_extra_state() for shape in shapes], sizes)
         bases = [shape.basis for shape in shapes if shape.basis and not shape.sizes]

@@ -32,8 +32,9 @@ Storage = TypeVar("Storage", bound="OperatorStorage")
 BASIS = ("eigenvalues", "eigenvectors", "left", "decay_rates", "modal_transform", "relative_errors")
 
 
-def _no_pairs() -> dict[str, Tensor]:
-    index, values = torch.zeros(0, dtype=torch.int64), torch.zeros(2, 0)
+def no_pairs(like: Tensor) -> dict[str, Tensor]:
+    """The buffers of both pairs where there are none, of the type and on the device of a tensor."""
+    index, values = like.new_zeros(0, dtype=torch.int64), like.new_zeros(2, 0)
     parts = {"crow": index, "col": index, "values": values}
     return {f"{pair}_{part}": t.clone() for pair in PAIRS for part, t in parts.items()}
 
@@ -83,7 +84,7 @@ class OperatorStorage(nn.Module):
             self.register_buffer(name, torch.zeros(0))
         self.register_buffer("on_boundary", torch.zeros(0, dtype=torch.bool))
         self.crow, self.col = torch.zeros(1, dtype=torch.int64), torch.zeros(0, dtype=torch.int64)
-        for name, tensor in _no_pairs().items():
+        for name, tensor in no_pairs(torch.zeros(0)).items():
             self.register_buffer(name, tensor)
         for name in REPORT_FIELDS:
             dtype = torch.get_default_dtype() if name in REAL_FIELDS else torch.int64
@@ -312,7 +313,7 @@ class OperatorStorage(nn.Module):
             stored = f"{prefix}basis_{name}" in state_dict
             self.register_buffer(f"basis_{name}", self.values.new_zeros(0), persistent=stored)
         self._bounds = None
-        for name, tensor in _no_pairs().items():  # as in a state of an older torchlb
+        for name, tensor in no_pairs(torch.zeros(0)).items():  # as in a state of an older torchlb
             state_dict.setdefault(prefix + name, tensor)
         for name, buffer in self.tensors.items():
             incoming = state_dict.get(prefix + name)
