@@ -20,6 +20,22 @@ def check_shape(x: Tensor, lb: LaplaceBeltrami) -> None:
         )
 
 
+def as_times(t: float | Tensor, x: Tensor, dtype: torch.dtype) -> Tensor:
+    """Times for the channels of x, (C,); InputError unless they are one or C, finite and at least 0.
+
+    >>> as_times(0.5, torch.ones(4, 2), torch.float32)
+    tensor([0.5000, 0.5000])
+    """
+    time = torch.as_tensor(t, dtype=dtype, device=x.device)
+    if time.shape not in ((), (1,), x.shape[-1:]):
+        raise InputError(
+            f"t: expected one time or one for each of {x.shape[-1]} channels, got {tuple(time.shape)}"
+        )
+    if not torch.compiler.is_compiling() and not bool(((time >= 0) & time.isfinite()).all()):
+        raise InputError(f"t: expected finite times of at least 0, got {time.detach().cpu()}")
+    return time.expand(x.shape[-1])
+
+
 def check_features(
     x: Tensor, lb: LaplaceBeltrami, channels: int, parameter: Tensor, k: int = 0
 ) -> torch.dtype:

@@ -18,9 +18,9 @@ from jaxtyping import Float
 from torch import Tensor, nn
 from torch.nn.functional import softplus
 
-from torchlb.errors import DiffusionError, InputError
+from torchlb.errors import DiffusionError
 from torchlb.linalg.exponential import heat
-from torchlb.nn.checks import check_choice, check_features, check_shape
+from torchlb.nn.checks import as_times, check_choice, check_features, check_shape
 from torchlb.nn.pair_flow import pair_flow
 from torchlb.operator.laplace_beltrami import LaplaceBeltrami
 from torchlb.spectral.eigenbasis import Eigenbasis
@@ -73,11 +73,9 @@ def heat_flow(
     x = f[:, None] if f.ndim == 1 else f
     check_shape(x, lb)
     dtype = torch.promote_types(torch.promote_types(x.dtype, lb.values.dtype), torch.float32)
-    time = torch.as_tensor(t, dtype=dtype, device=x.device)
-    if not torch.compiler.is_compiling() and not bool(((time >= 0) & time.isfinite()).all()):
-        raise InputError(f"t: expected finite times of at least 0, got {time.detach().cpu()}")
+    time = as_times(t, x, dtype)
     with torch.autocast(x.device.type, enabled=False):
-        y = _flow(lb, x.to(dtype), time.expand(x.shape[-1]), method, k, tolerance)
+        y = _flow(lb, x.to(dtype), time, method, k, tolerance)
     y = y.to(x.dtype) if x.dtype.itemsize < 4 else y
     return y[:, 0] if f.ndim == 1 else y
 

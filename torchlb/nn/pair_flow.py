@@ -44,13 +44,13 @@ class _Flow(torch.autograd.Function):
     def forward(ctx: Any, x: Tensor, time: Tensor, lb: Any, tolerance: float) -> Tensor:  # pyright: ignore[reportIncompatibleMethodOverride]
         ctx.save_for_backward(x, time)
         ctx.rest = lb, tolerance
-        return _summed(lb, x, time, tolerance, False)[0]
+        return _summed(lb, x, time, tolerance, False)[0]  # pyright: ignore[reportCallIssue]
 
     @staticmethod
     def backward(ctx: Any, g: Tensor) -> tuple[Any, ...]:  # pyright: ignore[reportIncompatibleMethodOverride]
         x, time = ctx.saved_tensors
         lb, tolerance = ctx.rest
-        grad_x, slope = _summed(lb, g, time, tolerance, True)
+        grad_x, slope = _summed(lb, g, time, tolerance, True)  # pyright: ignore[reportCallIssue]
         return grad_x, (slope * x).sum(0), None, None
 
 
@@ -78,7 +78,7 @@ def _summed(
                 *(_coefficients(t / pole, tolerance) for t in times[chosen]), strict=True
             )
         )
-        needed = int((c.abs().flip(0).cumsum(0).flip(0) > tolerance).any(1).sum())
+        needed = int(c.any(1).sum())
         for k, v in enumerate(
             _polynomials(solver, x[:, columns], needed, tolerance / 10, transposed)
         ):
@@ -124,7 +124,7 @@ def _coefficients(ratio: float, tolerance: float) -> tuple[np.ndarray, np.ndarra
 
     interpolate: Any = chebyshev.chebinterpolate
     c, derivative = interpolate(flow, POINTS), interpolate(slope, POINTS)
-    count = int((np.cumsum(np.abs(c[::-1]))[::-1] > tolerance / 10).sum())
+    count = int((np.cumsum(np.abs(c[::-1]))[::-1] > tolerance / 2).sum())
     c[count:] = derivative[count:] = 0
     c[0] += 1 - c.sum()
     derivative[0] -= derivative.sum()

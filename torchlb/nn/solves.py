@@ -10,7 +10,7 @@ from torch import Tensor
 
 from torchlb.errors import InputError
 from torchlb.linalg.sparse import csr_product
-from torchlb.nn.checks import check_shape
+from torchlb.nn.checks import as_times, check_shape
 from torchlb.nn.systems import system
 from torchlb.operator.laplace_beltrami import LaplaceBeltrami
 
@@ -57,10 +57,7 @@ def implicit_step(
     """
     x = f[:, None] if f.ndim == 1 else f
     check_shape(x, lb)
-    time = torch.as_tensor(t, dtype=torch.float64, device=x.device)
-    if not bool(((time >= 0) & time.isfinite()).all()):
-        raise InputError(f"t: expected finite times of at least 0, got {time.detach().cpu()}")
-    columns, time = _columns(x, time.expand(x.shape[-1]))
+    columns, time = _columns(x, as_times(t, x, torch.float64))
     given, poured = (_data(lb, d, n, f) for d, n in ((boundary_values, 0), (flux, 1)))
     right = _mass(lb, columns)
     if poured is not None:
@@ -166,7 +163,7 @@ class _Solve(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx: Any, b: Tensor, time: Tensor | None, lb: Any, tolerance: float) -> Tensor:  # pyright: ignore
-        u = solve_columns(lb, b, time, tolerance)
+        u = solve_columns(lb, b, time, tolerance)  # pyright: ignore[reportCallIssue]
         ctx.save_for_backward(time, u)
         ctx.rest = lb, tolerance
         return u
@@ -175,7 +172,7 @@ class _Solve(torch.autograd.Function):
     def backward(ctx: Any, g: Tensor) -> tuple[Any, ...]:  # pyright: ignore
         time, u = ctx.saved_tensors
         lb, tolerance = ctx.rest
-        w = solve_columns(lb, g, time, tolerance, transposed=True)
+        w = solve_columns(lb, g, time, tolerance, True)  # pyright: ignore[reportCallIssue]
         grad_t = None
         if time is not None and ctx.needs_input_grad[1]:
             slope = _product(lb, 0, u) if lb.has_weak_form else -lb(u)

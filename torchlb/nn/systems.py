@@ -9,6 +9,7 @@ steps. Factors are kept as long as the operator that they belong to.
 
 from __future__ import annotations
 
+import atexit
 from collections import OrderedDict
 from typing import Any
 
@@ -32,6 +33,7 @@ SMOOTHING = 1.5
 SHIFT = 1e-9
 """Of an inverted stencil that is singular, in units of its diagonal."""
 _SYSTEMS: Any = WeakIdKeyDictionary()
+atexit.register(_SYSTEMS.clear)  # cholespy reports factors that outlive Python as leaks
 Fixed = Tensor | None
 
 
@@ -85,8 +87,9 @@ class PairSystem:
         self.values = stiffness if t is None else mass + t * stiffness
         self.stiffness, self.mass, self.singular = stiffness, mass, t is None
         self.free = None if fixed is None else (~fixed).double()[:, None]
-        self.components = _Components(lb, fixed) if t is None else None
+        self.components = _Components(lb, fixed)
         self.ones_mass = multiply(*self.pattern, mass, torch.ones_like(lb.mass.double())[:, None])
+        self.area = self.components.sums(self.ones_mass)
         self.steps = 0
         n = lb.num_points
         first, second = (
@@ -96,12 +99,11 @@ class PairSystem:
             )
             for v in linear[:2]
         )
-        if self.components is None:
-            matrix = second + t * first
-        else:
-            area = self.components.sums(self.ones_mass)[:, 0]
-            scale = sparse.diags_array(area.rsqrt().cpu().numpy())
+        if t is None:
+            scale = sparse.diags_array(self.area[:, 0].rsqrt().cpu().numpy())
             matrix = first + scale @ second @ scale
+        else:
+            matrix = second + t * first
         if self.free is not None:
             free = self.free[:, 0].cpu().numpy()
             keep = sparse.diags_array(free)
@@ -116,12 +118,22 @@ class PairSystem:
     def solve(
         self, b: Float[Tensor, "N C"], tolerance: float, transposed: bool = False
     ) -> Float[Tensor, "N C"]:
-        """The solution, zero at Dirichlet points, of mean zero on the other components of a Poisson problem."""
-        b = self._compatible(self._inside(b.double()))
+        """The solution, zero at Dirichlet points, of mean zero on the other components of a Poisson problem.
+
+        On these, constants are split off, for which M + tK is M: they and the mass stay to rounding.
+        """
+        b = self._inside(b.double())
+        mean = self._mean(b)
+        right = b - self.ones_mass * mean
         x, self.steps = conjugate_gradients(
-            self._product, b, self._precondition, tolerance=tolerance
+            self._product, right, self._precondition, tolerance=tolerance
         )
-        return self._centered(x)
+        x = x - self._mean(self.ones_mass * x)
+        return x if self.singular else x + mean
+
+    def _mean(self, x: Tensor) -> Tensor:
+        """Sums over components that no Dirichlet point holds, by their areas; 0 on the others."""
+        return torch.where(self.components.free, self.components.sums(x) / self.area, 0.0)
 
     def _product(self, x: Tensor) -> Tensor:
         return self._inside(multiply(*self.pattern, self.values, x))
@@ -136,20 +148,6 @@ class PairSystem:
 
     def _inside(self, x: Tensor) -> Tensor:
         return x if self.free is None else x * self.free
-
-    def _compatible(self, b: Tensor) -> Tensor:
-        """Without the mean over components that no Dirichlet point holds: Πᵀb, Π as below."""
-        if self.components is None:
-            return b
-        mean = self.components.sums(b) / self.components.sums(self.ones_mass)
-        return b - torch.where(self.components.free, self.ones_mass * mean, 0.0)
-
-    def _centered(self, x: Tensor) -> Tensor:
-        """Πx = x less its mean, in M, over the same components."""
-        if self.components is None:
-            return x
-        mean = self.components.sums(self.ones_mass * x) / self.components.sums(self.ones_mass)
-        return x - torch.where(self.components.free, mean, 0.0)
 
 
 class StencilSystem:
