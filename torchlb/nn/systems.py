@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Float
 from scipy import sparse
 from scipy.sparse import csgraph
 from torch import Tensor
@@ -34,42 +34,32 @@ SHIFT = 1e-9
 """Of an inverted stencil that is singular, in units of its diagonal."""
 _SYSTEMS: Any = WeakIdKeyDictionary()
 atexit.register(_SYSTEMS.clear)  # cholespy reports factors that outlive Python as leaks
-Fixed = Tensor | None
 
 
-def system(
-    lb: LaplaceBeltrami, t: float | None, natural: bool = False
-) -> PairSystem | StencilSystem:
-    """That of an implicit step of a time t, or of a Poisson problem for None; `natural`: without Dirichlet points."""
+def system(lb: LaplaceBeltrami, t: float | None) -> PairSystem | StencilSystem:
+    """That of an implicit step of a time t, or of a Poisson problem for None."""
     kept = _SYSTEMS.setdefault(lb.values, OrderedDict())
-    fixed = None if natural else lb.fixed
-    key = t, lb.values.device, fixed is None
+    key = t, lb.values.device
     if key not in kept:
-        kind = PairSystem if lb.has_weak_form else StencilSystem
-        kept[key] = kind(lb, t, fixed)
+        kept[key] = PairSystem(lb, t) if lb.has_weak_form else StencilSystem(lb, t)
         if len(kept) > KEPT:
             kept.popitem(last=False)
     kept.move_to_end(key)
     return kept[key]
 
 
-def connected(lb: LaplaceBeltrami) -> tuple[Int[Tensor, " N"], int]:
-    """The number of the connected component of each point, and how many there are."""
-    crow, col = lb.linear_pair[:2] if lb.has_weak_form else (lb.crow, lb.col)
-    where = (np.ones(len(col)), col.cpu().numpy(), crow.cpu().numpy())
-    graph = sparse.csr_array(where, shape=lb.shape)
-    count, number = csgraph.connected_components(graph, directed=False)
-    return torch.from_numpy(number.astype(np.int64)).to(col.device), int(count)
-
-
 class _Components:
     """Means over the connected components of a shape, and which of them have a Dirichlet point."""
 
-    def __init__(self, lb: LaplaceBeltrami, fixed: Fixed) -> None:
-        self.of, self.count = connected(lb)
-        held = torch.zeros(self.count, device=self.of.device)
-        if fixed is not None:
-            held = held.index_add(0, self.of, fixed.float())
+    def __init__(self, lb: LaplaceBeltrami) -> None:
+        crow, col = lb.linear_pair[:2] if lb.has_weak_form else (lb.crow, lb.col)
+        where = (np.ones(len(col)), col.cpu().numpy(), crow.cpu().numpy())
+        graph = sparse.csr_array(where, shape=lb.shape)
+        self.count, number = csgraph.connected_components(graph, directed=False)
+        self.of = torch.from_numpy(number.astype(np.int64)).to(col.device)
+        held = torch.zeros(self.count, device=col.device)
+        if lb.fixed is not None:
+            held = held.index_add(0, self.of, lb.fixed.float())
         self.free = (held == 0)[self.of][:, None]  # points whose component has no Dirichlet point
 
     def sums(self, x: Float[Tensor, "N C"]) -> Float[Tensor, "N C"]:
@@ -80,14 +70,14 @@ class _Components:
 class PairSystem:
     """K, or M + tK, of a weak pair."""
 
-    def __init__(self, lb: LaplaceBeltrami, t: float | None, fixed: Fixed) -> None:
+    def __init__(self, lb: LaplaceBeltrami, t: float | None) -> None:
         stiffness, mass = (v.detach().double() for v in lb.weak_values[:2])
         crow, col, linear = lb.linear_pair
         self.pattern = lb.weak_crow, lb.weak_col
         self.values = stiffness if t is None else mass + t * stiffness
         self.stiffness, self.mass, self.singular = stiffness, mass, t is None
-        self.free = None if fixed is None else (~fixed).double()[:, None]
-        self.components = _Components(lb, fixed)
+        self.free = None if lb.fixed is None else (~lb.fixed).double()[:, None]
+        self.components = _Components(lb)
         self.ones_mass = multiply(*self.pattern, mass, torch.ones_like(lb.mass.double())[:, None])
         self.area = self.components.sums(self.ones_mass)
         self.steps = 0
@@ -153,16 +143,16 @@ class PairSystem:
 class StencilSystem:
     """−L, or 1 − tL, of a stencil L, by sparse LU on the CPU."""
 
-    def __init__(self, lb: LaplaceBeltrami, t: float | None, fixed: Fixed) -> None:
+    def __init__(self, lb: LaplaceBeltrami, t: float | None) -> None:
         n = lb.num_points
         matrix = sparse.csr_array(lb.to_scipy(), dtype=np.float64)
         self.components = None
         shift = 1.0
         if t is None:
-            self.components = _Components(lb, fixed)
+            self.components = _Components(lb)
             shift = SHIFT * float(np.median(np.abs(matrix.diagonal())))
             t = 1.0
-        self.free = None if fixed is None else (~fixed).double()[:, None]
+        self.free = None if lb.fixed is None else (~lb.fixed).double()[:, None]
         self.mass = lb.mass.detach().double()[:, None]
         self.lu = factorized(sparse.csc_array(shift * sparse.eye_array(n) - t * matrix), 1e-2)
 
