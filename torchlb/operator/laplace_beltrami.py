@@ -163,7 +163,8 @@ class LaplaceBeltrami(StencilFace, WeakFace):
         """Several shapes as one block-diagonal operator, which every layer takes like any other.
 
         Features are the shapes' below each other, (ΣN, C). Indices of shape s (its faces, say) move by
-        ``lb.offsets[s]``. The weak pair is there if all have one. Eigenbases that the shapes hold are taken over; the others are solved when asked for.
+        ``lb.offsets[s]``. The weak pair is there if all have one. Eigenbases that the shapes hold are taken over; the
+        others are solved when asked for.
         Raises InputError for shapes of different dimension, floating type or device, or for none.
         """
         if len(shapes) == 0:

@@ -1,0 +1,318 @@
+"""Implicit steps and Poisson problems against dense algebra, exact solutions, and their own derivatives."""
+
+import copy
+import functools
+import gc
+import pickle
+
+import pytest
+import torch
+from torch.autograd import gradcheck
+
+from torchlb import DiffusionError, InputError, LaplaceBeltrami, implicit_step, poisson_solve
+from torchlb.linalg.conjugate_gradients import conjugate_gradients
+from torchlb.nn import systems
+from torchlb.surfaces import Sphere, Torus, UnitDisk
+
+
+def disk(n, condition):
+    return LaplaceBeltrami.from_mesh(*UnitDisk().mesh(n), order=2, condition=condition)
+
+
+BUILDERS = {
+    "pair": lambda: LaplaceBeltrami.from_mesh(*Torus().mesh(80), order=2),
+    "cotangent": lambda: LaplaceBeltrami.from_cotangent(*Sphere().mesh(60)),
+    "stencil": lambda: LaplaceBeltrami.from_points(Sphere().points(80), order=2),
+    "neumann": lambda: disk(80, "neumann"),
+    "dirichlet": lambda: disk(80, "dirichlet"),
+}
+BUILDERS = {name: functools.cache(build) for name, build in BUILDERS.items()}
+every_builder = pytest.mark.parametrize("build", BUILDERS.values(), ids=BUILDERS.keys())
+
+
+def rough(lb, *shape, grad=False):
+    return torch.randn(lb.num_points, *shape, dtype=torch.float64, requires_grad=grad)
+
+
+def dense(lb):
+    """K and M; −L and 1 of a stencil."""
+    if lb.has_weak_form:
+        return lb.stiffness.to_dense(), lb.mass_matrix.to_dense()
+    return -lb.matrix.to_dense(), torch.eye(lb.num_points, dtype=torch.float64)
+
+
+def free(lb):
+    return torch.ones(lb.num_points, dtype=torch.bool) if lb.fixed is None else ~lb.fixed
+
+
+@every_builder
+def test_implicit_step_is_dense_algebra(build):
+    """(M + tK)u = Mf with the rows and columns of Dirichlet points taken out, for (N,), (N, C), (B, N, C)."""
+    lb = build()
+    f, times, inside = (
+        torch.randn(2, lb.num_points, 2).double(),
+        torch.tensor([0.05, 2.0]),
+        free(lb),
+    )
+    u = implicit_step(lb, f, times)
+    stiffness, mass = dense(lb)
+    for c, t in enumerate(times.double()):
+        expected = torch.zeros_like(f[..., c])
+        matrix = (mass + t * stiffness)[inside][:, inside]
+        expected[:, inside] = torch.linalg.solve(matrix, (mass @ f[..., c].T)[inside]).T
+        torch.testing.assert_close(u[..., c], expected, rtol=0, atol=1e-8)
+    torch.testing.assert_close(implicit_step(lb, f[1], times), u[1], rtol=0, atol=1e-8)
+    alone = implicit_step(lb, f[1, :, 0], 0.05)
+    torch.testing.assert_close(alone, u[1, :, 0], rtol=0, atol=1e-8)
+
+
+@every_builder
+def test_poisson_problem_is_solved(build):
+    """Ku = M(f − mean f), and u has mean zero, where no point is fixed."""
+    lb = build()
+    f, (stiffness, mass), inside = rough(lb), dense(lb), free(lb)
+    u = poisson_solve(lb, f)
+    weights = mass.sum(0) if lb.has_weak_form else lb.mass
+    if lb.fixed is None:
+        assert abs(weights @ u) < 1e-10
+        f = f - (weights @ f) / weights.sum()
+    else:
+        assert (u[lb.fixed] == 0).all()
+    torch.testing.assert_close((stiffness @ u)[inside], (mass @ f)[inside], rtol=0, atol=1e-7)
+
+
+@pytest.mark.parametrize("name", ["pair", "cotangent"])
+def test_eigenfunctions_are_scaled(name):
+    """(1 − tΔ)⁻¹φ = φ/(1 + tλ) and −Δ⁻¹φ = φ/λ, with the eigenvectors of dense (K, M)."""
+    lb = BUILDERS[name]()
+    stiffness, mass = dense(lb)
+    lower = torch.linalg.cholesky(mass)
+    inverse = torch.linalg.inv(lower)
+    values, vectors = torch.linalg.eigh(inverse @ stiffness @ inverse.T)
+    values, phi = values[1:8], (inverse.T @ vectors)[:, 1:8]
+    torch.testing.assert_close(implicit_step(lb, phi, 0.3), phi / (1 + 0.3 * values))
+    torch.testing.assert_close(poisson_solve(lb, phi), phi / values)
+
+
+@every_builder
+def test_no_time_no_step(build):
+    lb = build()
+    f = rough(lb, 2) * free(lb)[:, None]
+    torch.testing.assert_close(implicit_step(lb, f, 0.0), f, rtol=0, atol=1e-8)
+
+
+@pytest.mark.parametrize("name", ["pair", "cotangent", "neumann"])
+def test_constants_and_mass_stay_to_rounding(name):
+    lb = BUILDERS[name]()
+    f, weights = rough(lb, 3), lb.mass_matrix.to_dense().sum(0)
+    one = torch.ones_like(f)
+    torch.testing.assert_close(implicit_step(lb, one, 0.7), one, rtol=0, atol=1e-13)
+    assert (weights @ (implicit_step(lb, f, 0.7) - f)).abs().max() < 1e-13 * weights.sum()
+
+
+@every_builder
+def test_derivatives_in_f_and_t(build):
+    lb = build()
+    f, t = rough(lb, 2, grad=True), torch.tensor([0.1, 0.3]).double().requires_grad_()
+    exact = {"tolerance": 1e-13}
+    assert gradcheck(lambda f, t: implicit_step(lb, f, t, **exact), (f, t), fast_mode=True)
+    assert gradcheck(lambda f: poisson_solve(lb, f, **exact), f, fast_mode=True)
+
+
+@pytest.mark.parametrize(("name", "data"), [("dirichlet", "boundary_values"), ("neumann", "flux")])
+def test_derivatives_in_the_data_of_a_boundary(name, data):
+    lb = BUILDERS[name]()
+    f, g = rough(lb, grad=True), rough(lb, grad=True)
+    t = torch.tensor(0.2, dtype=torch.float64, requires_grad=True)
+
+    def step(f, t, g):
+        return implicit_step(lb, f, t, tolerance=1e-13, **{data: g})
+
+    def poisson(f, g):
+        return poisson_solve(lb, f, tolerance=1e-13, **{data: g})
+
+    assert gradcheck(step, (f, t, g), fast_mode=True)
+    assert gradcheck(poisson, (f, g), fast_mode=True)
+
+
+def problem(vertices):
+    """U on the disk, −Δu, and ∂_ν u at the rim."""
+    x, y, _ = vertices.T
+    u = torch.cos(2 * x + 1) * torch.sin(3 * y) + x**3
+    slope_x = -2 * torch.sin(2 * x + 1) * torch.sin(3 * y) + 3 * x**2
+    slope_y = 3 * torch.cos(2 * x + 1) * torch.cos(3 * y)
+    return u, 13 * torch.cos(2 * x + 1) * torch.sin(3 * y) - 6 * x, slope_x * x + slope_y * y
+
+
+@pytest.mark.parametrize(("condition", "data"), [("dirichlet", 0), ("neumann", 2)])
+def test_data_of_a_boundary_enter_with_the_order(condition, data):
+    """|u − u_h| ≤ 1e-3 |u| at 500 points and falls like h³ at least, for given values and for given fluxes."""
+    errors = []
+    for n in (500, 2000):
+        vertices, faces = UnitDisk().mesh(n)
+        lb = LaplaceBeltrami.from_mesh(vertices, faces, condition=condition)
+        exact = problem(vertices)
+        given = {("boundary_values", "", "flux")[data]: exact[data]}
+        mass = lb.mass_matrix.to_dense().sum(0)
+        u = exact[0] if lb.fixed is not None else exact[0] - (mass @ exact[0]) / mass.sum()
+        error = poisson_solve(lb, exact[1], **given) - u
+        step = (
+            implicit_step(
+                lb, u + 0.3 * exact[1], 0.3, **(given | ({} if data else {"boundary_values": u}))
+            )
+            - u
+        )
+        errors.append([float(e.norm() / u.norm()) for e in (error, step)])
+    coarse, fine = torch.tensor(errors)
+    assert (coarse < 1e-3).all()
+    assert (fine < coarse / 8).all()
+
+
+def test_given_values_are_taken_at_the_boundary():
+    lb = BUILDERS["dirichlet"]()
+    given = rough(lb)
+    for u in (
+        implicit_step(lb, rough(lb), 0.1, boundary_values=given),
+        poisson_solve(lb, rough(lb), boundary_values=given),
+    ):
+        torch.testing.assert_close(u[lb.fixed], given[lb.fixed])
+
+
+def test_a_number_is_the_same_at_all_the_boundary():
+    """Harmonic with u = 3 at the rim: u = 3."""
+    lb = BUILDERS["dirichlet"]()
+    u = poisson_solve(lb, torch.zeros(lb.num_points), boundary_values=3)
+    torch.testing.assert_close(u, torch.full_like(u, 3.0))
+
+
+@pytest.mark.parametrize("names", [("pair", "cotangent"), ("dirichlet", "neumann")])
+def test_a_batch_is_its_shapes(names):
+    shapes = [BUILDERS[name]() for name in names]
+    f = torch.cat([rough(lb, 2) for lb in shapes])
+    lb = LaplaceBeltrami.batch(shapes)
+    parts = list(zip(shapes, f.split([s.num_points for s in shapes]), strict=True))
+    for solve in (lambda s, x: implicit_step(s, x, 0.2), poisson_solve):
+        alone = torch.cat([solve(s, x) for s, x in parts])
+        torch.testing.assert_close(solve(lb, f), alone, rtol=0, atol=1e-8)
+
+
+def test_means_of_components_are_taken_off_one_by_one():
+    """Ku = M(f − mean of the component), and u has mean zero on each."""
+    vertices, faces = Sphere().mesh(60)
+    two = LaplaceBeltrami.from_mesh(
+        torch.cat([vertices, vertices + 5]), torch.cat([faces, faces + 60]), order=2
+    )
+    f = rough(two)
+    one = LaplaceBeltrami.from_mesh(vertices, faces, order=2)
+    alone = [poisson_solve(one, part) for part in f.split(60)]
+    torch.testing.assert_close(poisson_solve(two, f), torch.cat(alone), rtol=0, atol=1e-8)
+
+
+@every_builder
+def test_types(build):
+    """Solved in float64 whatever the type of f, which the result has."""
+    lb = build()
+    f = rough(lb, 2)
+    u = implicit_step(lb, f, 0.1)
+    for dtype, close in ((torch.float32, 1e-6), (torch.float16, 1e-2)):
+        single = implicit_step(lb, f.to(dtype), 0.1)
+        assert single.dtype == dtype
+        torch.testing.assert_close(single.double(), u, rtol=0, atol=close)
+
+
+def test_an_operator_that_has_solved_travels():
+    """Factors are outside of the module: copies, pickles and states are as before; they go with the operator."""
+    lb = LaplaceBeltrami.from_cotangent(*Sphere().mesh(60))
+    f, before = rough(lb), set(lb.state_dict())
+    u = implicit_step(lb, f, 0.1)
+    for other in (copy.deepcopy(lb), pickle.loads(pickle.dumps(lb))):
+        torch.testing.assert_close(implicit_step(other, f, 0.1), u)
+    assert set(lb.state_dict()) == before
+    gc.collect()
+    kept = len(systems._SYSTEMS)
+    del lb
+    gc.collect()
+    assert len(systems._SYSTEMS) < kept
+
+
+def test_factors_are_kept_in_bounds():
+    lb = BUILDERS["cotangent"]()
+    f = rough(lb)
+    for t in range(1, 2 * systems.KEPT):
+        implicit_step(lb, f, float(t))
+    assert len(systems._SYSTEMS[lb.values]) == systems.KEPT
+
+
+def test_conjugate_gradients_take_few_steps_in_any_state():
+    """At most 60 steps to 1e-10 with the linear factor, whatever the time, and for a Poisson problem."""
+    lb = LaplaceBeltrami.from_mesh(*Torus().mesh(1000))
+    f = rough(lb, 4)
+    for t in (float(lb.mass.mean()), 1.0, 1e3):
+        implicit_step(lb, f, t)
+        assert systems.system(lb, t).steps <= 60
+    poisson_solve(lb, f)
+    assert systems.system(lb, None).steps <= 60
+
+
+def test_conjugate_gradients_give_up_with_advice():
+    matrix = torch.diag(torch.logspace(0, 12, 50, dtype=torch.float64))
+    with pytest.raises(DiffusionError, match=r"after 20 steps.*degenerate"):
+        conjugate_gradients(
+            lambda x: matrix @ x, torch.ones(50, 1).double(), lambda r: r, max_steps=20
+        )
+
+
+def test_columns_have_steps_of_their_own():
+    """One column is solved at once, a zero one at the start, the third takes longer."""
+    matrix = torch.diag(torch.arange(1.0, 6.0, dtype=torch.float64))
+    b = torch.stack([torch.eye(5)[0], torch.zeros(5), torch.ones(5)], 1).double()
+    x, steps = conjugate_gradients(lambda v: matrix @ v, b, lambda r: r)
+    torch.testing.assert_close(matrix @ x, b)
+    assert steps == 5
+
+
+def test_compiled_code_may_solve():
+    lb = BUILDERS["cotangent"]()
+    f = rough(lb, grad=True)
+    compiled = torch.compile(
+        lambda x: implicit_step(lb, 2 * x, 0.1).square().sum(), backend="eager"
+    )
+    (expected,) = torch.autograd.grad(implicit_step(lb, 2 * f, 0.1).square().sum(), f)
+    torch.testing.assert_close(torch.autograd.grad(compiled(f), f)[0], expected)
+
+
+@pytest.mark.parametrize("t", [-1.0, float("inf"), float("nan"), torch.ones(3)])
+def test_times_that_cannot_be(t):
+    lb = BUILDERS["cotangent"]()
+    with pytest.raises(InputError, match="t: expected"):
+        implicit_step(lb, rough(lb, 2), t)
+
+
+@pytest.mark.parametrize(
+    ("name", "data", "message"),
+    [
+        ("stencil", {"flux": 1.0}, "a stencil has no place"),
+        ("stencil", {"boundary_values": 1.0}, "a stencil has no place"),
+        ("pair", {"flux": 1.0}, "the shape is closed"),
+        ("neumann", {"boundary_values": 1.0}, "condition='dirichlet'"),
+        ("dirichlet", {"boundary_values": torch.ones(7)}, "expected the shape of f"),
+    ],
+)
+def test_data_that_cannot_be(name, data, message):
+    lb = BUILDERS[name]()
+    for solve in (
+        lambda: implicit_step(lb, rough(lb), 0.1, **data),
+        lambda: poisson_solve(lb, rough(lb), **data),
+    ):
+        with pytest.raises(InputError, match=message):
+            solve()
+
+
+def test_features_of_another_shape():
+    lb = BUILDERS["cotangent"]()
+    for solve in (
+        lambda: implicit_step(lb, torch.ones(7), 0.1),
+        lambda: poisson_solve(lb, torch.ones(7)),
+    ):
+        with pytest.raises(InputError, match="N = 60"):
+            solve()
