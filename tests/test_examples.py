@@ -63,7 +63,7 @@ def test_demo_prints_report_certificate_and_table_and_writes_two_pictures(
         "ellipsoid.ply\nLaplaceBeltrami(250 points",
         "built in",
         "250 points, order 3 requested",
-        "certificate holds",
+        "weak pair: 100.00 % of the edges curved",
         "cotangent",
         "   250 ",
         "  1000 ",

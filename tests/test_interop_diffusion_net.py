@@ -283,7 +283,10 @@ def test_an_unmodified_diffusionnet_trains_on_the_tuple(name, method):
 
 @pytest.mark.parametrize("shape", [SPHERE, ELLIPSOID], ids=["sphere", "ellipsoid"])
 def test_the_network_on_the_tuple_is_torchlbs_own_on_the_operator(shape):
-    """Same weights, spectral diffusion: the same outputs, gradient features and their handedness included."""
+    """Same weights, spectral diffusion: the same outputs, gradient features and their handedness included.
+
+    But for the mass, which has to be diagonal in the tuple.
+    """
     verts, faces = shape
     original = OriginalDiffusionNet(3, 4).double()
     for block in original.blocks:
@@ -295,5 +298,5 @@ def test_the_network_on_the_tuple_is_torchlbs_own_on_the_operator(shape):
     ours.load_original_state_dict(original.state_dict())
     y = original(verts, mass, L, evals, evecs, gradX, gradY)
     torch.testing.assert_close(
-        ours(verts, LaplaceBeltrami.from_mesh(verts, faces)), y, rtol=1e-6, atol=1e-8
+        ours(verts, LaplaceBeltrami.from_mesh(verts, faces)), y, rtol=1e-6, atol=5e-5
     )

@@ -338,10 +338,12 @@ def disk(condition="dirichlet"):
     )
 
 
-def test_unbatch_is_the_inverse_of_batch():
+@pytest.mark.parametrize("pairs", [False, True])
+def test_unbatch_is_the_inverse_of_batch(pairs):
     """Every tensor, the certificate, bounds, options and eigenbasis of every shape, also of a batch of batches."""
-    shapes = [copy.deepcopy(built(name)) for name in ("points", "mesh", "cotangent")]
-    shapes.append(copy.deepcopy(disk()))
+    names = ("mesh", "cotangent") if pairs else ("points", "polyharmonic", "normal")
+    shapes = [copy.deepcopy(built(name)) for name in names]
+    shapes += [copy.deepcopy(disk())] if pairs else []
     for k, shape in enumerate(shapes, start=4):
         shape.eigenbasis(k)
     for found, expected in zip(LaplaceBeltrami.batch(shapes).unbatch(), shapes, strict=True):

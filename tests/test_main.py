@@ -44,7 +44,8 @@ def test_compare_prints_report_certificate_and_spectra_and_draws(mesh, tmp_path)
     for part in (
         "shape.ply: 150 points in R^3, 296 faces",
         "150 points, order 2 requested",
-        "certificate holds",
+        "weak pair: 100.00 % of the edges curved",
+        "stable: symmetric, positive by its weak pair",
         "   k     torchlb   cotangent",
         "shape_compare.png",
     ):
@@ -66,7 +67,7 @@ def test_compare_of_a_cloud_has_no_cotangent(tmp_path):
 
 
 def test_precompute_then_again_then_info(mesh, tmp_path):
-    arguments = ("precompute", ".", "--out", "cache", "--order", 1, "-k", 4, "--workers", 1)
+    arguments = ("precompute", ".", "--out", "cache", "--order", 1, "-k", 4, "--certify")
     first = run(*arguments, cwd=tmp_path)
     assert (first.returncode, first.stdout) == (0, "1 shapes, 1 built, 0 cached, 0 failed\n")
     again = run(*arguments, cwd=tmp_path)

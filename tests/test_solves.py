@@ -181,7 +181,7 @@ def test_given_values_are_taken_at_the_boundary():
 def test_a_number_is_the_same_at_all_the_boundary():
     """Harmonic with u = 3 at the rim: u = 3."""
     lb = BUILDERS["dirichlet"]()
-    u = poisson_solve(lb, torch.zeros(lb.num_points), boundary_values=3)
+    u = poisson_solve(lb, torch.zeros(lb.num_points), boundary_values=3.0)
     torch.testing.assert_close(u, torch.full_like(u, 3.0))
 
 

@@ -72,10 +72,22 @@ def _stencil_options(command: Callable[..., Any]) -> Callable[..., Any]:
             show_default=True,
             help="How the weights are found.",
         ),
+        click.option(
+            "--certify/--no-certify",
+            default=None,
+            help="Prove the stencil stable; by default where there is no weak pair.",
+        ),
         click.option("--clean", is_flag=True, help="Leave out vertices that belong to no face."),
     ):
         command = option(command)
     return command
+
+
+def _stability(lb: LaplaceBeltrami) -> str:
+    """What is known of it."""
+    pair = "stable: symmetric, positive by its weak pair" if lb.has_weak_form else ""
+    known = [pair, "" if lb.certificate is None else str(lb.certificate)]
+    return "\n".join(filter(None, known)) or "no certificate"
 
 
 @click.group(cls=_Commands, context_settings={"help_option_names": ["-h", "--help"]})
@@ -99,7 +111,7 @@ def main() -> None:
 )
 @_stencil_options
 def compare(mesh: Path, k: int, out: Path | None, clean: bool, **options: Any) -> None:
-    """Report, certificate and spectrum of MESH beside the cotangent operator's, and a picture.
+    """Report, stability and spectrum of MESH beside the cotangent operator's, and a picture.
 
     MESH is a mesh or point cloud (.ply .obj .off .stl .glb .xyz .npy .npz). A cloud has no cotangent operator.
 
@@ -114,7 +126,7 @@ def compare(mesh: Path, k: int, out: Path | None, clean: bool, **options: Any) -
     start = time.perf_counter()
     lb = build_operator(vertices, faces, **options)
     click.echo(f"{mesh.name}: {_size(vertices, faces)}\n{lb}")
-    click.echo(f"built in {time.perf_counter() - start:.1f} s\n\n{lb.report}\n{lb.certificate}\n")
+    click.echo(f"built in {time.perf_counter() - start:.1f} s\n\n{lb.report}\n{_stability(lb)}\n")
     operators = {"torchlb": lb}
     if faces is not None:
         try:
@@ -211,7 +223,7 @@ def info(file: Path) -> None:
             click.echo(f"{loose} vertices belong to no face with distinct corners")
         return
     lb = found["operator"]
-    click.echo(f"{lb}\n\n{lb.report}\n{lb.certificate or 'no certificate'}")
+    click.echo(f"{lb}\n\n{lb.report}\n{_stability(lb)}")
     pairs = 0 if lb.basis is None else lb.basis.eigenvectors.shape[1]
     click.echo(f"{pairs} eigenpairs stored")
     click.echo(f"{file.stat().st_size / 1e6:.1f} MB, written by torchlb {found['version']}")

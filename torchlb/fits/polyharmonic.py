@@ -9,9 +9,11 @@ from torch import Tensor
 from torchlb.fits.polynomials import monomials
 from torchlb.fits.weights import (
     Weights,
+    _condition,
     _finish,
     _functionals,
     _height_residual,
+    _inverse,
     _scaled_qr,
     _scaled_system,
 )
@@ -56,7 +58,7 @@ def polyharmonic_weights(
     left = (
         torch.zeros_like(radius) if heights is None else _height_residual(q, root, coords, heights)
     )
-    return _finish(weights, residual, radius, torch.linalg.svdvals(r), left, dim)
+    return _finish(weights, residual, radius, _condition(_inverse(r)), left, dim)
 
 
 def _kernel_derivatives(

@@ -33,7 +33,8 @@ class Weights:
     hessian : (B, K, pairs), 1/ℓ²: ∂_a∂_b for a ≤ b; no columns below degree 2.
     laplacian : (B, K), 1/ℓ²: Δ = Σ_c ∂_c²; zero below degree 2.
     radius : (B,), ℓ: distance ρ of the farthest neighbour in local coordinates.
-    condition : (B,): 2-norm condition of the column-scaled √ω V; above 1e10 without full rank.
+    condition : (B,): Frobenius norm of the inverse of the R of √ω V with its columns scaled to length one, which is its
+        condition up to a factor √M; above 1e10, or not finite, without full rank.
     residual : (B,): largest violation of the moment equations, in units of the largest right-hand side.
     height_residual : (B,): what a polynomial leaves of the heights over the distances; 0 where no heights were given.
     """
@@ -77,7 +78,7 @@ def _finish(
     weights: Float[Tensor, "B K F"],
     residual: Float[Tensor, " B"],
     radius: Float[Tensor, " B"],
-    singular_values: Float[Tensor, "B M"],
+    condition: Float[Tensor, " B"],
     height_residual: Float[Tensor, " B"],
     dim: int,
 ) -> Weights:
@@ -90,7 +91,7 @@ def _finish(
         hessian=hessian,
         laplacian=hessian[..., pure].sum(-1),
         radius=radius,
-        condition=singular_values[:, 0] / singular_values[:, -1],
+        condition=condition,
         residual=residual,
         height_residual=height_residual,
     )
@@ -137,6 +138,15 @@ def _scaled_qr(
     return q, r, scale
 
 
+def _inverse(r: Float[Tensor, "B M M"]) -> Float[Tensor, "B M M"]:
+    return torch.linalg.solve_triangular(r, torch.eye(r.shape[-1]).to(r).expand_as(r), upper=True)
+
+
+def _condition(inverse: Float[Tensor, "B M M"]) -> Float[Tensor, " B"]:
+    """‖R⁻¹‖: as columns of R have length one, ‖R‖ is between 1 and √M."""
+    return inverse.flatten(1).norm(dim=1)
+
+
 @dataclass(frozen=True)
 class CenteredFit:
     """Fits u(y) = u_i + Σ_α y^α Σ_j coefficients[α, j] (u_j − u_i), y in units of the radius.
@@ -145,8 +155,7 @@ class CenteredFit:
     ----------
     coefficients : (B, M − 1, K − 1). Their rows of |α| = 1, over the radius, are the weights of the gradient.
     radius : (B,), ℓ: distance ρ of the farthest neighbour in local coordinates.
-    condition : (B,): Frobenius norm of the inverse of the R of the column-scaled √ω V, which is its condition up to a
-        factor √(M − 1).
+    condition : (B,), as in `Weights`.
     residual : (B,): largest violation of the moment equations of the first derivatives.
     values : (B, K − 1, M − 1), the monomials V at the neighbours.
     root : (B, K − 1), √ω.
@@ -180,13 +189,11 @@ def centered_fit(
     """
     radius, _, values, root = _scaled_system(coords, degree, keep)
     q, r, scale = _scaled_qr(root, values)
-    inverse = torch.linalg.solve_triangular(
-        r, torch.eye(r.shape[-1]).to(r).expand_as(r), upper=True
-    )
+    inverse = _inverse(r)
     coefficients = (inverse / scale[..., None]) @ (q * root[..., None]).mT
     dim = coords.shape[-1]
     first = coefficients[:, :dim] @ values - torch.eye(r.shape[-1])[:dim].to(r)
-    condition = inverse.flatten(1).norm(dim=1)
+    condition = _condition(inverse)
     return CenteredFit(coefficients, radius, condition, first.abs().amax((1, 2)), values, root)
 
 
@@ -235,14 +242,15 @@ def least_squares_weights(
     functionals = _functionals(coords.shape[-1], degree).to(coords)
     q, r, scale = _scaled_qr(root, values)
     right = functionals / scale[..., None]
-    solution = root[..., None] * (q @ torch.linalg.solve_triangular(r.mT, right, upper=False))
+    inverse = _inverse(r)
+    solution = root[..., None] * (q @ (inverse.mT @ right))
     residual = (values.mT @ solution - functionals).abs().amax((1, 2)) / functionals.abs().max()
     center = -(constant[..., None] * solution).sum(1, keepdim=True)
     weights = torch.cat([center, solution[:, : coords.shape[1]]], dim=1)
     left = (
         torch.zeros_like(radius) if heights is None else _height_residual(q, root, coords, heights)
     )
-    return _finish(weights, residual, radius, torch.linalg.svdvals(r), left, coords.shape[-1])
+    return _finish(weights, residual, radius, _condition(inverse), left, coords.shape[-1])
 
 
 def _with_data(

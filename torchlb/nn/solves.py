@@ -17,13 +17,14 @@ from torchlb.operator.laplace_beltrami import LaplaceBeltrami
 TOLERANCE = 1e-10
 
 
+@torch.compiler.disable
 def implicit_step(
     lb: LaplaceBeltrami,
     f: Float[Tensor, "*B N C"] | Float[Tensor, " N"],
     t: float | Tensor,
     *,
-    boundary_values: Tensor | None = None,
-    flux: Tensor | None = None,
+    boundary_values: Tensor | float | None = None,
+    flux: Tensor | float | None = None,
     tolerance: float = TOLERANCE,
 ) -> Tensor:
     """(1 − tΔ)⁻¹f, one implicit Euler step of heat flow; differentiable in f, t and the boundary's data.
@@ -68,12 +69,13 @@ def implicit_step(
     return _shaped(u if given is None else u + given, f)
 
 
+@torch.compiler.disable
 def poisson_solve(
     lb: LaplaceBeltrami,
     f: Float[Tensor, "*B N C"] | Float[Tensor, " N"],
     *,
-    boundary_values: Tensor | None = None,
-    flux: Tensor | None = None,
+    boundary_values: Tensor | float | None = None,
+    flux: Tensor | float | None = None,
     tolerance: float = TOLERANCE,
 ) -> Tensor:
     """u with −Δu = f; differentiable in f and the boundary's data. Units of f by ℓ².
@@ -180,7 +182,7 @@ class _Solve(torch.autograd.Function):
         return w, grad_t, None, None
 
 
-_solve: Any = torch.compiler.disable(_Solve.apply)
+_solve: Any = _Solve.apply
 
 
 def solve_columns(

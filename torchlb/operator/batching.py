@@ -112,6 +112,8 @@ def split_buffers(joined: Buffers, sizes: Sequence[int]) -> list[Buffers]:
             shape |= dict(
                 zip((f"{pair}_{part}" for part in PARTS), (crow, col, values), strict=True)
             )
+        if all(torch.equal(shape[f"weak_{part}"], shape[f"linear_{part}"]) for part in PARTS):
+            shape |= {n: t for n, t in no_pairs(shape["values"]).items() if n.startswith("linear")}
         if not shape["on_boundary"].any():
             shape["on_boundary"] = shape["on_boundary"][:0]
         shapes.append({name: tensor.clone() for name, tensor in shape.items()})

@@ -184,7 +184,10 @@ class LaplaceBeltrami(StencilFace, WeakFace):
         return cls.from_buffers(join_buffers([s.tensors for s in shapes]), state, basis)
 
     def unbatch(self) -> list[LaplaceBeltrami]:
-        """The operators of the shapes of a `batch`, with all that they had: certificates, bounds, eigenbases."""
+        """The operators of the shapes of a `batch`, with all that they had: certificates, bounds, eigenbases.
+
+        But weak pairs only if all of them had one.
+        """
         if self.sizes is None or self.parts is None:
             raise InputError(f"unbatch: expected a batch of operators, got one from {self.source}")
         basis = self.basis

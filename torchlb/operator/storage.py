@@ -230,7 +230,8 @@ class OperatorStorage(nn.Module):
         modes = (self.basis_decay_rates, self.basis_modal_transform)
         pairs = (self.basis_eigenvalues, self.basis_eigenvectors, self.mass, self.basis_left)
         errors = self.basis_relative_errors if len(self.basis_relative_errors) else None
-        symmetric = {"is_symmetric": errors is not None, "relative_errors": errors}
+        alone = errors is not None and len(modes[0]) == 0  # else in a batch with stencils
+        symmetric = {"is_symmetric": alone, "relative_errors": errors}
         return Eigenbasis(*pairs, self.sizes, *(t if len(t) else None for t in modes), **symmetric)
 
     def keep_basis(self, basis: Eigenbasis | None = None, *, store: bool | None = None) -> None:

@@ -74,28 +74,39 @@ class WeakFace(OperatorStorage):
         mask = torch.tensor(holds).repeat_interleave(torch.tensor(sizes)).to(self.on_boundary)
         return mask & self.on_boundary if any(holds) else None
 
-    def eigenbasis(self, k: int, *, store: bool = False) -> Eigenbasis:
+    def eigenbasis(
+        self, k: int, *, tolerance: float | None = None, store: bool = False
+    ) -> Eigenbasis:
         """The k smallest eigenpairs of −Δ: real, ascending, orthonormal in the mass; min(k, N) of them.
 
-        Solved once, in float64 on the CPU (`method.md`, section 7), and kept: a smaller k is a slice of what there is,
-        a larger one is solved anew. For a batch each shape has its own.
+        Solved once, in float64 on the CPU (`method.md`, sections 7 and 10), and kept: a smaller k is a slice of what
+        there is, a larger one or a smaller tolerance is solved anew. For a batch each shape has its own.
 
         Parameters
         ----------
         k : number of pairs, the constants among them.
+        tolerance : bound on the estimated relative errors of the eigenvalues of a weak pair as against those of its
+            matrices, which the basis has as `relative_errors`. By default 1.5e-8 k², at order
+            4 1e-9, above 1e-11.
         store : whether `state_dict` holds the basis from now on; it then loads into any operator.
 
         Raises
         ------
         EigenbasisError : where the solver does not converge, or the operator is not stable.
         """
-        return self.invariant_basis(k, store=store).truncate(k)
+        return self.invariant_basis(k, tolerance=tolerance, store=store).truncate(k)
 
-    def invariant_basis(self, k: int, *, store: bool = False) -> Eigenbasis:
+    def invariant_basis(
+        self, k: int, *, tolerance: float | None = None, store: bool = False
+    ) -> Eigenbasis:
         """At least k eigenpairs, all that are solved, so that their span is invariant under Δ; else as `eigenbasis`."""
         k = check_num_pairs(k)
-        if self.basis_left.shape[-1] < min(k, max(self.sizes or (self.num_points,))):
-            solved = self._pair_eigenbasis(k) if self.has_weak_form else self._stencil_eigenbasis(k)
+        if tolerance is not None and not 0 < tolerance < 1:
+            raise InputError(f"tolerance: expected a number between 0 and 1, got {tolerance}")
+        missing = self.basis_left.shape[-1] < min(k, max(self.sizes or (self.num_points,)))
+        if missing or (tolerance is not None and (self.basis_relative_errors > tolerance).any()):
+            pair = self.has_weak_form
+            solved = self._pair_eigenbasis(k, tolerance) if pair else self._stencil_eigenbasis(k)
             self.keep_basis(solved)
         if store:
             self.keep_basis(store=True)
@@ -112,7 +123,7 @@ class WeakFace(OperatorStorage):
         options = {"outflow": outflow, "rounding": torch.finfo(self.dtype).eps}
         return blockwise_eigenbasis(matrix, self.mass, k, self.sizes, **options)
 
-    def _pair_eigenbasis(self, k: int) -> Eigenbasis:
+    def _pair_eigenbasis(self, k: int, tolerance: float | None) -> Eigenbasis:
         """From the weak pair of each shape; the more exact, the higher the order."""
         pairs = [(self.weak_crow, self.weak_col, self.weak_values), self.linear_pair]
         (stiffness, mass), linear = (
@@ -120,7 +131,9 @@ class WeakFace(OperatorStorage):
             for crow, col, values in pairs
         )
         fixed = None if self.fixed is None else self.fixed.cpu().numpy()
-        tolerance = 10.0 ** -(2 * max(self.options.get("order") or 3, 3) + 1)
+        order = self.options.get("order") or 3
+        if tolerance is None and order > 3:
+            tolerance = 10.0 ** -(2 * min(order, 5) + 1)
         bases = []
         for start, end in zip(self.offsets[:-1], self.offsets[1:], strict=True):
             block = slice(start, end)

@@ -59,7 +59,8 @@ class Eigenbasis:
     is_symmetric : whether they are eigenpairs of a symmetric pair, KΦ = MΦΛ with ΦᵀMΦ = I. Coefficients are then those
         of the full mass matrix, decay rates the eigenvalues, every part of the span is invariant, and the two above
         are None.
-    relative_errors : (k,) or (S, k), estimates for the eigenvalues of a symmetric pair; None if they were not made.
+    relative_errors : (k,) or (S, k), estimates for the eigenvalues of a symmetric pair; None if they were not made. NaN
+        for the other shapes of a batch of both kinds, in which those of a pair have the two above, too.
     """
 
     def __init__(
@@ -141,10 +142,11 @@ def unstack_eigenbases(basis: Eigenbasis) -> list[Eigenbasis]:
     for s, (vectors, mass, left) in enumerate(zip(*columns, strict=True)):
         k = int((vectors != 0).any(0).sum())
         pairs = (basis.eigenvalues[s, :k], vectors[:, :k], mass, left[:, :k])
-        if basis.decay_rates is None or basis.modal_transform is None:
-            errors = None if basis.relative_errors is None else basis.relative_errors[s, :k]
-            symmetric = {"is_symmetric": basis.is_symmetric, "relative_errors": errors}
-            parts.append(Eigenbasis(*pairs, **symmetric))
+        errors = None if basis.relative_errors is None else basis.relative_errors[s, :k]
+        if errors is not None and not errors.isnan().any():
+            parts.append(Eigenbasis(*pairs, is_symmetric=True, relative_errors=errors))
+        elif basis.decay_rates is None or basis.modal_transform is None:
+            parts.append(Eigenbasis(*pairs, is_symmetric=basis.is_symmetric))
         else:
             modes = (basis.decay_rates[s, :, :k], basis.modal_transform[s, :, :k, :k])
             parts.append(Eigenbasis(*pairs, None, *modes))
@@ -161,18 +163,16 @@ def stack_eigenbases(bases: list[Eigenbasis]) -> Eigenbasis:
     def extended(t: Tensor) -> Tensor:
         return torch.cat([t, t[-1:].expand(k - len(t))])
 
-    decay_rates = modal_transform = relative_errors = None
     is_symmetric = all(basis.is_symmetric for basis in bases)
-    if is_symmetric and all(basis.relative_errors is not None for basis in bases):
-        errors = [b.relative_errors for b in bases if b.relative_errors is not None]
+    decay_rates = modal_transform = relative_errors = None
+    if any(basis.relative_errors is not None for basis in bases):
+        unknown = torch.nan * bases[0].eigenvalues
+        errors = [unknown[:1] if b.relative_errors is None else b.relative_errors for b in bases]
         relative_errors = torch.stack([extended(each) for each in errors])
-    if all(basis.modal_transform is not None for basis in bases):
-        decay_rates = torch.stack(
-            [padded(b.decay_rates, 1) for b in bases if b.decay_rates is not None]
-        )
-        modal_transform = torch.stack(
-            [padded(b.modal_transform, 2) for b in bases if b.modal_transform is not None]
-        )
+    if all(basis.is_invariant for basis in bases) and not is_symmetric:
+        modes = [_modes(basis) for basis in bases]
+        decay_rates = torch.stack([padded(rates, 1) for rates, _ in modes])
+        modal_transform = torch.stack([padded(transform, 2) for _, transform in modes])
     return Eigenbasis(
         torch.stack([extended(b.eigenvalues) for b in bases]),
         torch.cat([padded(b.eigenvectors, 1) for b in bases]),
@@ -184,3 +184,12 @@ def stack_eigenbases(bases: list[Eigenbasis]) -> Eigenbasis:
         is_symmetric=is_symmetric,
         relative_errors=relative_errors,
     )
+
+
+def _modes(basis: Eigenbasis) -> tuple[Tensor, Tensor]:
+    """Decay rates and modal transform; of a symmetric pair the eigenvalues and 1, 1, 0."""
+    if basis.decay_rates is not None and basis.modal_transform is not None:
+        return basis.decay_rates, basis.modal_transform
+    rates = basis.eigenvalues
+    one = torch.eye(len(rates)).to(rates)
+    return torch.stack([rates, 0 * rates]), torch.stack([one, one, 0 * one])

@@ -25,15 +25,15 @@ from torchlb.linalg.sparse import multiply
 from torchlb.spectral.eigenbasis import Eigenbasis
 from torchlb.spectral.eigensolver import GAP
 
-TOLERANCE = 1e-4
-"""One sweep, in general: the worst error is then about that of the discretisation, the median a hundredth of it."""
+TOLERANCE, LOOSEST = 1.5e-8, 1e-3
+"""Times k², since errors of quadratic elements grow with λ², and at most: one sweep, in general, or one and a half."""
 DENSE, SHARE = 600, 6
 """Up to this many points, or where a sixth of the spectrum is wanted, a dense solve is as fast."""
 GUARD = 16
 """Vectors carried beyond those wanted: they keep λ away from the rest of the spectrum."""
 SHIFT = 10.0
 """Of the factors, over the area of a component: about half of its first eigenvalue, were it a disk."""
-START, EXACT = 1e-2, 1e-8
+START, EXACT = 3e-3, 1e-8
 """Residuals of Lanczos for the linear pair, whose distance from (K, M) is of that order, and for a pair alone."""
 STEPS, MOST_STEPS, SWEEPS = 4, 32, 20
 """Steps of conjugate gradients in the first sweep, doubled in the next ones up to a bound; bound on the sweeps."""
@@ -65,7 +65,7 @@ def pencil_eigenbasis(
     *,
     linear: tuple[Sparse, Sparse] | None = None,
     fixed: Bool[np.ndarray, " N"] | None = None,
-    tolerance: float = TOLERANCE,
+    tolerance: float | None = None,
 ) -> Eigenbasis:
     """The min(k, N) smallest eigenpairs of K u = λ M u, and more where a group of equal ones would be split.
 
@@ -76,7 +76,8 @@ def pencil_eigenbasis(
     linear : K₁ and M₁ of the same points, spectrally close, with fewer entries. None if (K, M) are that themselves:
         the eigenvalues are then exact to 1e-12 or so.
     fixed : points where functions vanish (Dirichlet).
-    tolerance : bound on the estimated relative error of every eigenvalue; those closer than that are not separated.
+    tolerance : bound on the estimated relative error of every eigenvalue, 1.5e-8 k² by default; those closer than that
+        are not separated.
 
     Raises
     ------
@@ -91,9 +92,12 @@ def pencil_eigenbasis(
     held = np.zeros(len(mass), dtype=bool) if fixed is None else np.asarray(fixed, dtype=bool)
     matrices = [sparse.csr_array(x, dtype=np.float64) for x in (stiffness, mass_matrix)]
     parts = _parts(matrices[0], matrices[1], linear, held)
-    tolerance = EXACT**2 if linear is None else tolerance
+    if linear is None:
+        tolerance = EXACT**2
+    elif tolerance is None:
+        tolerance = min(TOLERANCE * k**2, LOOSEST)
     found = [_pairs(part, k, tolerance) for part in parts]
-    return _merged(parts, found, matrices[1], mass, k, tolerance)
+    return _merged(parts, found, mass, k, tolerance)
 
 
 def _parts(
@@ -132,14 +136,14 @@ def _constant(mass_matrix: Sparse) -> np.ndarray:
     return np.full(len(mass_matrix.diagonal()), float(mass_matrix.sum()) ** -0.5)
 
 
-def _pairs(part: _Part, k: int, tolerance: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """The k smallest eigenvalues of a component, or all, with groups whole, eigenvectors, and relative errors."""
+def _pairs(part: _Part, k: int, tolerance: float) -> tuple[np.ndarray, ...]:
+    """The k smallest eigenvalues of a component, or all, with groups whole, their relative errors, U, and MU."""
     size, zero = len(part.points), int(part.conserving)
     count = min(k + GUARD, size)
     if size <= max(DENSE, SHARE * count):
         dense = (part.stiffness.toarray(), part.mass_matrix.toarray())
         values, u = linalg.eigh(*dense, subset_by_index=(0, count - 1))
-        errors = np.zeros(count)
+        errors, mu = np.zeros(count), part.mass_matrix @ u
     else:
         k1, m1, *_ = part.linear or (part.stiffness, part.mass_matrix)
         null, shift = _constant(m1) if zero else None, SHIFT / float(m1.sum())
@@ -149,18 +153,21 @@ def _pairs(part: _Part, k: int, tolerance: float) -> tuple[np.ndarray, np.ndarra
         )
         if null is not None:
             values, u = np.append(0.0, values), np.column_stack([null, u])
-        errors = np.full(len(values), tolerance)
-        if part.linear is not None:
-            values, u, errors = _swept(part, u, k, shift, tolerance)
+        if part.linear is None:
+            errors, mu = np.full(len(values), tolerance), part.mass_matrix @ u
+        else:
+            values, errors, u, mu = _swept(part, u, k, shift, tolerance)
     if zero:
-        values[0], u[:, 0], errors[0] = 0.0, _constant(part.mass_matrix), 0.0
+        values[0], errors[0] = 0.0, 0.0
+        u[:, 0] = _constant(part.mass_matrix)
+        mu[:, 0] = part.mass_matrix @ u[:, 0]
     if (values[zero:] <= 0).any():
         raise EigenbasisError(
             f"eigenbasis: the stiffness has the eigenvalue {values[zero:].min():.3g} on a component of {size} points, "
             "where it should be positive"
         )
     keep = _closed(values, k, tolerance)
-    return values[:keep], u[:, :keep], errors[:keep]
+    return values[:keep], errors[:keep], u[:, :keep], mu[:, :keep]
 
 
 def _closed(values: np.ndarray, k: int, tolerance: float) -> int:
@@ -186,7 +193,7 @@ def _coarse(stiffness: Sparse, linear: Sparse) -> Sparse:
 
 def _swept(
     part: _Part, start: np.ndarray, k: int, shift: float, tolerance: float
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+) -> tuple[np.ndarray, ...]:
     """Sweeps from the linear pair's eigenvectors until the first k eigenvalues are accurate."""
     stiffness, mass_matrix = part.stiffness, part.mass_matrix
     assert part.linear is not None
@@ -213,8 +220,8 @@ def _swept(
         errors[:zero] = 0.0
         keep = _closed(values, k, tolerance)
         if errors[:keep].max() <= tolerance:
-            return values, u, errors
-        active = np.flatnonzero(errors[:keep] > tolerance / SAFETY)
+            return values, errors, u, mu
+        active = np.flatnonzero(errors[:keep] > tolerance)
         small = (u.astype(np.float32), mu.astype(np.float32))
         right = (r[:, active], z[:, active], values[active].astype(np.float32))
         steps = min(STEPS << sweep, MOST_STEPS)
@@ -299,41 +306,40 @@ def _ritz(values: np.ndarray, known: Blocks, new: Blocks, count: int) -> tuple[n
 
 
 def _merged(
-    parts: list[_Part],
-    found: list[tuple[np.ndarray, np.ndarray, np.ndarray]],
-    mass_matrix: Sparse,
-    mass: Tensor,
-    k: int,
-    tolerance: float,
+    parts: list[_Part], found: list[tuple[np.ndarray, ...]], mass: Tensor, k: int, tolerance: float
 ) -> Eigenbasis:
     """The components side by side, ascending; their constants recombined so that the first is global."""
-    values, errors = (np.concatenate([f[i] for f in found] or [np.zeros(0)]) for i in (0, 2))
+    values, errors = (np.concatenate([f[i] for f in found] or [np.zeros(0)]) for i in (0, 1))
     columns = np.cumsum([0, *(len(f[0]) for f in found)])
-    phi = np.zeros((len(mass), len(values)))
-    for part, (_, u, _), at in zip(parts, found, columns[:-1], strict=True):
-        phi[part.points, at : at + u.shape[1]] = u
     constants = [at for part, at in zip(parts, columns[:-1], strict=True) if part.conserving]
     rest = np.setdiff1d(np.arange(len(values)), constants)
     rest = rest[np.argsort(values[rest], kind="stable")]
     order = np.concatenate([np.array(constants, dtype=int), rest])
-    values, errors, phi = values[order], errors[order], phi[:, order]
-    phi *= np.where(phi[np.abs(phi).argmax(0), np.arange(phi.shape[1])] < 0, -1.0, 1.0)
+    values, errors = values[order], errors[order]
+    keep = _closed(values, k, tolerance) if len(values) else 0
+    place = np.full(len(values), keep)
+    place[order[:keep]] = np.arange(keep)
+    phi, left = np.zeros((2, len(mass), keep))
+    for part, (_, _, *vectors), at in zip(parts, found, columns[:-1], strict=True):
+        to = place[at : at + vectors[0].shape[1]]
+        for whole, own in zip((phi, left), vectors, strict=True):
+            whole[np.ix_(part.points, to[to < keep])] = own[:, to < keep]
     count = len(constants)
     if count:
         nulls = [part for part in parts if part.conserving]
         root = np.sqrt([part.mass_matrix.sum() for part in nulls])
         t = np.linalg.qr(np.column_stack([root, np.eye(count)[:, : count - 1]]))[0]
-        phi[:, :count] = phi[:, :count] @ (t * np.sign(t[0, 0]))
+        t *= np.sign(t[0, 0])
+        phi[:, :count], left[:, :count] = phi[:, :count] @ t, left[:, :count] @ t
         phi[np.concatenate([part.points for part in nulls]), 0] = 1 / linalg.norm(root)
-    keep = _closed(values, k, tolerance) if len(values) else 0
-    phi = np.ascontiguousarray(phi[:, :keep])
-    arrays = [torch.from_numpy(x) for x in (values[:keep].copy(), phi, mass_matrix @ phi)]
-    eigenvalues, eigenvectors, left = arrays
+    signs = np.where(phi[np.abs(phi).argmax(0), np.arange(keep)] < 0, -1.0, 1.0)
+    arrays = (values[:keep].copy(), phi * signs, left * signs, errors[:keep].copy())
+    eigenvalues, eigenvectors, left, errors = (torch.from_numpy(x) for x in arrays)
     return Eigenbasis(
         eigenvalues,
         eigenvectors,
         mass.detach().cpu().double(),
         left,
         is_symmetric=True,
-        relative_errors=torch.from_numpy(errors[:keep].copy()),
+        relative_errors=errors,
     )
