@@ -1,6 +1,6 @@
 """The weak pair beside its peers on real smooth shapes: python benchmarks/limit_shapes.py SHAPE.npz ... [--quick]
 
-A shape is a smooth limit surface of subdivision with its eigenvalues known (`method.md`, section 13): `vertices`, faces
+A shape is a smooth limit surface of subdivision with its eigenvalues known (`method.md`, section 9): `vertices`, faces
 `faces1`, `faces2` on the first of them, `irregular_vertices`, `irregular_faces`, `eigenvalues` 0 to 40, and `solution`
 of u − 0.02 Δu = cos 6x sin(5y + 0.3) + z. Printed are relative errors, median and worst of the eigenvalues 1 to 40, and
 of the solve; of the wave kernel signature at 4.8k points against that at 19k; and what it costs on one thread.

@@ -50,6 +50,14 @@ def unstable():
     raise ValueError(repr(lb))
 
 
+def mixed_batch():
+    shapes = [
+        LaplaceBeltrami.from_mesh(VERTICES, FACES, order=1),
+        LaplaceBeltrami.from_points(VERTICES, order=1),
+    ]
+    LaplaceBeltrami.batch(shapes)
+
+
 def damaged():
     Path("shape.obj").write_text("nothing")
     torchlb.load_operator("shape.obj")
@@ -82,6 +90,8 @@ TRIGGERS = {
     "… points are fewer": lambda: LaplaceBeltrami.from_points(VERTICES[:3]),
     "num_neighbors:": lambda: LaplaceBeltrami.from_points(VERTICES, num_neighbors=4),
     "NOT STABLE": unstable,
+    "… this operator has": lambda: LaplaceBeltrami.from_points(VERTICES, order=1).stiffness,
+    "batch: not all": mixed_batch,
     "…: not a mesh": lambda: (
         Path("shape.obj").write_text("nothing"),
         torchlb.interop.trimesh.read_shape("shape.obj"),
@@ -94,7 +104,7 @@ TRIGGERS = {
     "rotations need": circle_network,
 }
 # Hard to provoke on purpose; that the source has the words is checked instead.
-IN_THE_SOURCE = ("cotangent operator:", "… points have neither")
+IN_THE_SOURCE = ("cotangent operator:", "… points have neither", "boundary_values: no")
 
 
 def quoted_messages():

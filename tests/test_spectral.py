@@ -105,7 +105,7 @@ def test_spectrum_of_the_sphere(order, weights, first, second):
 
 
 def test_spectrum_of_the_torus():
-    """R = 1, r = 0.5: the exact eigenvalues of `method.md`, section 11."""
+    """R = 1, r = 0.5: the exact eigenvalues, of the separated equation."""
     exact = [0] + [0.997472228] * 2 + [3.17827121] * 2 + [3.90692525, 4.48915308]
     exact += [5.05486779] * 2 + [6.18060331] * 2 + [6.65205815] * 2 + [8.16247260] * 2
     exact += [10.0568008] * 2 + [12.6129542] * 2 + [12.7010054] * 2 + [14.8217076] * 2

@@ -1,6 +1,7 @@
 """Folded triangles and slivers flipped away (`method.md`, section 9): for the integrals only.
 
-Flipping everything to intrinsic Delaunay would be wrong: good meshes follow the curvature, and lose by it.
+Flipping everything to intrinsic Delaunay would be wrong: good meshes follow the curvature, and lose by it. So would be
+flips that only lessen a fold: a crease of the surface itself has such triangles, and is no better for them.
 """
 
 from __future__ import annotations
@@ -19,7 +20,7 @@ ROUNDS = 50
 
 
 def flipped(vertices: Tensor, faces: Tensor) -> Tensor:
-    """The faces, with an edge flipped of every folded triangle or sliver that gains by it.
+    """The faces, with an edge flipped of every folded triangle or sliver that gains by it and is not folded then.
 
     Only edges of two triangles, and only where the new edge is not there yet. The normals are renewed each round.
     """
@@ -34,6 +35,7 @@ def flipped(vertices: Tensor, faces: Tensor) -> Tensor:
         left, right, after = pairs
         before = torch.stack([faces[left], faces[right]], dim=1)
         gain = _value(vertices, normals, after) - _value(vertices, normals, before)
+        gain[_scores(vertices, normals, after)[0].amin(1) < ALIGNED] = -1.0
         chosen = _independent(gain, left, right, after, len(faces))
         if len(chosen) == 0:
             return faces

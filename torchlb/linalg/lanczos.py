@@ -1,4 +1,4 @@
-"""Block Lanczos for the smallest eigenpairs of a symmetric pencil K u = λ M u (`method.md`, section 12)."""
+"""Block Lanczos for the smallest eigenpairs of a symmetric pencil K u = λ M u (`method.md`, section 10)."""
 
 from __future__ import annotations
 

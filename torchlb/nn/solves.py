@@ -1,4 +1,4 @@
-"""Implicit steps and Poisson problems on a shape, differentiable (`method.md`, section 12)."""
+"""Implicit steps and Poisson problems on a shape, differentiable (`method.md`, section 10)."""
 
 from __future__ import annotations
 

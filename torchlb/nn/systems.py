@@ -2,7 +2,7 @@
 
 A system is a K + b M with the rows and columns of Dirichlet points taken out. The weak pair is solved by conjugate
 gradients; the factor of the linear pair, which is spectrally close and 20 times sparser, preconditions them
-(`method.md`, section 12). Where rows of the fits have large weights, K is up to thirty times stiffer than K₁ at single
+(`method.md`, section 10). Where rows of the fits have large weights, K is up to thirty times stiffer than K₁ at single
 points, in functions that live there: a smoothing step before and after the factor's solve then takes less than half the
 steps. Factors are kept as long as the operator that they belong to.
 """
@@ -28,7 +28,7 @@ from torchlb.operator.laplace_beltrami import LaplaceBeltrami
 
 KEPT = 8
 """Factors that are kept for each operator."""
-SMOOTHING = 1.5
+SMOOTHING = 1.1
 """Of a damped Jacobi step, in units of the absolute row sums: below 2 the preconditioner is positive definite."""
 SHIFT = 1e-9
 """Of an inverted stencil that is singular, in units of its diagonal."""

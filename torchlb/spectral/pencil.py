@@ -1,4 +1,4 @@
-r"""Eigenpairs of a symmetric weak pair K u = λ M u (`method.md`, section 12).
+r"""Eigenpairs of a symmetric weak pair K u = λ M u (`method.md`, section 10).
 
 Block Lanczos for the linear pair (K₁, M₁), whose factor is 20 times sparser than that of K; Rayleigh–Ritz in (K, M);
 then sweeps. In a sweep each eigenvector u is corrected by some steps of conjugate gradients for (K − λM)w = Ku − λMu on
