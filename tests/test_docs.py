@@ -125,7 +125,7 @@ def test_a_quoted_message_is_one_that_comes(message, tmp_path, monkeypatch):
     pattern = ".*".join(re.escape(part) for part in message.split("…"))
     with warnings.catch_warnings():
         warnings.simplefilter("error", torchlb.StabilityWarning)
-        warnings.filterwarnings("error", "(faces|points): ")
+        warnings.filterwarnings("error", "(faces|points|batch): ")
         with pytest.raises((ValueError, TypeError, RuntimeError, UserWarning)) as caught:
             trigger()
     assert re.search(pattern, str(caught.value), re.DOTALL), str(caught.value)

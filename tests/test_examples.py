@@ -192,7 +192,7 @@ GALLERY = {  # options of a small run, and what it prints
     "first_laplacian": (["--points", "300"], "cloud: relative error of Δf "),
     "cotangent_vs_orders": (["--points", "960"], "   cotangent     order 1     order 3"),
     "cortical_eigenmodes": (["--points", "400", "--k", "10"], "     torchlb        LaPy   cosine"),
-    "diffusion_distances": (["--points", "400", "--k", "40"], "   order 3: "),
+    "diffusion_distances": (["--points", "400", "--k", "40"], "on a sphere of 400 points: 1"),
     "signatures_matching": (["--points", "300", "--k", "40"], "wave kernel signature: "),
     "wavelets": (["--points", "400", "--k", "40"], "low-pass: "),
     "diffusion_maps": (["--points", "400"], "correlation of coordinate 2 with cos(π width): 0.99"),

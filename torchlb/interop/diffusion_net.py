@@ -8,25 +8,24 @@ Its own data sets call `get_all_operators`, which finds ours after
 
 The names, arguments and the 7-tuple are those of the original (github.com/nmwsharp/diffusion-net, `geometry.py`).
 
-=====================================================  =============  =========================================
-promise of the original                                "cotangent"    "stencil"
-=====================================================  =============  =========================================
-frames (V, 3, 3): rows X, Y, normal, right-handed      kept           kept; normals of order p + 1
-mass (V,) > 0, sums to the area                        kept, Voronoi  kept: π of the certificate
-L (V, V) weak, positive semidefinite, rows sum to 0    kept           kept
-L symmetric                                            kept           kept; given up by ``symmetric=False``
-(L x) / mass is −Δx at a point                         kept           only with ``symmetric=False``, at order p
-evals (k,) ≥ 0, ascending, the first is 0              kept, exactly  kept, exactly; those of the stencil
-evecs (V, k), evecsᵀ M evecs = I, the first constant   kept           kept; of −Δ, not of L
-gradX, gradY (V, V): rows sum to 0, components in      kept           kept, at order p + 1
+=====================================================  =============  =====================  =====================
+promise of the original                                "cotangent"    a mesh                 a cloud
+=====================================================  =============  =====================  =====================
+frames (V, 3, 3): rows X, Y, normal, right-handed      kept           kept, order p + 1      kept, order p + 1
+mass (V,) > 0, sums to the area                        kept, Voronoi  kept, curved area      kept, π
+L (V, V) weak, positive semidefinite, rows sum to 0    kept           kept: the stiffness    kept
+L symmetric                                            kept           kept                   kept
+(L x) / mass is −Δx at a point                         kept           with symmetric=False   with symmetric=False
+evals (k,) ≥ 0, ascending, the first is 0              kept, exactly  kept, exactly          kept, exactly
+evecs (V, k), evecsᵀ M evecs = I, the first constant   kept           kept; M = diag(mass)   kept; not those of L
+gradX, gradY (V, V): rows sum to 0, components in      kept           kept, order p + 1      kept, order p + 1
 the rows X, Y of the frames
-coalesced COO, type and device of verts                kept           kept
-=====================================================  =============  =========================================
+coalesced COO, type and device of verts                kept           kept                   kept
+=====================================================  =============  =====================  =====================
 
-With ``symmetric=True`` L is ½(C + Cᵀ), C = −ΠΔ, for what needs symmetry: the Cholesky factorisation of
-"implicit_dense" diffusion reads one triangle of L only. Solves (M + tL)u = Mf with it are right to 0.5 % on a sphere of
-500 to 2,000 points (cotangent 0.1 %; C in a Cholesky factorisation 1 to 8 %; C in a solver that does without symmetry
-1e-5), but L / mass is no Laplacian at a point. For that, take ``symmetric=False``, or "cotangent".
+With ``symmetric=False`` L is −ΠΔ of the certified stencil, L / mass the Laplacian at a point at order p. A cloud has
+½(C + Cᵀ), C = −ΠΔ, by default, for what needs symmetry: solves (M + tL)u = Mf with it are right to 0.5 % on a sphere of
+500 to 2,000 points.
 
 What differs on purpose: a float64 shape is not rounded to float32 in the cache; the key holds normals, options and
 version; int32 and int64 faces are one entry; k_eig > V gives V pairs; NaN, vertices without a face and duplicates

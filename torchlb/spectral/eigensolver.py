@@ -17,7 +17,7 @@ import torch
 from jaxtyping import Float
 from scipy import linalg, sparse
 from scipy.sparse import csgraph
-from scipy.sparse.linalg import ArpackError, LinearOperator, eigs, eigsh
+from scipy.sparse.linalg import ArpackError, LinearOperator, eigs
 from torch import Tensor
 
 from torchlb.errors import EigenbasisError, StabilityError
@@ -37,7 +37,6 @@ SHIFT = 1e-9
 """Of the inverted operator, in units of its diagonal; the constants are projected out, so that it may be tiny."""
 GAP = 1e-7
 """Eigenvalues closer than this, relatively, are not separated: conjugate pairs and exact multiplicities stay whole."""
-SYMMETRY = 1e-12
 CONDITION = 1e8
 """Of the eigenvectors of B; beyond it e^{−tB} through them has no digits left in float32."""
 
@@ -69,7 +68,6 @@ class _Part:
     null_left: np.ndarray | None  # times √mass/|√mass| it is 1; None where there is outflow
     right: tuple[np.ndarray, np.ndarray]
     left: tuple[np.ndarray, np.ndarray]
-    symmetric: bool
 
     @property
     def complete(self) -> bool:
@@ -88,8 +86,8 @@ def solve_eigenbasis(
 
     Parameters
     ----------
-    matrix : Δ, (N, N), of either kind.
-    mass : inner product; π of the certificate, or the mass of a symmetric operator.
+    matrix : Δ, (N, N).
+    mass : inner product; π of the certificate.
     k : number of pairs; all N if there are fewer.
     outflow : whether rows may have a sum below zero, as beside a Dirichlet boundary. All others sum to zero up to
         `rounding`, relative, which is removed.
@@ -114,12 +112,11 @@ def solve_eigenbasis(
         except StabilityError as error:
             raise EigenbasisError(SINGULAR.format(len(pi))) from error
     wanted = max(min(k, len(pi)) - int(conserving.sum()), 0)
-    tolerance = max(SYMMETRY, 8 * rounding)
     parts = []
     for c in range(count):
         index = np.flatnonzero(component == c)
         null = null_left[index] if conserving[c] else None
-        parts.append(_part(a[index][:, index], index, pi[index], null, wanted, tolerance))
+        parts.append(_part(a[index][:, index], index, pi[index], null, wanted))
     cut = _cut(parts, wanted)
     solved = [_ritz(part, cut) for part in parts]
     return _merged(parts, solved, pi, min(k, len(pi)))
@@ -131,48 +128,40 @@ def _part(
     mass: np.ndarray,
     null: np.ndarray | None,
     wanted: int,
-    tolerance: float,
 ) -> _Part:
     """Scale one component and find its slow eigenvectors, right and left."""
     root = np.sqrt(mass)
     zero = root / linalg.norm(root)
     scaled = sparse.csr_array(sparse.diags_array(root) @ a @ sparse.diags_array(1 / root))
-    skew = scaled - scaled.T
-    symmetric = bool(skew.nnz == 0 or abs(skew).max() <= tolerance * abs(scaled).max())
-    if symmetric:
-        scaled = sparse.csr_array((scaled + scaled.T) / 2)
     left_null = None
     if null is not None:
-        left_null = root.copy() if symmetric else null / root
+        left_null = null / root
         left_null /= left_null @ zero
     size = len(index)
     if wanted == 0 or size <= (left_null is not None):
         right = left = (np.zeros(0), np.zeros((size, 0)))
     elif size <= DENSE or 2 * wanted >= size:
-        right, left = _dense(scaled.toarray(), symmetric, left_null is not None)
+        right, left = _dense(scaled.toarray(), left_null is not None)
     else:
-        right, left = _inverted(scaled, zero, left_null, wanted, symmetric)
-    return _Part(index, scaled, root, left_null, right, left, symmetric)
+        right, left = _inverted(scaled, zero, left_null, wanted)
+    return _Part(index, scaled, root, left_null, right, left)
 
 
 Pairs = tuple[np.ndarray, np.ndarray]
 
 
-def _dense(a: np.ndarray, symmetric: bool, singular: bool) -> tuple[Pairs, Pairs]:
+def _dense(a: np.ndarray, singular: bool) -> tuple[Pairs, Pairs]:
     """All eigenpairs but a null vector, slowest first, of A and of its transpose."""
 
     def ordered(values: np.ndarray, vectors: np.ndarray) -> Pairs:
         order = np.argsort(np.abs(values), kind="stable")[int(singular) :]
         return values[order], vectors[:, order]
 
-    if symmetric:
-        pairs = ordered(*linalg.eigh(a))
-        return pairs, pairs
     return ordered(*np.linalg.eig(a)), ordered(*np.linalg.eig(a.T))
 
 
 def _inverted(
-    a: sparse.csr_array, right: np.ndarray, left: np.ndarray | None, wanted: int, symmetric: bool
+    a: sparse.csr_array, right: np.ndarray, left: np.ndarray | None, wanted: int
 ) -> tuple[Pairs, Pairs]:
     """Slow eigenpairs by Arnoldi on the inverse; null vectors, if `left` is one, are projected out on both sides."""
     size = len(right)
@@ -189,7 +178,7 @@ def _inverted(
     count = min(wanted + max(6, wanted // 16), size - 3)
     start = np.random.default_rng(0).standard_normal(size)
     found = []
-    for mode, u, w in [("N", right, left), ("T", left, right)][: 1 if symmetric else 2]:
+    for mode, u, w in [("N", right, left), ("T", left, right)]:
 
         def apply(x: np.ndarray, mode: str = mode, u: np.ndarray = u, w: np.ndarray = w) -> Any:
             y = lu.solve(x - u * (w @ x), mode)
@@ -197,17 +186,16 @@ def _inverted(
 
         operator = LinearOperator((size, size), matvec=apply, dtype=np.float64)  # pyright: ignore[reportCallIssue]
         try:
-            solve: Any = eigsh if symmetric else eigs
-            values, vectors = solve(operator, count, which="LM", v0=start)
+            pairs: Any = eigs(operator, count, which="LM", v0=start)
         except ArpackError as error:
             raise EigenbasisError(
                 f"eigenbasis: the iteration for {count} eigenvectors of {size} points did not converge ({error}); "
                 "ask for fewer, or for more, so that the cut does not fall into a cluster"
             ) from error
-        values = (1 / values - shift) * unit
+        values, vectors = (1 / pairs[0] - shift) * unit, pairs[1]
         order = np.argsort(np.abs(values), kind="stable")
         found.append((values[order], vectors[:, order]))
-    return found[0], found[-1]
+    return found[0], found[1]
 
 
 def _cut(parts: list[_Part], wanted: int) -> float:
@@ -265,9 +253,8 @@ def _ritz(part: _Part, cut: float) -> Solved:
     if part.null_left is not None:
         phi, z = np.column_stack([zero, u]), np.column_stack([part.null_left, z])
         values = np.append(0.0, values)
-    if part.symmetric or phi.shape[1] == 0:
-        eye = np.eye(len(values))
-        return values, phi, phi, np.stack([values, 0 * values]), np.stack([eye, eye, 0 * eye])
+    if phi.shape[1] == 0:
+        return values, phi, phi, np.zeros((2, 0)), np.zeros((3, 0, 0))
     overlap = phi.T @ z if z.shape == phi.shape else np.zeros((1, 1))
     if linalg.svdvals(overlap)[-1] < 1e-8 * linalg.svdvals(overlap)[0]:
         raise EigenbasisError(
