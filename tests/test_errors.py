@@ -102,6 +102,14 @@ def test_cotangent_needs_area():
         LaplaceBeltrami.from_cotangent(vertices, torch.tensor([[0, 1, 2], [2, 1, 3]]))
 
 
+@pytest.mark.parametrize("build", ["from_mesh", "from_cotangent"])
+def test_triangles_without_area_are_no_surface(build):
+    line = torch.linspace(0, 1, 5)[:, None] * torch.tensor([1.0, 2.0, 3.0])
+    faces = torch.arange(3)[:, None] + torch.arange(3)
+    with pytest.raises(torchlb.InputError, match="none of the 3 triangles has an area"):
+        getattr(LaplaceBeltrami, build)(line.double(), faces)
+
+
 def test_coincident_vertices_of_a_mesh_are_named():
     """Two triangles that share an edge only in place, as in an STL file."""
     cut = torch.cat([VERTICES, VERTICES[FACES[0]]])

@@ -27,6 +27,8 @@ MAX_EXTENT = 1e70
 """Largest extent of the points, and the inverse of the smallest: fourth powers of it must stay finite."""
 COARSE = 1e-3
 """Step of single precision over the spacing of the points above which Δ is rounding."""
+FLAT = 1e-14
+"""Squared sine of the angles of triangles that have no area."""
 
 
 def _some(index: Tensor, limit: int = 8) -> str:
@@ -134,13 +136,21 @@ def _local_dimension(points: Float[Tensor, "N n"], thin: float) -> int:
 def mended_faces(vertices: Float[Tensor, "N n"], faces: Int[Tensor, "F v"]) -> Int[Tensor, "G v"]:
     """Faces, each once and triangles wound alike; warnings name what was changed, and vertices that coincide.
 
-    ValueError for quads.
+    ValueError for quads, and for triangles none of which has an area.
     """
     if faces.shape[1] == 4 and are_quads(faces):
         raise InputError(
             f"faces: shape {tuple(faces.shape)} is for tetrahedra, but these look like quads, since most share no "
             "three corners with another; split them with vertices, faces, kept = torchlb.clean_mesh(vertices, faces)"
         )
+    if faces.shape[1] == 3:
+        a, b = (vertices[faces[:, i]] - vertices[faces[:, 0]] for i in (1, 2))
+        lengths = a.square().sum(1) * b.square().sum(1)
+        if (lengths - (a * b).sum(1).square() <= FLAT * lengths).all():
+            raise InputError(
+                f"faces: none of the {len(faces)} triangles has an area, since all have their corners on a line; pass "
+                "the vertices of a surface, or a curve by its edges, (F, 2)"
+            )
     first = first_of_each(faces)
     if not first.all():
         again = (~first).nonzero()[:, 0]
