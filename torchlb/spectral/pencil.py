@@ -37,6 +37,8 @@ START, EXACT = 3e-3, 1e-8
 """Residuals of Lanczos for the linear pair, whose distance from (K, M) is of that order, and for a pair alone."""
 STEPS, MOST_STEPS, SWEEPS = 4, 32, 20
 """Steps of conjugate gradients in the first sweep, doubled in the next ones up to a bound; bound on the sweeps."""
+ROUGH = 1e-2
+"""Median of the errors above which a sweep takes one step: it squares them at best, however many it takes."""
 SAFETY = 4.0
 """On the estimated errors, which the preconditioner makes too small where K is softer than it takes it for."""
 
@@ -208,7 +210,8 @@ def _swept(
     nothing = np.zeros((len(start), 0))
     values, known = np.zeros(0), (nothing, nothing, nothing)
     new = np.ascontiguousarray(start)
-    for sweep in range(SWEEPS):
+    steps = STEPS
+    for _ in range(SWEEPS):
         blocks = (new, stiffness @ new, mass_matrix @ new)
         values, known = _ritz(values, known, blocks, count)
         u, ku, mu = known
@@ -224,8 +227,9 @@ def _swept(
         active = np.flatnonzero(errors[:keep] > tolerance)
         small = (u.astype(np.float32), mu.astype(np.float32))
         right = (r[:, active], z[:, active], values[active].astype(np.float32))
-        steps = min(STEPS << sweep, MOST_STEPS)
-        new = _correction(shifted, cycle, small, right, steps).astype(np.float64)
+        rough = np.median(errors[:keep]) > ROUGH
+        new = _correction(shifted, cycle, small, right, 1 if rough else steps).astype(np.float64)
+        steps = steps if rough else min(2 * steps, MOST_STEPS)
         new -= u @ (mu.T @ new)
     raise EigenbasisError(
         f"eigenbasis: after {SWEEPS} sweeps the estimated relative error of some of {k} eigenvalues is above "
