@@ -8,8 +8,7 @@ import pytest
 import torch
 from scipy import special
 
-from builders import stencil_of_mesh
-from torchlb import LaplaceBeltrami
+from builders import stencil_of_cloud, stencil_of_mesh
 from torchlb.geometry.boundary import boundary_of_mesh
 from torchlb.geometry.frames import mesh_frames
 from torchlb.linalg.sparse import to_scipy
@@ -29,7 +28,7 @@ def operators(surface, n, order):
     vertices, faces = surface.mesh(n)
     mask = surface.boundary_mask(vertices)
     yield stencil_of_mesh(vertices, faces, order=order)
-    yield LaplaceBeltrami.from_points(vertices, dim=2, order=order, boundary=mask)
+    yield stencil_of_cloud(vertices, dim=2, order=order, boundary=mask)
 
 
 @pytest.mark.parametrize("surface", [UnitDisk(), Hemisphere()], ids=["disk", "hemisphere"])
@@ -72,9 +71,7 @@ def test_dirichlet_spectrum(surface, order, bound):
     exact = surface.eigenvalues(10, condition="dirichlet")
     for lb in (
         stencil_of_mesh(vertices, faces, order=order, condition="dirichlet"),
-        LaplaceBeltrami.from_points(
-            vertices, dim=2, order=order, boundary=mask, condition="dirichlet"
-        ),
+        stencil_of_cloud(vertices, dim=2, order=order, boundary=mask, condition="dirichlet"),
     ):
         values, abscissa = spectrum(lb, 10)
         assert ((values - exact).abs() / exact).max() <= bound
@@ -104,7 +101,7 @@ def test_a_close_pair_on_a_dirichlet_boundary_is_not_stiff():
     rim = points[mask][0]
     twin = rim + 1e-9 * torch.stack([-rim[1], rim[0], rim[2]])
     points, mask = torch.cat([points, twin[None]]), torch.cat([mask, torch.tensor([True])])
-    lb = LaplaceBeltrami.from_points(points, dim=2, boundary=mask, condition="dirichlet")
+    lb = stencil_of_cloud(points, dim=2, boundary=mask, condition="dirichlet")
     assert lb.certificate.holds
     own = lb.matrix.to_dense().diagonal().abs()
     assert own[mask].max() < 300 * own[~mask].max()
@@ -187,7 +184,7 @@ def test_curved_boundaries(shape, condition, order):
     exact = first_eigenvalue(shape, condition)
     for lb in (
         stencil_of_mesh(vertices, faces, order=order, condition=condition),
-        LaplaceBeltrami.from_points(vertices, order=order, boundary=mask, condition=condition),
+        stencil_of_cloud(vertices, order=order, boundary=mask, condition=condition),
     ):
         assert lb.certificate.holds
         values, abscissa = spectrum(lb, 2)
@@ -213,8 +210,8 @@ def test_conormals_of_disk_and_hemisphere():
 
 def test_boundary_of_a_cloud_is_detected():
     points = UnitDisk().points(700)
-    asked = LaplaceBeltrami.from_points(points, dim=2, boundary="detect")
-    told = LaplaceBeltrami.from_points(points, dim=2, boundary=UnitDisk().boundary_mask(points))
+    asked = stencil_of_cloud(points, dim=2, boundary="detect")
+    told = stencil_of_cloud(points, dim=2, boundary=UnitDisk().boundary_mask(points))
     torch.testing.assert_close(asked.matrix.to_dense(), told.matrix.to_dense())
 
 
@@ -222,14 +219,14 @@ def test_boundary_of_a_cloud_is_detected():
 def test_gaps_between_random_points_are_no_boundary(surface):
     """Asking for the boundary of a closed shape changes nothing."""
     points = surface.random_points(800)
-    asked, told = (LaplaceBeltrami.from_points(points, boundary=b) for b in ("detect", None))
+    asked, told = (stencil_of_cloud(points, boundary=b) for b in ("detect", None))
     assert torch.equal(asked.values, told.values)
 
 
 def test_boundary_of_random_points_is_detected():
     """Of a hemisphere, whose rim no point is on: eigenvalues within 15 %."""
     points = Hemisphere().random_points(800)
-    values = LaplaceBeltrami.from_points(points, boundary="detect").eigenbasis(6).eigenvalues
+    values = stencil_of_cloud(points, boundary="detect").eigenbasis(6).eigenvalues
     exact = Hemisphere().eigenvalues(6)
     assert ((values - exact)[1:] / exact[1:]).abs().max() < 0.15
 
@@ -239,7 +236,7 @@ def test_boundary_of_random_points_is_detected():
 def test_a_boundary_may_be_a_few_points(count, condition):
     points = Sphere().points(300)
     mask = (points - points[0]).norm(dim=1).argsort().argsort() < count
-    lb = LaplaceBeltrami.from_points(points, boundary=mask, condition=condition)
+    lb = stencil_of_cloud(points, boundary=mask, condition=condition)
     assert lb.certificate.holds
 
 
@@ -262,7 +259,7 @@ def test_boundary_can_be_left_alone():
 @pytest.mark.parametrize("bad", ["dirichlet", torch.zeros(3, dtype=torch.bool), torch.zeros(300)])
 def test_bad_boundaries_are_refused(bad):
     with pytest.raises(ValueError, match="boundary"):
-        LaplaceBeltrami.from_points(UnitDisk().points(300), dim=2, boundary=bad)
+        stencil_of_cloud(UnitDisk().points(300), dim=2, boundary=bad)
 
 
 def test_bad_boundary_of_a_mesh_is_refused():

@@ -10,7 +10,7 @@ import pytest
 import torch
 from torch.autograd import gradcheck
 
-from builders import stencil_of_mesh
+from builders import stencil_of_cloud, stencil_of_mesh
 from torchlb import Diffusion, DiffusionError, InputError, LaplaceBeltrami, heat_flow
 from torchlb.linalg.exponential import chebyshev_coefficients, hyperbola
 from torchlb.linalg.spectral_bounds import Bounds
@@ -22,14 +22,14 @@ EXACT = ["deflated", "chebyshev", "contour"]
 every_method = pytest.mark.parametrize("method", METHODS)
 exact_method = pytest.mark.parametrize("method", EXACT)
 BUILDERS = {
-    "points": lambda: LaplaceBeltrami.from_points(Torus().points(300)),
-    "random points": lambda: LaplaceBeltrami.from_points(Torus().random_points(300)),
+    "points": lambda: stencil_of_cloud(Torus().points(300)),
+    "random points": lambda: stencil_of_cloud(Torus().random_points(300)),
     "mesh": lambda: stencil_of_mesh(*Sphere().mesh(300)),
     "boundary": lambda: stencil_of_mesh(*UnitDisk().mesh(300)),
     "cotangent": lambda: LaplaceBeltrami.from_cotangent(*Sphere().mesh(300)),
-    "curve": lambda: LaplaceBeltrami.from_points(Circle().points(300)),
-    "first order": lambda: LaplaceBeltrami.from_points(Torus().random_points(600), order=1),
-    "not certified": lambda: LaplaceBeltrami.from_points(Sphere().points(300), certify=False),
+    "curve": lambda: stencil_of_cloud(Circle().points(300)),
+    "first order": lambda: stencil_of_cloud(Torus().random_points(600), order=1),
+    "not certified": lambda: stencil_of_cloud(Sphere().points(300), certify=False),
 }
 BUILDERS = {name: functools.cache(build) for name, build in BUILDERS.items()}
 KINDS = {name: build for name, build in BUILDERS.items() if name != "first order"}
@@ -48,7 +48,7 @@ def norm(lb, f):
 @pytest.mark.parametrize("sampling", ["points", "random_points"])
 def test_deflated_diffusion_is_the_dense_exponential_at_every_scale(sampling):
     """|y − e^{tL}f| ≤ 1e-6 |f| for t from h²/10 to 10/λ_1, all in one call; what spectral alone loses beside it."""
-    lb = LaplaceBeltrami.from_points(getattr(Sphere(), sampling)(1000))
+    lb = stencil_of_cloud(getattr(Sphere(), sampling)(1000))
     h2, last = float(lb.mass.mean()), 10 / float(lb.eigenbasis(128).eigenvalues[1])
     times = torch.logspace(np.log10(h2 / 10), np.log10(last), 7).double()
     f = rough(1000, 7)
@@ -130,7 +130,7 @@ def test_derivatives_in_the_features_and_in_the_times(name, method):
 
 @exact_method
 def test_derivative_in_every_entry_of_the_features(method):
-    lb = LaplaceBeltrami.from_points(Torus().random_points(30), order=1)
+    lb = stencil_of_cloud(Torus().random_points(30), order=1)
     f = torch.randn(30, 2, dtype=torch.float64, requires_grad=True)
     times = torch.tensor([0.02, 0.5], dtype=torch.float64)
     assert gradcheck(lambda x: heat_flow(lb, x, times, method=method, k=10), f, eps=1e-2, atol=1e-6)
@@ -203,7 +203,7 @@ def test_a_surface_with_slivers_does_not_blow_up():
 
 def test_deflated_diffusion_takes_any_spectral_radius(monkeypatch):
     """Where the series would be too long the contour sum stands in, with the same values and derivatives."""
-    lb = LaplaceBeltrami.from_points(Torus().random_points(500))
+    lb = stencil_of_cloud(Torus().random_points(500))
     f = rough(500)
     results = []
     for products in (5_000, 10):
@@ -267,4 +267,4 @@ def test_what_cannot_work_is_said():
     )
     two = torch.cat([Sphere().points(200), Sphere().points(200) + 5])
     with pytest.raises(DiffusionError, match="ask for another k"):
-        heat_flow(LaplaceBeltrami.from_points(two), rough(400), 1.0, k=1)
+        heat_flow(stencil_of_cloud(two), rough(400), 1.0, k=1)

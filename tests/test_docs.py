@@ -44,7 +44,7 @@ GRID = torch.arange(100).view(10, 10)
 
 
 def unstable():
-    lb = LaplaceBeltrami.from_points(VERTICES, order=1)
+    lb = LaplaceBeltrami.from_points(VERTICES, order=1, weak_form=False)
     fields = {**vars(lb.certificate), "holds": False}
     lb.certificate = torchlb.Certificate(**fields)
     raise ValueError(repr(lb))
@@ -53,7 +53,7 @@ def unstable():
 def mixed_batch():
     shapes = [
         LaplaceBeltrami.from_mesh(VERTICES, FACES, order=1),
-        LaplaceBeltrami.from_points(VERTICES, order=1),
+        LaplaceBeltrami.from_points(VERTICES, order=1, weak_form=False),
     ]
     LaplaceBeltrami.batch(shapes)
 
@@ -88,9 +88,15 @@ TRIGGERS = {
     "… are taken for": lambda: LaplaceBeltrami.from_points(torch.rand(400, 2)),
     "… float32 has": lambda: LaplaceBeltrami.from_points((VERTICES + 1e6).float()),
     "… points are fewer": lambda: LaplaceBeltrami.from_points(VERTICES[:3]),
+    "the cloud is too": lambda: LaplaceBeltrami.from_points(
+        Sphere().points(800) + 0.06 * torch.randn(800, 3, generator=torch.manual_seed(0)).double()
+    ),
+    "all … lie on": lambda: LaplaceBeltrami.from_points(VERTICES[:1] * torch.arange(9.0)[:, None]),
     "num_neighbors:": lambda: LaplaceBeltrami.from_points(VERTICES, num_neighbors=4),
     "NOT STABLE": unstable,
-    "… this operator has": lambda: LaplaceBeltrami.from_points(VERTICES, order=1).stiffness,
+    "… this operator has": lambda: (
+        LaplaceBeltrami.from_points(VERTICES, order=1, weak_form=False).stiffness
+    ),
     "batch: not all": mixed_batch,
     "…: not a mesh": lambda: (
         Path("shape.obj").write_text("nothing"),

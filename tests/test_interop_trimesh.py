@@ -40,6 +40,8 @@ def test_there_and_back():
     assert torch.equal(from_trimesh(back, order=2).values, lb.values)
     assert np.array_equal(back.vertex_attributes["curvature"], lb.mean_curvature_normal().numpy())
     assert back.vertex_attributes["mass"].sum() == pytest.approx(float(lb.mass.sum()))
+    assert np.array_equal(to_trimesh(lb).faces, MESH.faces)
+    lb = LaplaceBeltrami.from_points(MESH.vertices, dim=1, order=1)
     cloud = to_trimesh(lb, mass=lb.mass)
     assert isinstance(cloud, trimesh.PointCloud)
     assert np.array_equal(cloud.vertices, MESH.vertices)

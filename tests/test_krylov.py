@@ -5,6 +5,7 @@ import pytest
 import torch
 from scipy import sparse
 
+from builders import stencil_of_cloud
 from torchlb import LaplaceBeltrami
 from torchlb.linalg.krylov import LowOrder, negative_directions
 from torchlb.stability.certificate import check_certificate
@@ -26,16 +27,16 @@ def unfactored(monkeypatch):
 
 def two_scales():
     points = torch.cat([1e-5 * Sphere().random_points(500), Torus().random_points(400) + 9])
-    return LaplaceBeltrami.from_points(points, order=3)
+    return stencil_of_cloud(points, order=3)
 
 
 def random_cloud():
-    return LaplaceBeltrami.from_points(Sphere().random_points(700))
+    return stencil_of_cloud(Sphere().random_points(700))
 
 
 def two_components():
     points = torch.cat([Sphere().random_points(400), Torus().points(400) + 6])
-    return LaplaceBeltrami.from_points(points, order=2)
+    return stencil_of_cloud(points, order=2)
 
 
 def with_outflow():
@@ -56,8 +57,8 @@ def test_null_vector_and_verdict_are_those_of_the_factors(build, monkeypatch):
 
 
 def test_what_the_factors_refuse_is_refused(monkeypatch):
-    raw = LaplaceBeltrami.from_points(Sphere().random_points(700), order=1, certify=False)
-    step = LaplaceBeltrami.from_points(Sphere().random_points(700), order=1)
+    raw = stencil_of_cloud(Sphere().random_points(700), order=1, certify=False)
+    step = stencil_of_cloud(Sphere().random_points(700), order=1)
     matrix = raw.to_scipy()
     verdicts = [check_certificate(matrix, step.mass)[1]]
     monkeypatch.setattr("torchlb.linalg.krylov.LARGEST_FACTORED", 0)
@@ -70,7 +71,7 @@ def test_what_the_factors_refuse_is_refused(monkeypatch):
 @pytest.mark.usefixtures("unfactored")
 def test_enforcement_ends_at_an_operator_as_good(order):
     points = Torus().random_points(900)
-    lb = LaplaceBeltrami.from_points(points, order=order)
+    lb = stencil_of_cloud(points, order=order)
     assert lb.certificate.holds
     assert lb.certificate.rounds > 0
     assert lb.report.order_counts[order] >= 0.99 * 900
@@ -78,10 +79,10 @@ def test_enforcement_ends_at_an_operator_as_good(order):
     values = torch.linalg.eigvalsh((weighted + weighted.T) / 2)
     assert values.max() <= 1e-10 * values.abs().max()
     exact = Torus().laplacian(smooth_function, points)
-    raw = LaplaceBeltrami.from_points(points, order=order, certify=False)
+    raw = stencil_of_cloud(points, order=order, certify=False)
     error, raw_error = ((op(smooth_function(points)) - exact).norm() for op in (lb, raw))
     assert error <= 1.6 * raw_error
-    again = LaplaceBeltrami.from_points(points, order=order)
+    again = stencil_of_cloud(points, order=order)
     assert torch.equal(again.values, lb.values)
     assert torch.equal(again.mass, lb.mass)
 
@@ -152,7 +153,7 @@ def test_noise_has_the_low_order_matrix_as_covariance():
 
 
 def test_factors_step_in_where_krylov_methods_do_not_converge(monkeypatch):
-    lb = LaplaceBeltrami.from_points(Sphere().random_points(400))
+    lb = stencil_of_cloud(Sphere().random_points(400))
     expected = left_null_vector(lb.to_scipy(), lb.mass)[0]
     monkeypatch.setattr("torchlb.linalg.krylov.LARGEST_FACTORED", 0)
     monkeypatch.setattr("torchlb.linalg.krylov.CYCLES", 1)

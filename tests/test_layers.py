@@ -11,7 +11,7 @@ import torch
 import torch._dynamo.testing
 from torch.utils.data import DataLoader
 
-from builders import stencil_of_mesh
+from builders import stencil_of_cloud, stencil_of_mesh
 from torchlb import (
     Diffusion,
     DiffusionNet,
@@ -60,7 +60,7 @@ def layer_of(name, dtype=torch.float32):
 def shapes(dtype=torch.float32):
     """Eight operators of five kinds and sizes, one smaller than the basis, one of another unit of length."""
     clouds = [Sphere().points(90), Torus().points(150), Torus().random_points(120)]
-    built = [LaplaceBeltrami.from_points(points.to(dtype)) for points in clouds]
+    built = [stencil_of_cloud(points.to(dtype)) for points in clouds]
     for surface in (Sphere(), Ellipsoid(), Torus()):
         vertices, faces = surface.mesh(100)
         built.append(stencil_of_mesh(vertices.to(dtype), faces))
@@ -83,14 +83,14 @@ def features(lb, channels=CHANNELS):
 
 @every_layer
 def test_a_batch_of_eight_shapes_gives_what_they_give_one_by_one(eight, name):
-    """To 1e-6 of the largest value, in float32; gradients of the parameters too."""
+    """To 2e-6 of the largest value, in float32; gradients of the parameters too."""
     layer = layer_of(name)
     x = [features(lb) for lb in eight]
     alone = [layer(f, lb) for f, lb in zip(x, eight, strict=True)]
     expected = torch.stack(alone) if name == "classifier" else torch.cat(alone)
     batch = LaplaceBeltrami.batch(eight)
     together = layer(torch.cat(x), batch)
-    assert (together - expected).abs().max() <= 1e-6 * expected.abs().max()
+    assert (together - expected).abs().max() <= 2e-6 * expected.abs().max()
     parameters = list(layer.parameters())
     ours, theirs = (torch.autograd.grad(y.square().sum(), parameters) for y in (together, expected))
     for a, b in zip(ours, theirs, strict=True):

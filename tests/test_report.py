@@ -6,7 +6,7 @@ import pytest
 import torch
 import trimesh
 
-from builders import stencil_of_mesh
+from builders import stencil_of_cloud, stencil_of_mesh
 from torchlb import LaplaceBeltrami
 from torchlb.fits.rules import reference
 from torchlb.stencils.assemble import Stencils, assemble
@@ -27,7 +27,7 @@ def cube():
 
 @cache
 def sphere():
-    return LaplaceBeltrami.from_points(Sphere().points(500), order=3)
+    return stencil_of_cloud(Sphere().points(500), order=3)
 
 
 def edges_near(vertices):
@@ -87,7 +87,7 @@ def test_half_the_rows_at_low_order_are_named():
     with pytest.warns(
         UserWarning, match=r"% of the points have only low-order rows.*pass its dimension"
     ):
-        LaplaceBeltrami.from_points(torch.randn(300, 3).double(), order=3, certify=False)
+        stencil_of_cloud(torch.randn(300, 3).double(), order=3, certify=False)
     vertices, faces = Sphere().mesh(300)
     noisy = vertices + 0.05 * torch.randn_like(vertices)
     with pytest.warns(UserWarning, match=r"% of the points have only low-order rows.*finer mesh"):
@@ -138,7 +138,7 @@ def test_unresolved_ripples_are_reported():
     """Most points ask for more than order 3 can follow, whatever stencils would pass otherwise."""
     report = stencil_of_mesh(*rippled(), order=3, certify=False).report
     assert report.reason_counts["points do not resolve the surface"] > 1200
-    cloud = LaplaceBeltrami.from_points(rippled()[0], order=3, certify=False).report
+    cloud = stencil_of_cloud(rippled()[0], order=3, certify=False).report
     assert cloud.reason_counts["points do not resolve the surface"] > 100
 
 

@@ -1,4 +1,4 @@
-"""robust_laplacian's rows: the low-order operator that takes any triangle mesh, and clouds (Sharp, Crane 2020)."""
+"""robust_laplacian's rows: the low-order operator that takes any triangle mesh (Sharp, Crane 2020)."""
 
 from __future__ import annotations
 
@@ -26,24 +26,17 @@ SCALES = 1024.0
 
 
 def robust_rows(
-    points: Float[Tensor, "N n"], faces: Int[Tensor, "F 3"] | None
+    points: Float[Tensor, "N n"], faces: Int[Tensor, "F 3"]
 ) -> tuple[sparse.csr_array, Float[Tensor, " N"]]:
-    """Strong-form rows and areas of `robust_laplacian`: the tufted cover of any triangle mesh, or of a cloud, in R³.
+    """Strong-form rows and areas of `robust_laplacian`: the tufted cover of any triangle mesh in R³.
 
     Off-diagonal entries are ≥ 0 and the diagonal is their negative sum: an M-matrix row, stable on its own. First
-    order at best. Units: 1/ℓ² and ℓ². Points in R² are lifted. The areas of a cloud are not to be trusted: of a sphere
-    with 32,000 random points they miss a third.
+    order at best. Units: 1/ℓ² and ℓ². Points in R² are lifted.
     """
     space = np.zeros((len(points), 3))
     space[:, : points.shape[1]] = points.numpy()
-    unit = np.ones(len(points))
-    if faces is None:
-        # Its triangles of a cloud depend on the axes, up to 100 % of a row: these turn with the points.
-        space = _principal_axes(space)
-        weak, mass = robust_laplacian.point_cloud_laplacian(space, MOLLIFY, min(30, len(space) - 1))
-    else:
-        unit = _units(space, mesh_graph(faces, len(space)))
-        weak, mass = robust_laplacian.mesh_laplacian(space / unit[:, None], faces.numpy(), MOLLIFY)
+    unit = _units(space, mesh_graph(faces, len(space)))
+    weak, mass = robust_laplacian.mesh_laplacian(space / unit[:, None], faces.numpy(), MOLLIFY)
     area = cast(np.ndarray, mass.diagonal())
     least = LEAST_AREA * area.mean()
     tiny = np.flatnonzero(area < least)
@@ -75,11 +68,3 @@ def _units(points: np.ndarray, graph: sparse.csr_array) -> np.ndarray:
     longer = total / np.maximum(count, 1) / max(length.mean(), np.finfo(float).tiny)
     power = np.log(np.where(longer > 0, longer, 1.0)) / np.log(SCALES)
     return SCALES ** np.round(power)[component]
-
-
-def _principal_axes(points: np.ndarray) -> np.ndarray:
-    """Coordinates about the mean in the principal axes, whose signs make the third moments positive."""
-    centered = points - points.mean(axis=0)
-    axes = np.linalg.svd(centered, full_matrices=False)[2]
-    turned = centered @ axes.T
-    return np.ascontiguousarray(turned * np.where((turned**3).sum(axis=0) < 0, -1.0, 1.0))

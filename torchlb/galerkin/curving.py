@@ -193,6 +193,12 @@ def _heights(
     return mean, sound
 
 
+def mollified(sides: Float[Tensor, "F 3"]) -> Float[Tensor, "F 3"]:
+    """Lengths of edges, all longer by so much that no triangle is without area."""
+    lack = SLACK * sides.mean() - (sides.sum(1) - 2 * sides.amax(1))
+    return sides + lack.clamp_min(0).max()
+
+
 def _flattened(
     points: Float[Tensor, "N 3"],
     nodes: Nodes,
@@ -206,8 +212,7 @@ def _flattened(
     """
     curved = curved.clone()
     sides = (points[nodes.faces[:, [1, 2, 0]]] - points[nodes.faces]).norm(dim=2)
-    lack = SLACK * sides.mean() - (sides.sum(1) - 2 * sides.amax(1))
-    lengths = sides + lack.clamp_min(0).max()
+    lengths = mollified(sides)
     plane, shape = flat_metric(lengths), triangle(nodes.degree)
     area = area_element(plane)
     curved[nodes.edge[area < FLAT * sides.amax(1).square()].flatten()] = False

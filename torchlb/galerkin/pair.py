@@ -14,7 +14,7 @@ from torch import Tensor
 from torch.nn.functional import pad
 
 from torchlb.galerkin.assembly import assemble, assemble_mass, flat_metric
-from torchlb.galerkin.curving import CurvedMesh, Surface, curve
+from torchlb.galerkin.curving import CurvedMesh, Surface, curve, mollified
 from torchlb.galerkin.elements import segment, triangle
 from torchlb.galerkin.nodes import lagrange_nodes
 from torchlb.galerkin.prolongation import prolongation
@@ -71,43 +71,69 @@ ELEMENTS = {1: (2, (2,)), 2: (2, (2,)), 3: (2, (4, 2)), 4: (3, (4, 2)), 5: (4, (
 
 
 def mesh_pair(
-    points: Float[Tensor, "N n"], faces: Int[Tensor, "F 3"], fits: VertexFits, degree: int
+    points: Float[Tensor, "N n"],
+    faces: Int[Tensor, "F 3"],
+    fits: VertexFits,
+    degree: int,
+    stars: Int[Tensor, "S 3"] | None = None,
 ) -> WeakPair:
-    """The pair of a mesh in the plane or in space, from the fits of its vertices, with elements of degree r."""
+    """The pair of a mesh in the plane or in space, from the fits of its vertices, with elements of degree r.
+
+    A third of the flat triangles `stars` is added.
+    """
     if points.shape[1] == 2:
         points, fits = pad(points, (0, 1)), copy(fits)
         fits.frames, fits.heights = pad(fits.frames, (0, 0, 0, 1)), pad(fits.heights, (0, 1))
     outward = vertex_normals(points, faces)
     normals = normals_of_frames(fits.frames)
     normals = normals * (normals * outward).sum(1, keepdim=True).sign()
-    return weak_pair(Surface(points, fits.frames, normals, fits), faces, degree)
+    return weak_pair(Surface(points, fits.frames, normals, fits), faces, degree, stars)
 
 
-def weak_pair(surface: Surface, faces: Int[Tensor, "F 3"], degree: int) -> WeakPair:
+def weak_pair(
+    surface: Surface,
+    faces: Int[Tensor, "F 3"],
+    degree: int,
+    stars: Int[Tensor, "S 3"] | None = None,
+) -> WeakPair:
     """The pair of a mesh with elements of degree r; r = 1 is the cotangent's, with its full mass.
 
     Symmetric, K1 = 0, K ≥ 0, M > 0 whatever the fits are: rows of P sum to one, and it has full column rank.
     """
     count = len(surface.points)
     mesh = curve(surface, lagrange_nodes(faces, count, max(degree, 2)))
-    flat = flat_metric(mesh.lengths)[:, None]
-    linear = assemble(flat.expand(-1, len(triangle(1).weights), 3), faces, triangle(1), count)
+    linear = _linear(mesh.lengths, faces, count)
+    extra = _star_pair(surface.points, stars) if stars is not None and len(stars) else None
     if degree == 1:
         return WeakPair(_stored(linear), mass=torch.from_numpy(_row_sums(linear)))
     shape, nodes = triangle(degree), mesh.nodes
     p = prolongation(surface, mesh)
     elements = assemble(mesh.metric, nodes.elements, shape, len(mesh.places))
     pair = sparse.csr_array(p.T) @ (elements @ p)
-    weights = _row_sums(elements)
+    mass = positive_mass(p, _row_sums(elements), mesh, linear)
+    if extra is not None:
+        pair, linear, mass = pair + extra, linear + extra, mass + _row_sums(extra)
     rim = None if len(mesh.rim) == 0 else p.T @ (_rim_mass(mesh) @ p)
     ends = nodes.edges.flatten()
     edges = [torch.bincount(e, minlength=count) for e in (ends, nodes.edges[mesh.curved].flatten())]
     return WeakPair(
         _stored(pair, rim),
         _stored(linear),
-        torch.from_numpy(positive_mass(p, weights, mesh, linear)),
+        torch.from_numpy(mass),
         torch.stack([surface.fits.degree, surface.fits.reason, *edges]),
     )
+
+
+def _linear(lengths: Tensor, faces: Tensor, count: int) -> sparse.csr_array:
+    """Linear elements on flat triangles."""
+    flat = flat_metric(lengths)[:, None]
+    return assemble(flat.expand(-1, len(triangle(1).weights), 3), faces, triangle(1), count)
+
+
+def _star_pair(points: Tensor, stars: Int[Tensor, "S 3"]) -> sparse.csr_array:
+    """A third of the linear elements on local stars: each triangle is in those of its three corners."""
+    lengths = (points[stars[:, [1, 2, 0]]] - points[stars]).norm(dim=2)
+    return _linear(mollified(lengths), stars, len(points)) / 3
 
 
 def positive_mass(

@@ -47,6 +47,8 @@ def boundary_faces(faces: Int[Tensor, "F v"]) -> Int[Tensor, "G w"]:
     sides = torch.cat(
         [faces[:, [c for c in range(corners) if c != left]] for left in range(corners)]
     )
+    if len(faces) == 0:
+        return sides
     sides = sides.sort(dim=1).values
     base = int(faces.max()) + 1
     key = sides[:, 0]

@@ -12,24 +12,23 @@ The names, arguments and the 7-tuple are those of the original (github.com/nmwsh
 promise of the original                                "cotangent"    a mesh                 a cloud
 =====================================================  =============  =====================  =====================
 frames (V, 3, 3): rows X, Y, normal, right-handed      kept           kept, order p + 1      kept, order p + 1
-mass (V,) > 0, sums to the area                        kept, Voronoi  kept, curved area      kept, π
-L (V, V) weak, positive semidefinite, rows sum to 0    kept           kept: the stiffness    kept
+mass (V,) > 0, sums to the area                        kept, Voronoi  kept, curved area      kept, curved area
+L (V, V) weak, positive semidefinite, rows sum to 0    kept           kept: the stiffness    kept: the stiffness
 L symmetric                                            kept           kept                   kept
 (L x) / mass is −Δx at a point                         kept           with symmetric=False   with symmetric=False
 evals (k,) ≥ 0, ascending, the first is 0              kept, exactly  kept, exactly          kept, exactly
-evecs (V, k), evecsᵀ M evecs = I, the first constant   kept           kept; M = diag(mass)   kept; not those of L
+evecs (V, k), evecsᵀ M evecs = I, the first constant   kept           kept; M = diag(mass)   kept; M = diag(mass)
 gradX, gradY (V, V): rows sum to 0, components in      kept           kept, order p + 1      kept, order p + 1
 the rows X, Y of the frames
 coalesced COO, type and device of verts                kept           kept                   kept
 =====================================================  =============  =====================  =====================
 
 With ``symmetric=False`` L is −ΠΔ of the certified stencil, L / mass the Laplacian at a point at order p. A cloud has
-½(C + Cᵀ), C = −ΠΔ, by default, for what needs symmetry: solves (M + tL)u = Mf with it are right to 0.5 % on a sphere of
-500 to 2,000 points.
+the stiffness of the surface through it.
 
 What differs on purpose: a float64 shape is not rounded to float32 in the cache; the key holds normals, options and
 version; int32 and int64 faces are one entry; k_eig > V gives V pairs; NaN, vertices without a face and duplicates
-in a cloud are errors that say what to do; normals of a cloud are oriented consistently.
+in a cloud are errors that say what to do; normals of a cloud are those of the surface through it, and face out.
 """
 
 from __future__ import annotations

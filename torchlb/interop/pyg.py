@@ -148,6 +148,8 @@ def _keys(lb: LaplaceBeltrami, k: int) -> dict[str, Any]:
     for name, tensor in (("lb_normals", lb.normals), ("lb_boundary", lb.on_boundary)):
         if len(tensor):
             keys[name] = tensor
+    if len(lb.faces):
+        keys["lb_face_index"] = lb.faces.T.contiguous()
     if lb.has_weak_form:
         matrices = {"weak": (lb.weak_crow, lb.weak_col, lb.weak_values), "linear": lb.linear_pair}
         for name, (crow, col, values) in matrices.items():
@@ -218,6 +220,7 @@ def _buffers(data: Any, sizes: Int[Tensor, " S"]) -> dict[str, Tensor]:
         "frames": data.lb_frames,
         "normals": data.get("lb_normals", points[:0]),
         "on_boundary": data.get("lb_boundary", points.new_zeros(0, dtype=torch.bool)),
+        "faces": data.get("lb_face_index", crow.new_zeros(data.lb_frames.shape[-1] + 1, 0)).T,
     }
 
 

@@ -39,12 +39,12 @@ def from_trimesh(shape: Any, *, operator: Operator = "stencil", **options: Any) 
 
 
 def to_trimesh(lb: LaplaceBeltrami, faces: Any = None, **attributes: Any) -> Any:
-    """The points of an operator as a `trimesh.Trimesh`, or without faces as a `trimesh.PointCloud`.
+    """The points and faces of an operator as a `trimesh.Trimesh`, or without faces as a `trimesh.PointCloud`.
 
     Parameters
     ----------
     lb : of N points in R³.
-    faces : (F, 3), which an operator does not keep.
+    faces : (F, 3), instead of the operator's own.
     **attributes : (N,) or (N, C) data, such as ``curvature=lb.mean_curvature_normal()``, for `vertex_attributes`;
         files such as .ply keep them. A point cloud has no place for them but in `metadata`.
 
@@ -61,7 +61,8 @@ def to_trimesh(lb: LaplaceBeltrami, faces: Any = None, **attributes: Any) -> Any
         if len(array) != lb.num_points:
             raise InputError(f"{name}: expected {lb.num_points} rows, got shape {array.shape}")
     points = _array(lb.points).astype(np.float64)
-    if faces is None:
+    faces = lb.faces if faces is None else faces
+    if len(faces) == 0 or lb.dim != 2:
         return trimesh.PointCloud(points, metadata=arrays)
     mesh = trimesh.Trimesh(points, _array(faces), process=False)
     mesh.vertex_attributes.update(arrays)

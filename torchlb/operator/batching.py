@@ -59,6 +59,7 @@ def join_buffers(shapes: Sequence[Buffers]) -> Buffers:
         joined["col" + suffix] = torch.cat(cols)
     orders = [s["order_t"] + e for s, e in zip(shapes, entries, strict=True)]
     joined["order_t"] = torch.cat(orders)
+    joined["faces"] = torch.cat([s["faces"] + p for s, p in zip(shapes, points, strict=True)])
     return joined | _join_pairs(shapes)
 
 
@@ -98,6 +99,8 @@ def split_buffers(joined: Buffers, sizes: Sequence[int]) -> list[Buffers]:
         by_point = [n for n in joined if n in BY_POINT or n.startswith("report_")]
         shape = {n: joined[n][point] for n in by_point} | {n: joined[n][entry] for n in BY_ENTRY}
         shape["gradient_values"] = joined["gradient_values"][:, entry]
+        own = (joined["faces"] >= start) & (joined["faces"] < start + size)
+        shape["faces"] = joined["faces"][own.all(1)] - start
         for name, shift in (("col", start), ("col_t", start), ("order_t", first)):
             shape[name] = shape[name] - shift
         for name in ("crow", "crow_t"):

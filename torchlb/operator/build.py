@@ -7,6 +7,8 @@ from dataclasses import asdict, dataclass, replace
 from typing import Any, get_args
 
 import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
 from torch.nn.functional import pad
 
 from torchlb.baseline.cotangent import cotangent_laplacian
@@ -16,6 +18,8 @@ from torchlb.galerkin.flips import flipped
 from torchlb.galerkin.pair import ELEMENTS, SparsePair, WeakPair, mesh_pair
 from torchlb.geometry.boundary import boundary_faces
 from torchlb.geometry.frames import Projection
+from torchlb.geometry.surface import CloudSurface, SurfaceSummary, cloud_surface
+from torchlb.geometry.vertex_fits import REASONS, VertexFits
 from torchlb.operator.checks import (
     check_boundary,
     check_dimension,
@@ -25,6 +29,7 @@ from torchlb.operator.checks import (
     check_options,
     check_points,
     check_scale,
+    check_spread,
     mended_faces,
 )
 from torchlb.operator.cleaning import ArrayLike
@@ -33,10 +38,13 @@ from torchlb.stability.enforce import certify
 from torchlb.stencils.assemble import Stencils, assemble
 from torchlb.stencils.conditions import CONDITIONS, Condition, ConditionName
 from torchlb.stencils.rows import Reason, Rows, matrix_rows
-from torchlb.stencils.shape import Shape, cloud_shape, mesh_shape
+from torchlb.stencils.shape import Shape, cloud_shape, mesh_shape, surface_shape
 
 MANY = 0.5
 """Share of low-order rows from which on a warning names them."""
+DOUBTFUL = 0.1
+"""Share of the points that do not resolve the surface of a cloud from which on a warning names them."""
+REMEDY = "do the points lie on a manifold of dimension {}? If not, pass its dimension as `dim`; else add points"
 
 
 @dataclass(frozen=True)
@@ -62,12 +70,17 @@ class Options:
         """The condition at the boundary, as what it does to rows."""
         return None if self.condition is None else CONDITIONS[self.condition]
 
+    @property
+    def elements(self) -> tuple[int, tuple[int, ...]]:
+        """Degree of the elements and degrees of the fits of the weak pair, where there is to be one."""
+        return ELEMENTS[min(self.order, max(ELEMENTS))] if self.weak_form else (0, ())
+
     def settled(self, triangles: bool) -> Options:
         """With the choices that were left open: a pair where there can be one, the certificate where there is none."""
         if self.weak_form and not triangles:
             raise InputError(
-                "weak_form: only triangle meshes in R² and R³ have one; leave it out, and the certificate makes the "
-                "stencil stable instead"
+                "weak_form: only triangle meshes and clouds of surfaces in R² and R³ have one; leave it out, and the "
+                "certificate makes the stencil stable instead"
             )
         weak = triangles if self.weak_form is None else self.weak_form
         return replace(
@@ -99,6 +112,8 @@ class AssembledOperator:
     options: dict[str, Any]
     certificate: Certificate | None
     pair: WeakPair | None
+    faces: Int[Tensor, "F v"]
+    surface: SurfaceSummary | None = None
 
 
 def build_cloud(
@@ -116,7 +131,6 @@ def build_cloud(
     ambient = points.shape[1]
     d = check_dimension(points, dim, hypersurface=normals is not None)
     options.check(len(points), ambient, d)
-    options = options.settled(triangles=False)
     check_distinct(points)
     where = check_boundary(boundary, len(points))
     if where is None and options.condition == "dirichlet":
@@ -128,18 +142,55 @@ def build_cloud(
             raise InputError(f"normals: only hypersurfaces have them, not dim={d} in R^{ambient}")
         normals = check_normals(normals, points)
     progress = progress and sys.stderr.isatty()
-    shape = cloud_shape(
-        points,
-        d,
-        options.q,
-        num_neighbors=options.num_neighbors,
-        normals=normals,
-        boundary=where,
-        condition=options.held,
-        progress=progress,
+    settings = {"num_neighbors": options.num_neighbors, "condition": options.held}
+    settings |= {"normals": normals, "progress": progress}
+    if d == 2 and ambient <= 3 and len(points) > 3:
+        return _build_on_surface(points, options, where, settings)
+    options = options.settled(triangles=False)
+    shape = cloud_shape(points, d, options.q, boundary=where, **settings)
+    return _finished(shape, "points", options, REMEDY.format(d), progress)
+
+
+def _build_on_surface(
+    points: Float[Tensor, "N n"],
+    options: Options,
+    boundary: Bool[Tensor, " N"] | str | None,
+    settings: dict[str, Any],
+) -> AssembledOperator:
+    """Operator on a cloud in R² or R³, by the surface through it."""
+    check_spread(points)
+    ambient, where = points.shape[1], None if isinstance(boundary, str) else boundary
+    space = pad(points, (0, 3 - ambient))
+    surface = cloud_surface(space, normals=settings["normals"], boundary=where)
+    surface = replace(surface, faces=flipped(surface.points, surface.faces))
+    options = options.settled(triangles=len(surface.faces) > 0)
+    degree, degrees = options.elements
+    places = surface.points[:, :ambient]
+    shape = surface_shape(
+        places, surface, options.q, boundary=where, fit_degrees=degrees, **settings
     )
-    remedy = f"do the points lie on a manifold of dimension {d}? If not, pass its dimension as `dim`; else add points"
-    return _finished(shape, "points", options, remedy, progress)
+    pair, fits = None, shape.fits
+    if fits is not None:
+        pair = mesh_pair(places, surface.faces, fits, degree, surface.stars)
+        assert pair.mass is not None
+        shape = replace(shape, areas=pair.mass)
+        _warn_of_doubts(surface, fits)
+    built = _finished(shape, "points", options, REMEDY.format(2), settings["progress"], pair)
+    shape = replace(built.shape, points=points)
+    return replace(built, shape=shape, faces=surface.faces, surface=surface.summary)
+
+
+def _warn_of_doubts(surface: CloudSurface, fits: VertexFits) -> None:
+    """A warning that names points where a cloud does not resolve its surface, if they are many."""
+    doubtful = fits.reason == REASONS.index("points do not resolve the surface")
+    doubtful |= ~torch.isin(torch.arange(len(doubtful)), surface.faces)
+    if float(doubtful.double().mean()) >= DOUBTFUL:
+        index = doubtful.nonzero()[:, 0]
+        names = ", ".join(map(str, index[:8].tolist())) + (", …" if len(index) > 8 else "")
+        warn(
+            f"points: at {len(index)} of {len(doubtful)} the cloud is too coarse or noisy for the surface through it "
+            f"to be trusted ({names}); add points there, or give the mesh if there is one"
+        )
 
 
 def build_mesh(
@@ -155,9 +206,9 @@ def build_mesh(
     check_scale(vertices)
     corners = check_faces(faces, len(vertices))
     options.check(len(vertices), vertices.shape[1], corners.shape[1] - 1)
-    corners = mended_faces(vertices, corners)
+    corners = given = mended_faces(vertices, corners)
     options = options.settled(corners.shape[1] == 3 and vertices.shape[1] <= 3)
-    degree, degrees = ELEMENTS[min(options.order, max(ELEMENTS))] if options.weak_form else (0, ())
+    degree, degrees = options.elements
     if options.weak_form:  # for the stencil, too: who is whose neighbour, and the first normals
         corners = flipped(pad(vertices, (0, 3 - vertices.shape[1])), corners)
     if isinstance(boundary, str) and boundary in CONDITIONS:
@@ -183,7 +234,7 @@ def build_mesh(
         assert pair.mass is not None
         shape = replace(shape, areas=pair.mass)
     remedy = "a finer mesh, or one without noise, has better ones"
-    return _finished(shape, "mesh", options, remedy, progress, pair)
+    return replace(_finished(shape, "mesh", options, remedy, progress, pair), faces=given)
 
 
 def build_cotangent(vertices: ArrayLike, faces: ArrayLike) -> AssembledOperator:
@@ -209,7 +260,7 @@ def build_cotangent(vertices: ArrayLike, faces: ArrayLike) -> AssembledOperator:
         share = torch.zeros_like(mass).index_add(0, rim.flatten(), length.repeat_interleave(2) / 2)
         weak.append(share[row] * diagonal)
     pair = WeakPair(SparsePair(rows.crow, rows.col, torch.stack(weak)))
-    return AssembledOperator(rows, shape, "cotangent", {}, None, pair)
+    return AssembledOperator(rows, shape, "cotangent", {}, None, pair, corners)
 
 
 def _finished(
@@ -247,4 +298,5 @@ def _finished(
             f"{share:.0%} of the points have only low-order rows, of first order at best; at most of them: {reason}. "
             f"{remedy[:1].upper()}{remedy[1:]}; `print(lb.report)` says more"
         )
-    return AssembledOperator(rows, shape, source, asdict(options), certificate, pair)
+    faces = torch.zeros(0, shape.frames.shape[-1] + 1, dtype=torch.int64)
+    return AssembledOperator(rows, shape, source, asdict(options), certificate, pair, faces)

@@ -27,6 +27,8 @@ MAX_EXTENT = 1e70
 """Largest extent of the points, and the inverse of the smallest: fourth powers of it must stay finite."""
 COARSE = 1e-3
 """Step of single precision over the spacing of the points above which Δ is rounding."""
+ON_LINE = 1e-9
+"""Spread of a cloud across its longest direction over that along it, below which it is a line."""
 FLAT = 1e-14
 """Squared sine of the angles of triangles that have no area."""
 
@@ -87,6 +89,15 @@ def check_distinct(points: Float[Tensor, "N n"]) -> None:
             "remove duplicates with points, kept = torchlb.clean_points(points)"
         )
     _warn_of_rounding(points, spacing)
+
+
+def check_spread(points: Float[Tensor, "N n"]) -> None:
+    """InputError for points of a surface that lie on a line."""
+    spread = torch.linalg.svdvals(points - points.mean(0))
+    if spread[1] <= ON_LINE * spread[0]:
+        raise InputError(
+            f"points: all {len(points)} lie on a line, and no surface goes through them; a curve has dim=1"
+        )
 
 
 def _warn_of_rounding(points: Float[Tensor, "N n"], spacing: Float[Tensor, " N"]) -> None:

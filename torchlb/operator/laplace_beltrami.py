@@ -10,6 +10,7 @@ import torch
 from torchlb.errors import InputError, warn
 from torchlb.fits.rules import WeightsName
 from torchlb.geometry.frames import Projection
+from torchlb.geometry.surface import SurfaceSummary
 from torchlb.operator import build
 from torchlb.operator.batching import join_buffers, join_states, split_buffers
 from torchlb.operator.cleaning import ArrayLike, float_type
@@ -38,6 +39,8 @@ class LaplaceBeltrami(StencilFace, WeakFace):
     certificate : what is proved of the stability of Δ; None where it was not asked for, and for the cotangent.
     points : (N, n), ℓ.  frames : (N, n, d), orthonormal tangent vectors.
     normals : (N, n), unit normals of a hypersurface, empty (0, n) otherwise.
+    faces : (F, d + 1), of the mesh, or of the surface through a cloud of points in R³ or R²; empty for other clouds.
+    surface : how the surface through a cloud was found, a `SurfaceSummary`; None where there is none.
     sizes : numbers of points of the shapes of a `batch`; None for a single shape.
     source : "points", "mesh", "cotangent" or "batch".  options : of the constructor, as given.
 
@@ -81,13 +84,15 @@ class LaplaceBeltrami(StencilFace, WeakFace):
         weights : "least_squares" (robust) or "polyharmonic" (far more accurate on evenly spread points).
         num_neighbors : size K of every stencil, itself included, instead of the sizes of the candidates.
         normals : (N, n), if known (d = n − 1): the first guess of the tangent frames, and their orientation.
-        boundary : (N,) mask of the points on the boundary, or "detect" (surfaces); None for a closed shape.
+        boundary : (N,) mask of the points on the boundary. By default, or for "detect", that of the surface through a
+            cloud in R² or R³; elsewhere None is a closed shape, and surfaces alone can "detect" one.
         condition : there: "neumann", ∂_ν f = 0, or "dirichlet", f = 0. With the latter the values of f at boundary
             points are not used elsewhere, and have rows of their own, −4d f/h² with h the distance to the nearest, at
             least a tenth of that to the farthest of the row. None uses no datum. That, and a boundary that is not
             declared, leaves stencils there one-sided; hardly one passes, and the low-order rows in their place have
             ∂_ν f = 0 at first order: Δx at the boundary of a disk is of size 1/h then, not 0.
-        weak_form : whether to build the weak pair (K, M); by default where there can be one: on triangle meshes.
+        weak_form : whether to build the weak pair (K, M); by default where there can be one: on triangle meshes and on
+            clouds of surfaces in R² and R³, by the surface through them (`lb.faces`, `method.md`, section 12).
         certify : whether rows of the stencil are lowered until the certificate of stability holds, whose π is then the
             mass; by default where there is no weak pair. With neither of them the operator may blow up under diffusion.
         progress : whether to show a bar, on a terminal, for what takes longer than two seconds.
@@ -211,6 +216,7 @@ class LaplaceBeltrami(StencilFace, WeakFace):
             "points": points,
             "frames": shape.frames,
             "normals": points[:0] if shape.normals is None else shape.normals,
+            "faces": built.faces,
         }
         fits = None if built.pair is None else built.pair.fits
         fits = rows.length.new_zeros(4, len(points)) if fits is None else fits
@@ -220,7 +226,7 @@ class LaplaceBeltrami(StencilFace, WeakFace):
         if shape.boundary is not None and shape.boundary.mask.any():
             buffers["on_boundary"] = shape.boundary.mask
         lb = cls.from_buffers(buffers, {"source": built.source, "options": built.options})
-        lb.certificate = built.certificate
+        lb.certificate, lb.surface = built.certificate, built.surface
         _ = lb.bounds  # found once, from values that are not yet rounded
         return lb.to(float_type(given))
 
@@ -236,4 +242,4 @@ class LaplaceBeltrami(StencilFace, WeakFace):
 
 
 # A whole module can be read back with torch.load(weights_only=True) where torchlb is imported.
-torch.serialization.add_safe_globals([LaplaceBeltrami, Certificate])
+torch.serialization.add_safe_globals([LaplaceBeltrami, Certificate, SurfaceSummary])

@@ -9,6 +9,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from torchlb.fits.rules import WEIGHT_RULES, reference
+from torchlb.geometry.surface import SurfaceSummary
 from torchlb.geometry.vertex_fits import REASONS
 from torchlb.stencils.rows import Reason
 
@@ -32,6 +33,7 @@ class StencilReport:
     fit_degree : (N,), degree of the fit behind the weak pair; 0 where the surface is left flat.
     fit_reason : (N,), why that is not higher, a place in `REASONS`.
     edges, curved_edges : (N,), number of edges at each vertex, and of those that are curved; zero without a weak pair.
+    surface : what was found of the surface through a cloud; None on a mesh.
     """
 
     requested_order: int
@@ -48,6 +50,7 @@ class StencilReport:
     fit_reason: Int[Tensor, " N"]
     edges: Int[Tensor, " N"]
     curved_edges: Int[Tensor, " N"]
+    surface: SurfaceSummary | None = None
 
     @property
     def curved_share(self) -> float:
@@ -128,4 +131,6 @@ class StencilReport:
             for text, count in zip(REASONS[1:], below[1:], strict=True):
                 if count:
                     lines.append(f"  {text:<39}{count:>8}")
+        if self.surface is not None:
+            lines.append(str(self.surface))
         return "\n".join(lines)

@@ -34,7 +34,8 @@ class StencilFace(OperatorStorage):
         if len(self.report_order) != self.num_points:
             raise InputError("report: PyG's Data do not carry it; it is with the operator as built")
         fields = {name: getattr(self, f"report_{name}") for name in REPORT_FIELDS}
-        return StencilReport(self.options.get("order", 0), self.dim, **fields)
+        order = self.options.get("order", 0)
+        return StencilReport(order, self.dim, **fields, surface=self.surface)
 
     def forward(self, f: Float[Tensor, "*batch N C"] | Float[Tensor, " N"]) -> Tensor:
         """Δf, of the shape of f: (N,), (N, C) or (B, N, C) on one surface. Units of f by 1/ℓ²."""

@@ -13,6 +13,7 @@ from scipy import sparse
 from torch import Tensor, nn
 
 from torchlb.errors import InputError, warn
+from torchlb.geometry.surface import SurfaceSummary
 from torchlb.linalg.sparse import to_scipy, transpose_pattern
 from torchlb.linalg.spectral_bounds import Bounds, spectral_bounds
 from torchlb.spectral.eigenbasis import Eigenbasis
@@ -45,6 +46,7 @@ class OperatorStorage(nn.Module):
     Attributes are those of `LaplaceBeltrami`; the transpose's pattern and, unless asked for, the basis are left out of
     `state_dict`. ``weak_crow``, ``weak_col``, ``weak_values`` (2, nnz) are stiffness and mass matrix on one pattern,
     (3, nnz) with the mass matrix of the boundary; ``linear_…`` those of linear elements, empty where they are the same.
+    ``faces`` are those of the mesh, or of the surface through a cloud; ``surface`` says how that was found.
     """
 
     crow: Tensor
@@ -56,6 +58,7 @@ class OperatorStorage(nn.Module):
     frames: Tensor
     normals: Tensor
     on_boundary: Tensor
+    faces: Tensor
     weak_crow: Tensor
     weak_col: Tensor
     weak_values: Tensor
@@ -77,12 +80,14 @@ class OperatorStorage(nn.Module):
         self.source = "empty"
         self.options: dict[str, Any] = {}
         self.certificate: Certificate | None = None
+        self.surface: SurfaceSummary | None = None
         self._sizes: list[Tensor] | None = None
         self.parts: list[dict[str, Any]] | None = None  # the extra states of the shapes of a batch
         self._bounds: Tensor | None = None
         for name in BUFFERS:
             self.register_buffer(name, torch.zeros(0))
         self.register_buffer("on_boundary", torch.zeros(0, dtype=torch.bool))
+        self.register_buffer("faces", torch.zeros(0, 3, dtype=torch.int64))
         self.crow, self.col = torch.zeros(1, dtype=torch.int64), torch.zeros(0, dtype=torch.int64)
         for name, tensor in no_pairs(torch.zeros(0)).items():
             self.register_buffer(name, tensor)
@@ -269,7 +274,7 @@ class OperatorStorage(nn.Module):
             )
 
     def get_extra_state(self) -> dict[str, Any]:
-        """Source, options, certificate and spectral bounds, plain types only."""
+        """Source, options, certificate, spectral bounds and what is known of the surface, plain types only."""
         return {
             "source": self.source,
             "options": self.options,
@@ -277,12 +282,15 @@ class OperatorStorage(nn.Module):
             "sizes": None if self.sizes is None else list(self.sizes),
             "bounds": None if self._bounds is None else list(self.spectral_bounds),
             "parts": self.parts,
+            "surface": None if self.surface is None else asdict(self.surface),
         }
 
     def set_extra_state(self, state: dict[str, Any]) -> None:
         """Inverse of `get_extra_state`; what is left out is not known."""
         self.source, self.options = state["source"], dict(state["options"])
         found, sizes, bounds = (state.get(key) for key in ("certificate", "sizes", "bounds"))
+        surface = state.get("surface")
+        self.surface = None if surface is None else SurfaceSummary(**surface)
         self.certificate = None if found is None else Certificate(**found)
         self.sizes, self.parts = None if sizes is None else tuple(sizes), state.get("parts")
         self.set_bounds(bounds and Bounds(*bounds))
@@ -314,7 +322,8 @@ class OperatorStorage(nn.Module):
             stored = f"{prefix}basis_{name}" in state_dict
             self.register_buffer(f"basis_{name}", self.values.new_zeros(0), persistent=stored)
         self._bounds = None
-        for name, tensor in no_pairs(torch.zeros(0)).items():  # as in a state of an older torchlb
+        missing = {"faces": torch.zeros(0, 3, dtype=torch.int64)} | no_pairs(torch.zeros(0))
+        for name, tensor in missing.items():  # as in a state of an older torchlb
             state_dict.setdefault(prefix + name, tensor)
         for name, buffer in self.tensors.items():
             incoming = state_dict.get(prefix + name)

@@ -15,8 +15,8 @@ from torchlb.spectral.pencil import pencil_eigenbasis
 from torchlb.stencils.conditions import CONDITIONS
 
 NO_PAIR = (
-    "{}: this operator has no weak pair (weak_form=False, or no triangle mesh); build it from a triangle mesh, "
-    "or use the stencil, lb.matrix"
+    "{}: this operator has no weak pair (weak_form=False, or no surface in R² or R³); build it from a triangle mesh "
+    "or the points of a surface, or use the stencil, lb.matrix"
 )
 
 
@@ -25,7 +25,7 @@ class WeakFace(OperatorStorage):
 
     @property
     def has_weak_form(self) -> bool:
-        """Whether there is a weak pair: on triangle meshes, unless built with weak_form=False."""
+        """Whether there is a weak pair: on triangle meshes and clouds of surfaces, but for weak_form=False."""
         return self.weak_crow.shape[0] > 0
 
     @property

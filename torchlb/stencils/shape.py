@@ -27,6 +27,7 @@ from torchlb.geometry.orientation import (
     orient_normals,
     thin_sides,
 )
+from torchlb.geometry.surface import CloudSurface
 from torchlb.geometry.vertex_fits import VertexFits, fit_size
 from torchlb.stencils.conditions import Condition, Neumann
 from torchlb.stencils.low_order import CloudLowOrder, MeshLowOrder
@@ -51,6 +52,7 @@ class Shape:
     low_order : M-matrix rows for points without a stencil; None if there are none to be had.
     boundary : its points and conormals; None for a closed shape, or where no condition holds.
     condition : what holds there.
+    on_mesh : whether the triangles are given, and know the surface where points do not resolve it.
     fits : of functions at each vertex, where a weak pair is to be made from them.
     """
 
@@ -63,12 +65,8 @@ class Shape:
     low_order: CloudLowOrder | MeshLowOrder | None
     boundary: Boundary | None
     condition: Condition
+    on_mesh: bool = False
     fits: VertexFits | None = None
-
-    @property
-    def on_mesh(self) -> bool:
-        """Whether triangles know the surface where points do not resolve it."""
-        return isinstance(self.low_order, MeshLowOrder)
 
 
 def cloud_shape(
@@ -101,7 +99,7 @@ def cloud_shape(
     frames = balls.frames
     mask = detect_boundary(points, frames, balls) if isinstance(boundary, str) else boundary
     edge = None if mask is None else boundary_of_cloud(points, mask, frames, normal_order)
-    low_order = CloudLowOrder(balls, edge, surface=dim == 2 and points.shape[1] <= 3)
+    low_order = CloudLowOrder(balls, edge)
     return _oriented(balls, normals, order, low_order.areas(), low_order, edge, condition)
 
 
@@ -141,13 +139,48 @@ def mesh_shape(
     low_order = None
     if areas is None:
         triangles = faces.shape[1] == 3 and vertices.shape[1] <= 3
-        low_order = (
-            MeshLowOrder(vertices, faces)
-            if triangles
-            else CloudLowOrder(balls, edge, surface=False)
-        )
+        low_order = MeshLowOrder(vertices, faces) if triangles else CloudLowOrder(balls, edge)
         areas = low_order.areas()
     shape = _oriented(balls, reference, order, areas, low_order, edge, condition)
+    fits = None if fits is None else fits.complete(start)
+    return replace(shape, on_mesh=isinstance(low_order, MeshLowOrder), fits=fits)
+
+
+def surface_shape(
+    points: Float[Tensor, "N n"],
+    surface: CloudSurface,
+    normal_order: int,
+    *,
+    num_neighbors: int | None = None,
+    normals: Float[Tensor, "N 3"] | None = None,
+    boundary: Bool[Tensor, " N"] | None = None,
+    condition: Condition | None = NEUMANN,
+    fit_degrees: tuple[int, ...] = (),
+    progress: bool = True,
+) -> Shape:
+    """A cloud in R² or R³ with a surface through it, whose triangles and normals it starts from.
+
+    The boundary is that of the surface, but for points at local stars; or the mask `boundary`.
+    """
+    flat = points.shape[1] == 2
+    triangles = torch.cat([surface.faces, surface.stars])
+    initial = mesh_frames(points, triangles) if flat else surface.frames
+    sides = None
+    if not flat:
+        candidates = nearest_neighbors(points, min(CANDIDATES[2], len(points)))
+        sides = thin_sides(points, surface.normals, nearest_pairs(candidates))
+    start = GraphBalls(points, mesh_graph(triangles, len(points)), initial, sides)
+    fits = VertexFits(start, fit_degrees) if fit_degrees else None
+    balls, order = _refined(start, normal_order, num_neighbors, progress, fits)
+    edge = boundary_of_mesh(points, surface.faces, balls.frames, normal_order)
+    if edge is not None and len(surface.stars):
+        edge = _part(edge, edge.mask & ~torch.isin(torch.arange(len(points)), surface.stars))
+    found = torch.zeros(len(points), dtype=torch.bool) if edge is None else edge.mask
+    if boundary is not None and not torch.equal(boundary, found):
+        edge = boundary_of_cloud(points, boundary, balls.frames, normal_order)
+    low_order = MeshLowOrder(points, triangles)
+    reference = None if flat else surface.normals if normals is None else normals
+    shape = _oriented(balls, reference, order, low_order.areas(), low_order, edge, condition)
     return replace(shape, fits=None if fits is None else fits.complete(start))
 
 

@@ -1,0 +1,189 @@
+"""A surface through a cloud: a manifold that faces out, with its own boundary; noise; and the weak pair on it."""
+
+from functools import cache
+
+import numpy as np
+import pytest
+import torch
+
+from builders import stencil_of_cloud
+from torchlb import InputError, LaplaceBeltrami
+from torchlb.geometry.manifold import boundary_loops, edges_of, with_single_fans, wound_alike
+from torchlb.geometry.surface import cloud_surface
+from torchlb.surfaces import Ellipsoid, Hemisphere, Sphere, StarShaped, Torus, UnitDisk
+
+CLOSED = {"sphere": Sphere(), "torus": Torus(), "ellipsoid": Ellipsoid(), "star": StarShaped()}
+
+
+@cache
+def cloud(name, kind, count=1500):
+    return getattr(CLOSED[name], kind)(count)
+
+
+@pytest.mark.parametrize("kind", ["points", "random_points"])
+@pytest.mark.parametrize("name", CLOSED)
+def test_closed_shapes_get_closed_surfaces(name, kind):
+    """V − E + F = 2 − 2g, every edge has two faces that run along it in opposite directions, all points are reached."""
+    points = cloud(name, kind)
+    surface = cloud_surface(points)
+    faces = surface.faces.numpy()
+    edges = edges_of(faces, len(points))
+    assert (edges.uses == 2).all()
+    assert len(np.unique(faces)) == len(points)
+    assert len(points) - len(edges.keys) + len(faces) == (0 if name == "torus" else 2)
+    one, two = edges.twins
+    assert (edges.ends[0][one] == edges.ends[1][two]).all()
+    assert len(surface.stars) == 0
+    assert surface.summary.components == 1
+    assert surface.summary.noise == 0
+    assert ((surface.normals * CLOSED[name].normals(points)).sum(1) > 0.9).all()
+
+
+@pytest.mark.parametrize("kind", ["points", "random_points"])
+@pytest.mark.parametrize("name", ["sphere", "torus"])
+def test_eigenvalues_and_area_of_the_pair_of_a_cloud(name, kind):
+    """λ_1 to λ_15 within 1e-3 (even: 1e-4) of those of a fine mesh, and better than the certified stencil's."""
+    shape, points = CLOSED[name], cloud(name, kind)
+    exact = LaplaceBeltrami.from_mesh(*shape.mesh(4000), order=5).eigenbasis(16).eigenvalues[1:]
+    lb = LaplaceBeltrami.from_points(points)
+    assert lb.has_weak_form
+    assert lb.certificate is None
+
+    def error(operator):
+        return float((operator.eigenbasis(16).eigenvalues[1:] / exact - 1).abs().max())
+
+    assert error(lb) < (1e-4 if kind == "points" else 1e-3)
+    assert error(lb) < error(stencil_of_cloud(points))
+    assert float(lb.mass.sum()) == pytest.approx(shape.area, rel=1e-3)
+
+
+@pytest.mark.parametrize("shape", [Hemisphere(), UnitDisk()])
+def test_a_boundary_stays_and_has_its_condition(shape):
+    """Undeclared, declared or to be detected: the same points; Neumann eigenvalues within 1e-3, Dirichlet's too."""
+    points = shape.points(1000)
+    options = {} if points.shape[1] == 3 else {"dim": 2}
+    mask = shape.boundary_mask(points)
+    for boundary in (None, "detect", mask):
+        lb = LaplaceBeltrami.from_points(points, boundary=boundary, **options)
+        assert torch.equal(lb.boundary, mask)
+        values = lb.eigenbasis(8).eigenvalues
+        assert (values[1:] / shape.eigenvalues(8)[1:] - 1).abs().max() < 1e-3
+        assert float(lb.mass.sum()) == pytest.approx(shape.area, rel=1e-3)
+    held = LaplaceBeltrami.from_points(points, boundary=mask, condition="dirichlet", **options)
+    exact = shape.eigenvalues(6, "dirichlet")
+    assert (held.eigenbasis(6).eigenvalues / exact - 1).abs().max() < 1e-3
+
+
+def test_a_hole_is_left_open_and_gaps_are_not():
+    """A cap of radius 0.6 is missing of a random sphere: one loop, all around it."""
+    points = Sphere().random_points(2000)
+    points = points[points[:, 2] < np.cos(0.6)]
+    surface = cloud_surface(points)
+    (loop,) = boundary_loops(surface.faces.numpy(), len(points))
+    assert (points[loop, 2] > np.cos(0.8)).all()
+    area = 2 * np.pi * (1 + np.cos(0.6))
+    assert float(LaplaceBeltrami.from_points(points).mass.sum()) == pytest.approx(area, rel=0.02)
+
+
+def test_a_band_with_one_side_stays_one_band():
+    """Möbius: one component, one boundary loop, Euler characteristic 0, and a seam that no turning of faces removes."""
+    u = torch.linspace(0, 2 * torch.pi, 61)[:-1].double().repeat_interleave(9)
+    v = torch.linspace(-0.3, 0.3, 9).double().repeat(60)
+    ring = 1 + v * (u / 2).cos()
+    points = torch.stack([ring * u.cos(), ring * u.sin(), v * (u / 2).sin()], 1)
+    surface = cloud_surface(points)
+    faces = surface.faces.numpy()
+    edges = edges_of(faces, len(points))
+    assert surface.summary.components == surface.summary.boundary_loops == 1
+    assert len(points) - len(edges.keys) + len(faces) == 0
+    assert wound_alike(points.numpy(), faces)[1].any()
+
+
+def test_spheres_apart_stay_apart_and_an_outlier_is_joined():
+    points = Sphere().points(600)
+    two = torch.cat([points, points + torch.tensor([2.4, 0.0, 0.0])])
+    assert cloud_surface(two).summary.components == 2
+    far = torch.cat([points, torch.tensor([[2.0, 0.0, 0.0]]).double()])
+    lb = LaplaceBeltrami.from_points(far)
+    assert lb.surface.components == 1
+    assert lb.surface.reached == 600
+    assert (lb.mass > 0).all()
+    assert "600 of 601 points" in str(lb.report)
+    values = lb.eigenbasis(6).eigenvalues
+    assert values[1] > 0
+
+
+@pytest.mark.parametrize("name", ["sphere", "torus"])
+def test_noise_is_seen_and_smoothed(name):
+    """10 % of the spacing: σ within a factor of 1.5, eigenvalues 1 to 8 within 1 %, the area too; points stay."""
+    shape, points = CLOSED[name], cloud(name, "points")
+    share = 0.1 * float((shape.area / len(points)) ** 0.5)
+    noise = torch.randn(points.shape, generator=torch.Generator().manual_seed(1)).double()
+    noisy = points + share * noise
+    lb = LaplaceBeltrami.from_points(noisy)
+    assert share / 1.5 < lb.surface.noise < 1.5 * share
+    assert torch.equal(lb.points, noisy)
+    exact = LaplaceBeltrami.from_points(points).eigenbasis(9).eigenvalues[1:]
+    assert (lb.eigenbasis(9).eigenvalues[1:] / exact - 1).abs().max() < 0.01
+    assert float(lb.mass.sum()) == pytest.approx(shape.area, rel=0.01)
+
+
+def test_half_the_spacing_of_noise_is_named():
+    points = cloud("sphere", "points")
+    noise = torch.randn(points.shape, generator=torch.Generator().manual_seed(1)).double()
+    with pytest.warns(UserWarning, match=r"too coarse or noisy .* \(\d+, "):
+        lb = LaplaceBeltrami.from_points(points + 0.05 * noise)
+    assert (lb.mass > 0).all()
+    stiffness, mass = (m.to_dense() for m in (lb.stiffness, lb.mass_matrix))
+    assert torch.equal(stiffness, stiffness.mT)
+    assert torch.linalg.eigvalsh(mass)[0] > 0
+
+
+def test_faces_are_there_and_travel():
+    """Of the surface through a cloud, of a mesh as given; through batches and states."""
+    points = cloud("torus", "random_points")
+    lb = LaplaceBeltrami.from_points(points)
+    vertices, faces = Sphere().mesh(200)
+    mesh = LaplaceBeltrami.from_mesh(vertices, faces)
+    assert torch.equal(mesh.faces, faces)
+    assert mesh.surface is None
+    batch = LaplaceBeltrami.batch([lb, mesh])
+    assert torch.equal(batch.faces, torch.cat([lb.faces, faces + len(points)]))
+    first, second = batch.unbatch()
+    assert torch.equal(first.faces, lb.faces)
+    assert first.surface == lb.surface
+    assert torch.equal(second.faces, faces)
+    other = LaplaceBeltrami()
+    other.load_state_dict(lb.state_dict())
+    assert torch.equal(other.faces, lb.faces)
+    assert other.surface == lb.surface
+
+
+def test_the_surface_turns_with_the_points_and_follows_the_unit():
+    points = cloud("star", "random_points")
+    turn = torch.linalg.qr(torch.randn(3, 3, generator=torch.Generator().manual_seed(2)).double())[
+        0
+    ]
+    turn = turn * turn.det()
+
+    def corners(surface):
+        return {tuple(sorted(face)) for face in surface.faces.tolist()}
+
+    plain = corners(cloud_surface(points))
+    assert corners(cloud_surface(1024 * points @ turn.T)) == plain
+
+
+def test_coplanar_points_and_those_on_a_line():
+    side = torch.linspace(0, 1, 20).double()
+    flat = torch.nn.functional.pad(torch.cartesian_prod(side, side), (0, 1))
+    lb = LaplaceBeltrami.from_points(flat @ torch.linalg.qr(torch.randn(3, 3).double())[0])
+    assert float(lb.mass.sum()) == pytest.approx(1.0)
+    assert lb.eigenbasis(3).eigenvalues[1:] == pytest.approx(np.pi**2, rel=1e-3)
+    with pytest.raises(InputError, match="on a line"):
+        LaplaceBeltrami.from_points(flat[:20])
+
+
+def test_a_fan_for_each_point():
+    """Two triangles that touch in a point are two fans; the larger one stays."""
+    faces = np.array([[0, 1, 2], [0, 2, 3], [0, 3, 1], [0, 4, 5]])
+    assert with_single_fans(faces, 6).tolist() == faces[:3].tolist()

@@ -1,0 +1,245 @@
+"""Gaps of a triangulated cloud: filled from their rims, closed where they are small, and points that were left out.
+
+A real boundary stays: no triangle is taken whose circumcircle is larger than the reach of its corners.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from torchlb.geometry.cocone import FOLD, TILTED, TINY, Cloud, wings
+from torchlb.geometry.manifold import Edges, Faces, boundary_loops, edges_of
+
+ALIGNED = 0.3
+"""Least cosine between the normal of a triangle in a gap and those of its corners."""
+OVERLAP = 0.05
+"""Sine of the angle by which triangles at a point may overlap, seen along its normal."""
+WIDTH = 2.0
+"""Loops no wider than this many reaches are closed."""
+BESIDE = 13
+"""Nearest points at whose faces a point that was left out looks for one to stand on."""
+
+
+def filled(
+    cloud: Cloud,
+    faces: Faces,
+    pool: Faces,
+    rim: Bool[np.ndarray, " N"],
+    *,
+    oriented: bool,
+    strict: bool,
+) -> Faces:
+    """The faces and those of the pool, or ears between two rim edges, that extend them without folds or overlaps.
+
+    Best first, in rounds, until nothing fits. `rim` marks declared boundary points, three of which make no triangle.
+    If `oriented`, the faces and normals agree on which way is out, and triangles have to agree with them. If not
+    `strict` they may face away from the normals by nearly a right angle, and overlap what they share no edge with.
+    """
+    count = len(cloud.points)
+    edges = edges_of(faces, count)
+    outer = np.ones(count, dtype=bool)  # not inside: only there can anything be added
+    outer[faces.ravel()] = False
+    for end in edges.ends:
+        outer[end[edges.rim]] = True
+    near = outer[faces].any(1)
+    inner, around = faces[~near], faces[near]
+    while True:
+        edges = edges_of(around, count)
+        half = edges.rim[outer[edges.ends[0][edges.rim]] & outer[edges.ends[1][edges.rim]]]
+        free = outer.copy()
+        free[around.ravel()] = False
+        for end in edges.ends:
+            free[end[half]] = True
+        pool = pool[free[pool].all(1)]
+        ears = _ears(edges, half)
+        candidates = np.concatenate([pool, ears[~rim[ears].all(1)]])
+        new = _proposals(cloud, edges, half, candidates, oriented, ALIGNED if strict else TILTED)
+        new = new[~overlapping(cloud, new, around)] if strict else new
+        if len(new) == 0:
+            return np.concatenate([inner, around])
+        best = np.full(count, len(new))
+        np.minimum.at(best, new.ravel(), np.arange(len(new)).repeat(3))
+        chosen = (best[new] == np.arange(len(new))[:, None]).all(1)
+        around = np.concatenate([around, new[chosen]])
+
+
+def _ears(edges: Edges, half: Int[np.ndarray, " G"]) -> Faces:
+    """Triangles of two edges of the rim that meet in a point where no others do."""
+    tail, head = (end[half] for end in edges.ends)
+    here, there = np.concatenate([tail, head]), np.concatenate([head, tail])
+    order = np.argsort(here, kind="stable")
+    here, there = here[order], there[order]
+    _, first, uses = np.unique(here, return_index=True, return_counts=True)
+    first = first[uses == 2]
+    return np.stack([there[first], here[first], there[first + 1]], 1)
+
+
+def _proposals(
+    cloud: Cloud,
+    edges: Edges,
+    half: Int[np.ndarray, " G"],
+    faces: Faces,
+    oriented: bool,
+    least: float,
+) -> Faces:
+    """Those of the faces that fit to the rim's half-edges without a fold or third face, and aligned; best first."""
+    faces = np.unique(np.sort(faces, axis=1), axis=0)
+    tail, head = np.roll(faces, -1, 1), np.roll(faces, -2, 1)
+    edge, uses = edges.find(tail, head)
+    ok = (uses <= 1).all(1) & (uses == 1).any(1)
+    faces, tail, head, edge, uses = faces[ok], tail[ok], head[ok], edge[ok], uses[ok]
+    of, starts, stops = edges.of[half], edges.ends[0][half], edges.ends[1][half]
+    first = np.full(len(edges.keys), -1)
+    first[of] = starts
+    against = np.where(uses == 1, np.where(first[edge] == head, 1, -1), 0)  # 1: runs the other way
+    plus, minus = (against >= 0).all(1), (against <= 0).all(1)
+    radius, normal = cloud.circles(faces)
+    cosine = (normal[:, None] * cloud.normals[faces]).sum(-1)
+    if oriented:
+        alignment = np.where(plus, cosine.min(1), np.where(minus, (-cosine).min(1), -1.0))
+    else:
+        alignment = np.abs(cosine).min(1)
+    wing = np.zeros((len(edges.keys), 3))
+    wing[of] = wings(cloud.points, starts, stops, edges.faces.ravel()[half])
+    folds = (wing[edge] * wings(cloud.points, tail, head, faces)).sum(-1) > FOLD
+    ok = alignment > least
+    ok &= radius <= cloud.reach[faces].min(1)
+    ok &= ~((uses == 1) & folds).any(1)
+    faces = np.where(plus.reshape(-1, 1), faces, faces[:, ::-1])[ok]
+    cost = radius[ok] / alignment[ok] ** 2
+    return faces[np.argsort(cost, kind="stable")]
+
+
+def overlapping(cloud: Cloud, new: Faces, faces: Faces, corners: int = 3) -> Bool[np.ndarray, " T"]:
+    """Which new triangles overlap a face at one of their first corners, seen along the normal there."""
+    count = len(cloud.points)
+    rows, places = np.nonzero(np.isin(faces, new[:, :corners]))
+    point = faces[rows, places]
+    order = np.argsort(point, kind="stable")
+    rows, places = rows[order], places[order]
+    number = np.bincount(point, minlength=count)
+    start = np.cumsum(number) - number
+    theirs = _wedges(cloud, faces[rows], places)
+    result = np.zeros(len(new), dtype=bool)
+    for k in range(corners):
+        ours = _wedges(cloud, new, np.full(len(new), k))
+        uses = number[new[:, k]]
+        i = np.arange(len(new)).repeat(uses)
+        j = _ranges(uses) + start[new[:, k]].repeat(uses)
+        a, b = (np.stack([x[i] for x in ours], 1), np.stack([x[j] for x in theirs], 1))
+        result[i[_meet(a, b) | _meet(b, a)]] = True
+    return result
+
+
+def _ranges(sizes: Int[np.ndarray, " n"]) -> Int[np.ndarray, " total"]:
+    """0, 1, …, size − 1 for each size in turn."""
+    return np.arange(sizes.sum()) - (np.cumsum(sizes) - sizes).repeat(sizes)
+
+
+def _wedges(
+    cloud: Cloud, faces: Faces, corner: Int[np.ndarray, " T"]
+) -> tuple[Float[np.ndarray, "T 3"], ...]:
+    """Unit vectors in the tangent plane of a corner: both sides of the face, its middle, and the normal of the turn."""
+    rows = np.arange(len(faces))
+    apex = faces[rows, corner]
+    normal = cloud.normals[apex]
+    sides = []
+    for turn in (1, 2):
+        side = cloud.points[faces[rows, (corner + turn) % 3]] - cloud.points[apex]
+        side = side - (side * normal).sum(1, keepdims=True) * normal
+        sides.append(side / np.maximum(np.linalg.norm(side, axis=1, keepdims=True), TINY))
+    middle = sides[0] + sides[1]
+    middle /= np.maximum(np.linalg.norm(middle, axis=1, keepdims=True), TINY)
+    turn = np.sign((np.cross(sides[0], sides[1]) * normal).sum(1, keepdims=True)) * normal
+    return sides[0], sides[1], middle, turn
+
+
+def _meet(one: Float[np.ndarray, "P 4 3"], two: Float[np.ndarray, "P 4 3"]) -> np.ndarray:
+    """Whether a side or the middle of wedge one lies inside of wedge two."""
+    first, second, turn = two[:, None, 0], two[:, None, 1], two[:, None, 3]
+    rays = one[:, :3]
+    after = (np.cross(first, rays) * turn).sum(-1) > OVERLAP
+    before = (np.cross(rays, second) * turn).sum(-1) > OVERLAP
+    return (after & before).any(1)
+
+
+def closed(
+    cloud: Cloud, faces: Faces, rim: Bool[np.ndarray, " N"], kept: Bool[np.ndarray, " N"]
+) -> tuple[Faces, list[list[int]]]:
+    """The faces with narrow boundary loops closed, ear by ear; and the points of the loops that were.
+
+    Loops stay that have two neighbouring points in the declared boundary `rim`, or one in `kept`.
+    """
+    count = len(cloud.points)
+    edges = edges_of(faces, count)
+    known, new, done = set(edges.keys.tolist()), [faces], []
+    for loop in boundary_loops(faces, count):
+        wide = WIDTH * cloud.reach[loop].mean()
+        places = cloud.points[loop]
+        declared = rim[loop] & rim[np.roll(loop, 1)]
+        if declared.any() or kept[loop].any() or np.ptp(places, axis=0).max() > wide:
+            continue
+        if max(np.linalg.norm(places - place, axis=1).max() for place in places) > wide:
+            continue
+        ears = _clipped(cloud, loop, known)
+        if ears is not None:
+            done.append(loop)
+            new.append(np.array(ears))
+    return np.concatenate(new), done
+
+
+def _clipped(cloud: Cloud, loop: list[int], known: set[int]) -> list[list[int]] | None:
+    """Triangles that close a loop, the best ear first; None where that would use an edge a third time."""
+    count, loop, ears = len(cloud.points), list(loop), []
+    own: set[int] = set()
+    while len(loop) > 3:
+        size = len(loop)
+        turn = np.array([[loop[k - 1], loop[k], loop[(k + 1) % size]] for k in range(size)])
+        radius, normal = cloud.circles(turn)
+        alignment = np.abs((normal[:, None] * cloud.normals[turn]).sum(-1)).mean(1)
+        cost = radius / np.maximum(alignment, OVERLAP) ** 2
+        a, c = turn[:, 0], turn[:, 2]
+        keys = np.minimum(a, c) * count + np.maximum(a, c)
+        cost[[key in known or key in own for key in keys.tolist()]] = np.inf
+        best = int(cost.argmin())
+        if not np.isfinite(cost[best]):
+            return None
+        ears.append(turn[best].tolist())
+        own.add(int(keys[best]))
+        del loop[best]
+    known |= own
+    return [*ears, loop]
+
+
+def with_left_points(cloud: Cloud, faces: Faces) -> Faces:
+    """The faces, with each point in none of them put into the one that it stands over, if there is one."""
+    count = len(cloud.points)
+    while True:
+        outside = np.ones(count, dtype=bool)
+        outside[faces.ravel()] = False
+        left = np.flatnonzero(outside)
+        corner = np.argsort(faces.ravel(), kind="stable")
+        number = np.bincount(faces.ravel(), minlength=count)
+        start = np.cumsum(number) - number
+        near = cloud.neighbors[left, 1:BESIDE]
+        uses = number[near]
+        row = np.arange(len(left)).repeat(uses.sum(1))
+        under = corner[_ranges(uses.ravel()) + start[near].ravel().repeat(uses.ravel())] // 3
+        points, triangle = left[row], faces[under]
+        radius, normal = cloud.circles(triangle)
+        corners = cloud.points[triangle] - cloud.points[points, None]
+        height = np.abs((corners[:, 0] * normal).sum(1))
+        shares = [
+            (np.cross(corners[:, k - 2], corners[:, k - 1]) * normal).sum(1) for k in range(3)
+        ]
+        aligned = np.abs((normal * cloud.normals[points]).sum(1)) > ALIGNED
+        over = np.flatnonzero((np.min(shares, axis=0) > 0) & aligned & (height < radius))
+        over = over[np.argsort(height[over], kind="stable")]
+        over = over[np.unique(points[over], return_index=True)[1]]
+        over = over[np.unique(under[over], return_index=True)[1]]
+        if len(over) == 0:
+            return faces
+        point, triangle = points[over], triangle[over]
+        parts = [np.stack([triangle[:, k - 1], triangle[:, k], point], 1) for k in range(3)]
+        faces = np.concatenate([np.delete(faces, under[over], 0), *parts])

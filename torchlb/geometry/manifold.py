@@ -1,0 +1,218 @@
+"""Which triangles meet where: edges, fans, patches, boundary loops, and which way round triangles are wound.
+
+Half-edge 3f + k is the side of face f opposite its corner k; it runs from corner k + 1 to corner k + 2.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+from scipy import sparse
+from scipy.sparse import csgraph
+
+Faces = Int[np.ndarray, "_ 3"]
+LEAST_VOLUME = 1e-3
+"""Over area^{3/2}: patches with less under them are taken for flat."""
+CLOSED = 1000
+"""A closed fan comes before an open one of up to so many triangles."""
+
+
+@dataclass(frozen=True)
+class Edges:
+    """The edges of triangles on `count` points.
+
+    Attributes
+    ----------
+    keys : (E,), low · count + high of the two ends, ascending.
+    of : (3F,), number of the edge that each half-edge lies on.
+    uses : (E,), how many faces meet there.
+    """
+
+    faces: Faces
+    count: int
+    keys: Int[np.ndarray, " E"]
+    of: Int[np.ndarray, " three_F"]
+    uses: Int[np.ndarray, " E"]
+
+    @cached_property
+    def ends(self) -> tuple[Int[np.ndarray, " three_F"], Int[np.ndarray, " three_F"]]:
+        """First and last point of every half-edge."""
+        return np.roll(self.faces, -1, 1).ravel(), np.roll(self.faces, -2, 1).ravel()
+
+    @cached_property
+    def rim(self) -> Int[np.ndarray, " G"]:
+        """Half-edges of edges that have one face."""
+        return np.flatnonzero(self.uses[self.of] == 1)
+
+    @cached_property
+    def twins(self) -> tuple[Int[np.ndarray, " T"], Int[np.ndarray, " T"]]:
+        """The two half-edges of every edge that has two faces."""
+        order = self.of.argsort(kind="stable")
+        first = (np.cumsum(self.uses) - self.uses)[self.uses == 2]
+        return order[first], order[first + 1]
+
+    def find(
+        self, tail: np.ndarray, head: np.ndarray
+    ) -> tuple[Int[np.ndarray, "*batch"], Int[np.ndarray, "*batch"]]:
+        """(number of the edge between two points, how many faces it has; 0 if there is no such edge)."""
+        key = np.minimum(tail, head) * self.count + np.maximum(tail, head)
+        place = np.searchsorted(self.keys, key)
+        place[place == len(self.keys)] = 0
+        there = self.keys[place] == key if len(self.keys) else np.zeros(key.shape, dtype=bool)
+        return place, np.where(there, self.uses[place] if len(self.uses) else 0, 0)
+
+
+def edges_of(faces: Faces, count: int) -> Edges:
+    """The edges of triangles.
+
+    >>> edges_of(np.array([[0, 1, 2], [1, 3, 2]]), 4).uses.tolist()
+    [1, 1, 2, 1, 1]
+    """
+    tail, head = np.roll(faces, -1, 1).ravel(), np.roll(faces, -2, 1).ravel()
+    key = np.minimum(tail, head) * count + np.maximum(tail, head)
+    keys, of, uses = np.unique(key, return_inverse=True, return_counts=True)
+    return Edges(faces, count, keys, of.ravel(), uses)
+
+
+def components(i: np.ndarray, j: np.ndarray, count: int) -> Int[np.ndarray, " count"]:
+    """Number of the connected component of each of `count` nodes joined by the pairs (i, j)."""
+    graph = sparse.coo_array((np.ones(len(i), dtype=np.int8), (i, j)), shape=(count, count))
+    return csgraph.connected_components(graph, directed=False)[1]
+
+
+def patches(faces: Faces, count: int) -> Int[np.ndarray, " F"]:
+    """Number of the patch of each face: faces that hang together by edges of two faces."""
+    one, two = edges_of(faces, count).twins
+    return components(one // 3, two // 3, len(faces))
+
+
+def without_specks(faces: Faces, count: int, least: int) -> Faces:
+    """The faces of patches that have at least so many."""
+    patch = patches(faces, count)
+    return faces[np.bincount(patch)[patch] >= least] if len(faces) else faces
+
+
+def with_single_fans(faces: Faces, count: int) -> Faces:
+    """Faces are left out until those around each point are one fan: the closed one, or else the largest.
+
+    >>> with_single_fans(np.array([[0, 1, 2], [0, 2, 3], [0, 4, 5]]), 6).tolist()
+    [[0, 1, 2], [0, 2, 3]]
+    """
+    while len(faces):
+        one, two = edges_of(faces, count).twins
+        corner = faces.ravel()
+        left, right = [], []
+        for turn in (1, 2):  # the corners of both faces at the same end of their edge
+            mine = one - one % 3 + (one + turn) % 3
+            near, far = (two - two % 3 + (two + other) % 3 for other in (1, 2))
+            left.append(mine)
+            right.append(np.where(corner[near] == corner[mine], near, far))
+        joined = np.concatenate(left)
+        fan = components(joined, np.concatenate(right), 3 * len(faces))
+        size = np.bincount(fan)
+        closed = np.bincount(fan[joined], minlength=len(size)) == size
+        point = np.zeros_like(size)
+        point[fan] = corner
+        order = np.lexsort((size + CLOSED * closed, point))
+        best = np.zeros(len(size), dtype=bool)
+        best[order[np.append(np.diff(point[order]) > 0, True)]] = True
+        keep = best[fan].reshape(-1, 3).all(1)
+        if keep.all():
+            break
+        faces = faces[keep]
+    return faces
+
+
+def face_vectors(points: Float[np.ndarray, "N 3"], faces: Faces) -> Float[np.ndarray, "F 3"]:
+    """Normals of the faces, as long as their areas, ℓ²."""
+    a, b, c = (points[faces[:, k]] for k in range(3))
+    return np.cross(b - a, c - a) / 2
+
+
+def wound_alike(
+    points: Float[np.ndarray, "N 3"], faces: Faces
+) -> tuple[Faces, Bool[np.ndarray, " F"]]:
+    """The faces turned so that neighbours agree, carried along the flattest edges; and which lie at a seam.
+
+    At a seam two neighbours still disagree: the surface has one side only, or a wrong triangle makes it seem so.
+    """
+    edges = edges_of(faces, len(points))
+    one, two = edges.twins
+    against = edges.ends[0][one] == edges.ends[0][two]
+    normals = face_vectors(points, faces)
+    length = np.linalg.norm(normals, axis=1, keepdims=True)
+    normals = normals / np.maximum(length, np.finfo(float).tiny)
+    i, j, size = one // 3, two // 3, len(faces)
+    bend = 1.001 - (normals[i] * normals[j]).sum(1) * np.where(against, -1, 1)
+    order = np.argsort(bend, kind="stable")
+    _, first = np.unique(i[order] * size + j[order], return_index=True)  # two may share two edges
+    ends = i[order[first]], j[order[first]]
+    ranks = sparse.csr_array((first + 1.0, ends), shape=(size, size))
+    number = order[csgraph.minimum_spanning_tree(ranks).data.astype(np.int64) - 1]
+    a, b, turned = i[number], j[number], against[number]
+    ends = (
+        np.concatenate([a, a + size]),
+        np.concatenate([np.where(turned, b + size, b), np.where(turned, b, b + size)]),
+    )
+    own, other = components(*ends, 2 * size).reshape(2, size)
+    flip = own > other
+    seam = against ^ flip[i] ^ flip[j]
+    at_seam = np.zeros(size, dtype=bool)
+    at_seam[i[seam]] = at_seam[j[seam]] = True
+    return np.where(flip[:, None], faces[:, ::-1], faces), at_seam
+
+
+def facing_out(points: Float[np.ndarray, "N 3"], faces: Faces) -> Faces:
+    """The faces of every patch turned to have volume under it, seen from the middle of its rim; flat ones up."""
+    edges, patch = edges_of(faces, len(points)), patches(faces, len(points))
+    count = int(patch.max(initial=-1)) + 1
+    normals, middle = face_vectors(points, faces), points[faces].mean(1)
+    area = np.linalg.norm(normals, axis=1)
+    rim = edges.rim
+    on_rim = (points[edges.ends[0][rim]] + points[edges.ends[1][rim]]) / 2
+    open_ = np.bincount(patch[rim // 3], minlength=count)
+    totals = np.stack([np.bincount(patch, area * x, count) for x in middle.T], 1)
+    rims = np.stack([np.bincount(patch[rim // 3], x, count) for x in on_rim.T], 1)
+    mean = totals / np.maximum(np.bincount(patch, area, count), np.finfo(float).tiny)[:, None]
+    center = np.where((open_ > 0)[:, None], rims / np.maximum(open_, 1)[:, None], mean)
+    volume = np.bincount(patch, ((middle - center[patch]) * normals).sum(1), count)
+    up = np.bincount(patch, normals[:, 2], count)
+    hollow = np.abs(volume) > LEAST_VOLUME * np.bincount(patch, area, count) ** 1.5
+    inward = np.where(hollow, volume, up) < 0
+    return np.where(inward[patch, None], faces[:, ::-1], faces)
+
+
+def boundary_loops(faces: Faces, count: int) -> list[list[int]]:
+    """The points of every boundary loop in turn, each walked round from face to face.
+
+    >>> [sorted(loop) for loop in boundary_loops(np.array([[0, 1, 2], [1, 3, 2]]), 4)]
+    [[0, 1, 2, 3]]
+    """
+    edges = edges_of(faces, count)
+    mate = np.full(3 * len(faces), -1)
+    one, two = edges.twins
+    mate[one], mate[two] = two, one
+    tail, head = edges.ends
+    found, seen = [], set()
+    for start in edges.rim.tolist():
+        if start in seen:
+            continue
+        half, at, loop = start, int(head[start]), [int(tail[start])]
+        while half not in seen:
+            seen.add(half)
+            while True:  # the other side of the face at this point, until nothing lies beyond
+                face = half - half % 3
+                half = face + next(
+                    k for k in range(3) if face + k != half and faces[face // 3, k] != at
+                )
+                if mate[half] < 0:
+                    break
+                half = int(mate[half])
+            if half not in seen:
+                loop.append(at)
+                at = int(head[half] if tail[half] == at else tail[half])
+        found.append(loop)
+    return found
