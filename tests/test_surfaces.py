@@ -1,17 +1,19 @@
 """The analytic surfaces are what they claim: points on them, meshes, derivatives and spectra."""
 
+import itertools
 import math
 from functools import cache
 
 import numpy as np
 import pytest
 import torch
+import trimesh
 from scipy.spatial import KDTree
 from scipy.special import ellipeinc, ellipkinc, sph_harm_y
 from torch.func import hessian, jacfwd, vmap
 
 from tolerances import TOLERANCE
-from torchlb import surfaces
+from torchlb import InputError, surfaces
 from torchlb.surfaces import (
     Circle,
     CliffordTorus,
@@ -24,6 +26,7 @@ from torchlb.surfaces import (
     Torus,
     UnitDisk,
     deserno_points,
+    limit_surface,
     smooth_function,
     spherical_harmonic,
 )
@@ -473,3 +476,33 @@ def test_duplicates_and_not_a_number_are_errors_that_name_the_points():
 
 def test_public_names_exist():
     assert all(hasattr(surfaces, name) for name in surfaces.__all__)
+
+
+def test_levels_of_a_limit_surface_are_nested_and_watertight():
+    vertices, faces = Ellipsoid().mesh(150)
+    points, meshes = limit_surface(vertices, faces, 3)
+    assert torch.equal(meshes[0], faces)
+    for level, mesh in enumerate(meshes):
+        count = int(mesh.max()) + 1
+        assert count == 2 + 148 * 4**level
+        assert len(mesh) == 2 * count - 4
+        coarser, _ = limit_surface(vertices, faces, level)  # the same surface at every level
+        torch.testing.assert_close(points[:count], coarser, rtol=0, atol=1e-14)
+        assert trimesh.Trimesh(coarser.numpy(), mesh.numpy(), process=False).is_watertight
+
+
+def test_normals_of_a_limit_surface_converge():
+    """Angles between the triangles at an edge halve from level to level: no crease is left."""
+    points, meshes = limit_surface(*Ellipsoid().mesh(150), 4)
+    angles = []
+    for mesh in meshes[1:]:
+        shape = trimesh.Trimesh(points.numpy()[: int(mesh.max()) + 1], mesh.numpy(), process=False)
+        angles.append(shape.face_adjacency_angles.mean())
+    for coarse, fine in itertools.pairwise(angles):
+        assert fine == pytest.approx(coarse / 2, rel=0.1)
+
+
+def test_a_limit_surface_is_that_of_a_closed_mesh():
+    vertices, faces = UnitDisk().mesh(100)
+    with pytest.raises(InputError, match=r"expected a closed mesh, got \d+ edges"):
+        limit_surface(vertices, faces, 1)

@@ -1,10 +1,11 @@
-"""Analytic manifolds with exact answers: points, meshes, derivatives and spectra to compare with.
+"""Manifolds to compare on: analytic ones with exact points, derivatives and spectra, and smooth ones of real shapes.
 
 `base`: a manifold from a retraction and a chart. `shapes`: spheres, tori, curves and others, with what is known of them
-in closed form.
+in closed form. `limit`: smooth surfaces of real shapes, by subdivision.
 """
 
 from torchlb.surfaces.base import Surface
+from torchlb.surfaces.limit import limit_surface
 from torchlb.surfaces.shapes import (
     Circle,
     CliffordTorus,
@@ -34,6 +35,7 @@ __all__ = [
     "Torus",
     "UnitDisk",
     "deserno_points",
+    "limit_surface",
     "smooth_function",
     "spherical_harmonic",
 ]

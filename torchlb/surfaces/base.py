@@ -20,7 +20,6 @@ from typing import ClassVar
 import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
-from scipy.integrate import cumulative_trapezoid
 from scipy.spatial import KDTree
 from torch import Tensor
 from torch.func import jvp
@@ -138,6 +137,8 @@ class Surface:
     def _stratified(self, shares: Float[Tensor, "N 1"]) -> Points:
         """Points of a curve, by fractions of its length."""
         grid = torch.linspace(0, 1, 4097, dtype=torch.float64)[:, None]
+        from scipy.integrate import cumulative_trapezoid
+
         length = cumulative_trapezoid(self._density(grid).numpy(), initial=0)
         cube = np.interp(shares[:, 0].numpy() * length[-1], length, grid[:, 0].numpy())
         return self._chart(torch.from_numpy(cube)[:, None])
