@@ -113,6 +113,62 @@ def test_spheres_apart_stay_apart_and_an_outlier_is_joined():
     assert values[1] > 0
 
 
+@pytest.mark.parametrize("size", [20, 24, 30])
+def test_rings_far_apart_are_one_tube(size):
+    """A capsule by rings up to six spacings apart: closed, of its area but for the chords, facing out."""
+    axis = torch.tensor([0.0, 0.0, 1.0]).double()
+
+    def ring(radius, height, twist=0.0):
+        angle = 2 * torch.pi * torch.arange(size).double() / size + twist
+        flat = torch.stack([angle.cos(), angle.sin(), torch.zeros_like(angle)], 1)
+        return radius * flat + height * axis
+
+    rings = [ring(1, height, 0.3 * k) for k, height in enumerate(np.linspace(0, 8, 7))]
+    for end, side in ((0.0, -1.0), (8.0, 1.0)):
+        for tilt in (0.4, 0.8, 1.2):
+            rings.append(ring(np.cos(tilt), end + side * np.sin(tilt)))
+        rings.append(((end + side) * axis)[None])
+    points = torch.cat(rings)
+    surface = cloud_surface(points)
+    edges = edges_of(surface.faces.numpy(), len(points))
+    assert (edges.uses == 2).all()
+    assert len(points) - len(edges.keys) + len(surface.faces) == 2
+    assert surface.summary.contacts == 0
+    out = points - points[:, 2:].clamp(0, 8) * axis
+    assert ((surface.normals * out).sum(1) > 0.9).all()
+    a, b, c = points[surface.faces].unbind(1)
+    area = float(torch.linalg.cross(b - a, c - a).norm(dim=1).sum() / 2)
+    assert area == pytest.approx(2 * np.pi * 8 + 4 * np.pi, rel=0.02)
+
+
+def test_walls_of_cavities_face_into_them():
+    """Four spheres, three of them one in the other: normals out of the solid, so the second has them inward."""
+    sphere, shift = Sphere(), torch.tensor([3.0, 0.0, 0.0]).double()
+    points = torch.cat([sphere.points(1500), 0.6 * sphere.points(700), 0.3 * sphere.points(300)])
+    points = torch.cat([points, 0.2 * sphere.points(200) + shift])
+    away = points - shift * (torch.arange(2700) >= 2500)[:, None]
+    side = ((cloud_surface(points).normals * away).sum(1) > 0).long()
+    assert [sorted(set(part.tolist())) for part in side.split([1500, 700, 300, 200])] == [
+        [1],
+        [0],
+        [1],
+        [1],
+    ]
+
+
+def test_where_sheets_touch_is_said():
+    """Two spheres a third of a spacing apart: one component, and a place between them; the same in a warning."""
+    points = Sphere().points(1000)
+    gap = torch.tensor([2.0 + 0.33 * (4 * np.pi / 1000) ** 0.5, 0.0, 0.0]).double()
+    pair = torch.cat([points, points + gap]) @ torch.linalg.qr(torch.eye(3).double())[0]
+    summary = cloud_surface(pair).summary
+    assert summary.components == 1
+    assert summary.contacts > 0
+    assert torch.tensor(summary.places[0]).numpy() == pytest.approx(pair.mean(0).numpy(), abs=0.1)
+    assert "nearest to one of another sheet" in str(summary)
+    assert cloud_surface(points).summary.contacts == 0
+
+
 @pytest.mark.parametrize("name", ["sphere", "torus"])
 def test_noise_is_seen_and_smoothed(name):
     """10 % of the spacing: σ within a factor of 1.5, eigenvalues 1 to 8 within 1 %, the area too; points stay."""

@@ -108,11 +108,11 @@ def _height_residual(
     `basis` spans the polynomials, times √ω. The scatter is per degree of freedom, so their number does not matter.
     """
     weighted = root[..., None] * heights
-    left = weighted - basis @ (basis.mT @ weighted)
+    left = (weighted - basis @ (basis.mT @ weighted)).flatten(1)
     freedom = max(basis.shape[1] - basis.shape[2], 1) / basis.shape[1]
-    square = coords.square().sum(-1) + heights.square().sum(-1)
+    square = coords.norm(dim=-1).square() + heights.norm(dim=-1).square()
     distance = (root.square() * square).sum(1)
-    return (left.square().sum((1, 2)) / freedom / distance).sqrt()
+    return left.norm(dim=1) / (freedom * distance).sqrt()
 
 
 def _scaled_system(

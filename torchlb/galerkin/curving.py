@@ -14,6 +14,7 @@ from torchlb.galerkin.assembly import area_element, flat_metric, metric
 from torchlb.galerkin.elements import EDGES, lattice, triangle
 from torchlb.galerkin.nodes import Nodes
 from torchlb.galerkin.rim import RimCurves, rim_curves
+from torchlb.geometry.vectors import dot
 from torchlb.geometry.vertex_fits import VertexFits
 
 NEWTON_STEPS = 4
@@ -85,9 +86,9 @@ def curve(surface: Surface, nodes: Nodes) -> CurvedMesh:
     rim = (nodes.uses == 1).nonzero()[:, 0]
     degree = max(int(fits.degree.max()), 2)
     curves = rim_curves(points, nodes.edges[rim], degree + 2 + degree % 2)
-    flat = (nodes.shares[..., None] * points[nodes.corners]).sum(1)
+    flat = torch.einsum("xv,xvn->xn", nodes.shares, points[nodes.corners])
     start = flat + _rim_displacement(points, nodes, rim, curves)
-    along = normalize((nodes.shares[..., None] * surface.normals[nodes.corners]).sum(1))
+    along = normalize(torch.einsum("xv,xvn->xn", nodes.shares, surface.normals[nodes.corners]))
     ends = node_ends(nodes)
     height, sound = _heights(surface, nodes, ends, start, along)
     outside = torch.zeros(len(nodes.faces), dtype=torch.bool)
@@ -179,9 +180,9 @@ def _heights(
     for _ in range(NEWTON_STEPS):
         p = offset + t[:, None] * direction
         y = (p[:, None] @ frame)[:, 0] / radius
-        value = (p * normal).sum(1) - (monomials(y, top) * heights).sum(1)
-        slope = (monomial_derivatives(y, top) * heights[..., None]).sum(1)
-        t = t - value / ((direction * normal).sum(1) - (slope * turn).sum(1))
+        value = dot(p, normal) - dot(monomials(y, top), heights)
+        slope = torch.einsum("vmd,vm->vd", monomial_derivatives(y, top), heights)
+        t = t - value / (dot(direction, normal) - dot(slope, turn))
     t = torch.where(t.isfinite() & (fits.degree[vertex] > 0), t, torch.inf)
     size = _sizes(surface.points, nodes)
     least = torch.full_like(size, torch.inf).scatter_reduce(0, ends.node, t, "amin")

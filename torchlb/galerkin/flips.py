@@ -11,6 +11,7 @@ from torch import Tensor
 
 from torchlb.galerkin.elements import EDGES
 from torchlb.geometry.frames import vertex_normals
+from torchlb.geometry.vectors import dot
 
 ALIGNED = 0.5
 """Least cosine between a triangle's normal and those of its vertices."""
@@ -50,7 +51,7 @@ def _scores(vertices: Tensor, normals: Tensor, faces: Tensor) -> tuple[Tensor, T
     normal = torch.linalg.cross(sides[..., 0, :], sides[..., 1, :])
     twice = normal.norm(dim=-1, keepdim=True)
     unit = normal / twice.clamp_min(torch.finfo(normal.dtype).tiny)
-    alignment = (unit[..., None, :] * normals[faces]).sum(-1).amin(-1)
+    alignment = dot(unit[..., None, :], normals[faces]).amin(-1)
     return alignment, 2 * 3**0.5 * twice[..., 0] / sides.square().sum((-1, -2))
 
 

@@ -7,6 +7,7 @@ tetrahedra beside it, comes close to the tangent planes of its corners: leaves t
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 import torch
@@ -20,6 +21,7 @@ from torchlb.fits.weights import window
 from torchlb.geometry.frames import complete_frames
 from torchlb.geometry.manifold import Faces, edges_of
 from torchlb.geometry.neighbors import admissible
+from torchlb.geometry.vectors import dot
 
 COCONE = np.sin(np.pi / 8)
 """Sine of the half-angle between a tangent plane and the double cone that a dual edge has to leave."""
@@ -27,6 +29,12 @@ FOLD = 0.5
 """Cosine of the least angle between two triangles at an edge."""
 TILTED = 0.1
 """Least cosine between the normal of a triangle and those of its corners: walls between two rims have none."""
+LONG = 1.4
+"""A Voronoi cell that reaches so many times as far as along the normal has another one."""
+FAR = 1e6
+"""Extents of the cloud at which its outer Voronoi cells end."""
+FLAT = 1e-10
+"""Tetrahedra of less volume, over the cube of their longest side, have no circumcentre to speak of; triangles alike."""
 RIDGE = 1e-13
 TINY = np.finfo(float).tiny
 
@@ -40,90 +48,156 @@ class Cloud:
     points : (N, 3), ℓ.
     normals : (N, 3), unit.
     neighbors : (N, K), nearest points, itself first.
-    reach : (N,), ℓ: the largest circumradius of a triangle at each point.
+    reach : (N,), ℓ: the largest circumradius of a triangle at each point; half of it if all corners are on the rim.
+    rim : (N,), points of a declared boundary.
     """
 
     points: Float[np.ndarray, "N 3"]
     normals: Float[np.ndarray, "N 3"]
     neighbors: Int[np.ndarray, "N K"]
     reach: Float[np.ndarray, " N"]
+    rim: Bool[np.ndarray, " N"]
 
     def circles(self, faces: Faces) -> tuple[Float[np.ndarray, " F"], Float[np.ndarray, "F 3"]]:
         """Circumradii, ℓ, and unit normals of triangles."""
         corners = self.points[faces]
         sides = corners[:, [1, 2, 0]] - corners
         normal = np.cross(sides[:, 0], -sides[:, 2])
-        twice = np.maximum(np.linalg.norm(normal, axis=1), TINY)
-        lengths = np.linalg.norm(sides, axis=2).prod(1)
-        return lengths / (2 * twice), normal / twice[:, None]
+        lengths = np.linalg.norm(sides, axis=2)
+        twice = np.linalg.norm(normal, axis=1)
+        twice = np.maximum(twice, FLAT * lengths.max(1) ** 2)
+        return lengths.prod(1) / (2 * twice), normal / twice[:, None]
+
+    def limits(self, faces: Faces) -> Float[np.ndarray, " F"]:
+        """Their largest circumradii, ℓ."""
+        return self.reach[faces].min(1) / np.where(self.rim[faces].all(1), 2, 1)
 
     def small(self, faces: Faces) -> Faces:
         """Those within the reach of all their corners."""
-        return faces[self.circles(faces)[0] <= self.reach[faces].min(1)]
+        return faces[self.circles(faces)[0] <= self.limits(faces)]
 
 
 def refined_normals(
     points: Float[Tensor, "N 3"],
-    frames: Float[Tensor, "N 3 2"],
+    normals: Float[Tensor, "N 3"],
     candidates: Int[Tensor, "N K"],
-    rounds: int = 2,
+    centers: Int[Tensor, " B"] | None = None,
+    rounds: int = 1,
 ) -> Float[Tensor, "N 3"]:
-    """Unit normals from quadratics through the admissible candidates, error O(h²); not oriented.
+    """Unit normals, those of `centers` from quadratics through their admissible candidates, error O(h²); not oriented.
 
     The quadratics need not go through the point itself, which lessens what noise does to the slope.
     """
-    offset = points[candidates] - points[:, None]
+    centers = torch.arange(len(points)) if centers is None else centers
+    index = candidates[centers]
+    pairs = centers.repeat_interleave(index.shape[1]), index.flatten()
+    offset = points[index] - points[centers, None]
     distance = offset.norm(dim=-1)
-    centers = torch.arange(len(points)).repeat_interleave(candidates.shape[1])
-    normals = torch.linalg.cross(*frames.unbind(-1))
     unit = torch.eye(6, dtype=points.dtype)
     for _ in range(rounds):
-        good = admissible(points, frames, centers, candidates.flatten(), normals)
-        good = good.view(candidates.shape)
+        own, frames = normals[centers], complete_frames(normals[centers])
+        good = admissible(points, normals, *pairs).view(index.shape)
         good[:, 0] = True
         reach = (distance * good).amax(1, keepdim=True).clamp_min(TINY)
         weight = window((distance / reach).clamp_max(1.1)) * good
         terms = monomials(offset @ frames / reach[..., None], 2)
         terms = torch.cat([torch.ones_like(terms[..., :1]), terms], -1) * weight[..., None]
-        heights = weight * (offset * normals[:, None]).sum(-1) / reach
+        heights = weight * dot(offset, own[:, None]) / reach
         square = terms.mT @ terms
         square += RIDGE * square.diagonal(dim1=-2, dim2=-1).sum(-1)[:, None, None] * unit
         slope = torch.linalg.solve(square, terms.mT @ heights[..., None])[:, 1:3]
-        found = normalize(normals - (frames @ slope)[..., 0])
+        found = normalize(own - (frames @ slope)[..., 0])
         sound = (good.sum(1) > 7) & (slope[..., 0].norm(dim=1) < 1)
-        normals = torch.where(sound[:, None], found, normals)
-        frames = complete_frames(normals)
+        normals = normals.index_put((centers[sound],), found[sound])
     return normals
 
 
-def delaunay_triangles(cloud: Cloud) -> tuple[Faces, Faces]:
-    """(triangles of the surface, best first; all small triangles) of the Delaunay tetrahedra."""
-    points = cloud.points
-    delaunay = Delaunay(points)
-    cells, beyond = delaunay.simplices.astype(np.int64), delaunay.neighbors
-    centers = _circumcenters(points, cells)
-    faces, first, second, apex = [], [], [], []
-    for k in range(4):  # each triangle once
-        own = np.flatnonzero(beyond[:, k] < np.arange(len(cells)))
-        faces.append(np.delete(cells[own], k, 1))
-        first.append(own)
-        second.append(beyond[own, k])
-        apex.append(cells[own, k])
-    triangles, here, there = np.concatenate(faces), np.concatenate(first), np.concatenate(second)
-    radius, normal = cloud.circles(triangles)
-    kept = radius <= cloud.reach[triangles].min(1)
-    triangles, here, there, radius = triangles[kept], here[kept], there[kept], radius[kept]
-    normal, tip = normal[kept], points[np.concatenate(apex)[kept]]
-    away = np.sign(((points[triangles[:, 0]] - tip) * normal).sum(1))[:, None] * normal
-    far = 1e6 * np.ptp(points, axis=0).max() * away
-    ends = centers[here], np.where((there < 0)[:, None], centers[here] + far, centers[there])
-    near = np.ones(len(triangles), dtype=bool)
-    for corner in triangles.T:
-        near &= _leaves_cone(points[corner], cloud.normals[corner], ends)
-    alignment = np.abs((normal[:, None] * cloud.normals[triangles]).sum(-1)).min(1)
-    surface = np.flatnonzero(near & (alignment > TILTED))
-    cost = radius / np.maximum(alignment, TILTED) ** 2
-    return triangles[surface[np.argsort(cost[surface], kind="stable")]], triangles
+@dataclass(frozen=True)
+class Tetrahedra:
+    """Delaunay tetrahedra of a cloud; their circumcentres are the corners of its Voronoi cells.
+
+    Attributes
+    ----------
+    cells : (T, 4).
+    centers : (T, 3), ℓ, of the circumscribed spheres.
+    triangles : (F, 3), each once.
+    ends : centers of the spheres on its two sides, (F, 3) each; beyond the convex hull a point far away.
+    """
+
+    points: Float[np.ndarray, "N 3"]
+    cells: Int[np.ndarray, "T 4"]
+    centers: Float[np.ndarray, "T 3"]
+    triangles: Faces
+    ends: tuple[Float[np.ndarray, "F 3"], Float[np.ndarray, "F 3"]]
+    hull: Bool[np.ndarray, " F"]
+
+    @classmethod
+    def of(cls, points: Float[np.ndarray, "N 3"]) -> Tetrahedra:
+        """Those of a cloud that lies in no plane."""
+        delaunay = Delaunay(points)
+        cells, beyond = delaunay.simplices.astype(np.int64), delaunay.neighbors
+        centers = _circumcenters(points, cells)
+        faces, here, there, apex = [], [], [], []
+        for k in range(4):
+            own = np.flatnonzero(beyond[:, k] < np.arange(len(cells)))
+            faces.append(np.delete(cells[own], k, 1))
+            here.append(own)
+            there.append(beyond[own, k])
+            apex.append(cells[own, k])
+        triangles, first, second = (
+            np.concatenate(faces),
+            np.concatenate(here),
+            np.concatenate(there),
+        )
+        hull = second < 0
+        ends = centers[first], centers[second]
+        outer = triangles[hull]
+        normal = np.cross(
+            points[outer[:, 1]] - points[outer[:, 0]], points[outer[:, 2]] - points[outer[:, 0]]
+        )
+        normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), TINY)
+        inside = points[outer[:, 0]] - points[np.concatenate(apex)[hull]]
+        away = np.sign((inside * normal).sum(1, keepdims=True)) * normal
+        ends[1][hull] = ends[0][hull] + FAR * np.ptp(points, axis=0).max() * away
+        return cls(points, cells, centers, triangles, ends, hull)
+
+    @cached_property
+    def _rays(self) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """(point, offset to a corner of its Voronoi cell), of all; length of the longest and its number, (N,)."""
+        corners = self.points[self.cells]
+        sides = corners[:, 1:] - corners[:, :1]
+        solid = np.abs(np.linalg.det(sides)) > FLAT * np.linalg.norm(sides, axis=2).max(1) ** 3
+        outer = self.triangles[self.hull]
+        point = np.concatenate([self.cells[solid].ravel(), outer.ravel()])
+        ray = [self.centers[solid].repeat(4, 0), self.ends[1][self.hull].repeat(3, 0)]
+        ray = torch.from_numpy(np.concatenate(ray) - self.points[point])
+        point, length = torch.from_numpy(point), ray.norm(dim=1)
+        longest = length.new_zeros(len(self.points)).scatter_reduce(0, point, length, "amax")
+        at = (length == longest.index_select(0, point)).nonzero()[:, 0]
+        number = torch.full((len(longest),), len(ray) - 1).scatter_reduce(0, point[at], at, "amin")
+        return point, ray, longest, number
+
+    def corrected(self, normals: Float[Tensor, "N 3"]) -> Float[Tensor, "N 3"]:
+        """The normals, but for those along which the Voronoi cell is short: there the direction where it is longest."""
+        point, ray, longest, number = self._rays
+        along = dot(ray, normals.index_select(0, point)).abs()
+        along = torch.zeros_like(longest).scatter_reduce(0, point, along, "amax")
+        short = along * LONG < longest
+        return torch.where(short[:, None], ray[number] / longest[:, None], normals)
+
+    def surface(self, cloud: Cloud) -> tuple[Faces, Faces]:
+        """(triangles of the surface, best first; all small triangles)."""
+        radius, normal = cloud.circles(self.triangles)
+        kept = radius <= cloud.limits(self.triangles)
+        triangles, radius, normal = self.triangles[kept], radius[kept], normal[kept]
+        ends = self.ends[0][kept], self.ends[1][kept]
+        near = np.ones(len(triangles), dtype=bool)
+        for corner in triangles.T:
+            near &= _leaves_cone(cloud.points[corner], cloud.normals[corner], ends)
+        alignment = np.abs((normal[:, None] * cloud.normals[triangles]).sum(-1)).min(1)
+        found = np.flatnonzero(near & (alignment > TILTED))
+        cost = radius / np.maximum(alignment, TILTED) ** 2
+        return triangles[found[np.argsort(cost[found], kind="stable")]], triangles
 
 
 def _circumcenters(points: np.ndarray, cells: Int[np.ndarray, "T 4"]) -> Float[np.ndarray, "T 3"]:
@@ -135,7 +209,7 @@ def _circumcenters(points: np.ndarray, cells: Int[np.ndarray, "T 4"]) -> Float[n
     total = sum(h * c for h, c in zip(halves, crosses, strict=True))
     with np.errstate(all="ignore"):
         center = total / determinant
-    most = 1e6 * np.ptp(points, axis=0).max()
+    most = FAR * np.ptp(points, axis=0).max()
     return origin + np.clip(np.nan_to_num(center, posinf=most, neginf=-most), -most, most)
 
 
@@ -163,6 +237,25 @@ def wings(
     along = along / np.maximum(np.linalg.norm(along, axis=-1, keepdims=True), TINY)
     out = out - (out * along).sum(-1, keepdims=True) * along
     return out / np.maximum(np.linalg.norm(out, axis=-1, keepdims=True), TINY)
+
+
+def corrected_normals(
+    points: Float[Tensor, "N 3"],
+    normals: Float[Tensor, "N 3"],
+    candidates: Int[Tensor, "N K"],
+    tetrahedra: Tetrahedra,
+    rounds: int = 3,
+) -> Float[Tensor, "N 3"]:
+    """The normals, refined again around those that the Voronoi cells contradict, which are replaced.
+
+    A cell is long across the surface. Where points lie on rings or other curves far apart, the planes through the
+    nearest of them are those of the curves, and neither their size nor their fit tells.
+    """
+    for _ in range(rounds):
+        before, normals = normals, tetrahedra.corrected(normals)
+        around = (normals != before).any(1)[candidates].any(1).nonzero()[:, 0]
+        normals = refined_normals(points, normals, candidates, around)
+    return tetrahedra.corrected(normals)
 
 
 def best_manifold(points: Float[np.ndarray, "N 3"], faces: Faces) -> Faces:

@@ -15,7 +15,7 @@ from torch import Tensor
 
 from torchlb.fits.weights import MAX_RESIDUAL, centered_fit, window
 from torchlb.geometry.candidates import Candidate, Search
-from torchlb.geometry.neighbors import MIN_ALIGNMENT, GraphBalls, admissible
+from torchlb.geometry.neighbors import MIN_ALIGNMENT, GraphBalls, admissible, planes_of
 from torchlb.geometry.vertex_fits import VertexFits
 
 MAX_GRADIENT_GROWTH = 15.0
@@ -35,6 +35,7 @@ def cloud_frames(
     offset = points[candidates] - points[:, None]
     distance = offset.norm(dim=-1)
     centers = torch.arange(len(points)).repeat_interleave(candidates.shape[1])
+    pairs = centers, candidates.flatten()
     good = torch.ones_like(candidates, dtype=torch.bool)
     half = (candidates.shape[1] + 1) // 2
     frames = torch.empty(0)
@@ -43,7 +44,7 @@ def cloud_frames(
         reach = (distance * near).amax(1, keepdim=True).clamp_min(torch.finfo(distance.dtype).tiny)
         weight = window((distance / reach).clamp_max(1.1)) * near
         frames = _principal_directions(offset, weight, dim)
-        good = admissible(points, frames, centers, candidates.reshape(-1)).view(candidates.shape)
+        good = admissible(points, planes_of(frames), *pairs).view(candidates.shape)
     return frames
 
 

@@ -25,23 +25,18 @@ def filled(
     cloud: Cloud,
     faces: Faces,
     pool: Faces,
-    rim: Bool[np.ndarray, " N"],
     *,
     oriented: bool,
     strict: bool,
 ) -> Faces:
     """The faces and those of the pool, or ears between two rim edges, that extend them without folds or overlaps.
 
-    Best first, in rounds, until nothing fits. `rim` marks declared boundary points, three of which make no triangle.
-    If `oriented`, the faces and normals agree on which way is out, and triangles have to agree with them. If not
-    `strict` they may face away from the normals by nearly a right angle, and overlap what they share no edge with.
+    Best first, in rounds, until nothing fits; no ear has all its corners on a declared boundary. If `oriented`, the
+    faces and normals agree on which way is out, and triangles have to agree with them. If not `strict` they may face
+    away from the normals by nearly a right angle, and overlap what they share no edge with.
     """
     count = len(cloud.points)
-    edges = edges_of(faces, count)
-    outer = np.ones(count, dtype=bool)  # not inside: only there can anything be added
-    outer[faces.ravel()] = False
-    for end in edges.ends:
-        outer[end[edges.rim]] = True
+    outer = edges_of(faces, count).outer  # only there can anything be added
     near = outer[faces].any(1)
     inner, around = faces[~near], faces[near]
     while True:
@@ -53,7 +48,7 @@ def filled(
             free[end[half]] = True
         pool = pool[free[pool].all(1)]
         ears = _ears(edges, half)
-        candidates = np.concatenate([pool, ears[~rim[ears].all(1)]])
+        candidates = np.concatenate([pool, ears[~cloud.rim[ears].all(1)]])
         new = _proposals(cloud, edges, half, candidates, oriented, ALIGNED if strict else TILTED)
         new = new[~overlapping(cloud, new, around)] if strict else new
         if len(new) == 0:
@@ -104,7 +99,7 @@ def _proposals(
     wing[of] = wings(cloud.points, starts, stops, edges.faces.ravel()[half])
     folds = (wing[edge] * wings(cloud.points, tail, head, faces)).sum(-1) > FOLD
     ok = alignment > least
-    ok &= radius <= cloud.reach[faces].min(1)
+    ok &= radius <= cloud.limits(faces)
     ok &= ~((uses == 1) & folds).any(1)
     faces = np.where(plus.reshape(-1, 1), faces, faces[:, ::-1])[ok]
     cost = radius[ok] / alignment[ok] ** 2
@@ -165,11 +160,11 @@ def _meet(one: Float[np.ndarray, "P 4 3"], two: Float[np.ndarray, "P 4 3"]) -> n
 
 
 def closed(
-    cloud: Cloud, faces: Faces, rim: Bool[np.ndarray, " N"], kept: Bool[np.ndarray, " N"]
+    cloud: Cloud, faces: Faces, kept: Bool[np.ndarray, " N"]
 ) -> tuple[Faces, list[list[int]]]:
     """The faces with narrow boundary loops closed, ear by ear; and the points of the loops that were.
 
-    Loops stay that have two neighbouring points in the declared boundary `rim`, or one in `kept`.
+    Loops stay that have two neighbouring points in the declared boundary, or one in `kept`.
     """
     count = len(cloud.points)
     edges = edges_of(faces, count)
@@ -177,7 +172,7 @@ def closed(
     for loop in boundary_loops(faces, count):
         wide = WIDTH * cloud.reach[loop].mean()
         places = cloud.points[loop]
-        declared = rim[loop] & rim[np.roll(loop, 1)]
+        declared = cloud.rim[loop] & cloud.rim[np.roll(loop, 1)]
         if declared.any() or kept[loop].any() or np.ptp(places, axis=0).max() > wide:
             continue
         if max(np.linalg.norm(places - place, axis=1).max() for place in places) > wide:

@@ -16,6 +16,8 @@ from scipy.sparse import csgraph
 Faces = Int[np.ndarray, "_ 3"]
 LEAST_VOLUME = 1e-3
 """Over area^{3/2}: patches with less under them are taken for flat."""
+SOME = 8
+"""Faces by which a patch is found inside of others."""
 CLOSED = 1000
 """A closed fan comes before an open one of up to so many triangles."""
 
@@ -54,6 +56,15 @@ class Edges:
         first = (np.cumsum(self.uses) - self.uses)[self.uses == 2]
         return order[first], order[first + 1]
 
+    @cached_property
+    def outer(self) -> Bool[np.ndarray, " N"]:
+        """Which points lie on the rim or in no face."""
+        result = np.ones(self.count, dtype=bool)
+        result[self.faces.ravel()] = False
+        for end in self.ends:
+            result[end[self.rim]] = True
+        return result
+
     def find(
         self, tail: np.ndarray, head: np.ndarray
     ) -> tuple[Int[np.ndarray, "*batch"], Int[np.ndarray, "*batch"]]:
@@ -81,6 +92,31 @@ def components(i: np.ndarray, j: np.ndarray, count: int) -> Int[np.ndarray, " co
     """Number of the connected component of each of `count` nodes joined by the pairs (i, j)."""
     graph = sparse.coo_array((np.ones(len(i), dtype=np.int8), (i, j)), shape=(count, count))
     return csgraph.connected_components(graph, directed=False)[1]
+
+
+def spanning_pairs(i: np.ndarray, j: np.ndarray, count: int) -> Int[np.ndarray, " T"]:
+    """Numbers of the pairs (i, j), best first, that join `count` nodes as far as all do, without a circle.
+
+    >>> spanning_pairs(np.array([0, 0, 1, 2]), np.array([1, 1, 2, 0]), 4).tolist()
+    [0, 2]
+    """
+    low, high = np.minimum(i, j), np.maximum(i, j)
+    _, first = np.unique(low * count + high, return_index=True)
+    ranks = sparse.csr_array((first + 1.0, (low[first], high[first])), shape=(count, count))
+    return csgraph.minimum_spanning_tree(ranks).data.astype(np.int64) - 1
+
+
+def two_orientations(
+    i: np.ndarray, j: np.ndarray, against: Bool[np.ndarray, " P"], count: int
+) -> tuple[Int[np.ndarray, " F"], Int[np.ndarray, " F"]]:
+    """Component of each face as it is and turned round, where faces i and j agree, or are wound against each other.
+
+    An orientable component falls into its two orientations; one that has one side only stays in one piece.
+    """
+    turned, plain = np.where(against, j + count, j), np.where(against, j, j + count)
+    both = components(np.concatenate([i, i + count]), np.concatenate([turned, plain]), 2 * count)
+    own, other = both.reshape(2, count)
+    return own, other
 
 
 def patches(faces: Faces, count: int) -> Int[np.ndarray, " F"]:
@@ -148,16 +184,8 @@ def wound_alike(
     i, j, size = one // 3, two // 3, len(faces)
     bend = 1.001 - (normals[i] * normals[j]).sum(1) * np.where(against, -1, 1)
     order = np.argsort(bend, kind="stable")
-    _, first = np.unique(i[order] * size + j[order], return_index=True)  # two may share two edges
-    ends = i[order[first]], j[order[first]]
-    ranks = sparse.csr_array((first + 1.0, ends), shape=(size, size))
-    number = order[csgraph.minimum_spanning_tree(ranks).data.astype(np.int64) - 1]
-    a, b, turned = i[number], j[number], against[number]
-    ends = (
-        np.concatenate([a, a + size]),
-        np.concatenate([np.where(turned, b + size, b), np.where(turned, b, b + size)]),
-    )
-    own, other = components(*ends, 2 * size).reshape(2, size)
+    number = order[spanning_pairs(i[order], j[order], size)]
+    own, other = two_orientations(i[number], j[number], against[number], size)
     flip = own > other
     seam = against ^ flip[i] ^ flip[j]
     at_seam = np.zeros(size, dtype=bool)
@@ -166,9 +194,15 @@ def wound_alike(
 
 
 def facing_out(points: Float[np.ndarray, "N 3"], faces: Faces) -> Faces:
-    """The faces of every patch turned to have volume under it, seen from the middle of its rim; flat ones up."""
+    """The faces of every patch turned to face out of the solid: up if the patch is flat.
+
+    A patch has volume under it, seen from the middle of its rim; one inside of larger ones, as often as their windings
+    around it say, is the wall of a cavity, which has volume above it.
+    """
+    if len(faces) == 0:
+        return faces
     edges, patch = edges_of(faces, len(points)), patches(faces, len(points))
-    count = int(patch.max(initial=-1)) + 1
+    count = int(patch.max()) + 1
     normals, middle = face_vectors(points, faces), points[faces].mean(1)
     area = np.linalg.norm(normals, axis=1)
     rim = edges.rim
@@ -176,13 +210,43 @@ def facing_out(points: Float[np.ndarray, "N 3"], faces: Faces) -> Faces:
     open_ = np.bincount(patch[rim // 3], minlength=count)
     totals = np.stack([np.bincount(patch, area * x, count) for x in middle.T], 1)
     rims = np.stack([np.bincount(patch[rim // 3], x, count) for x in on_rim.T], 1)
-    mean = totals / np.maximum(np.bincount(patch, area, count), np.finfo(float).tiny)[:, None]
+    size = np.bincount(patch, area, count)
+    mean = totals / np.maximum(size, np.finfo(float).tiny)[:, None]
     center = np.where((open_ > 0)[:, None], rims / np.maximum(open_, 1)[:, None], mean)
     volume = np.bincount(patch, ((middle - center[patch]) * normals).sum(1), count)
     up = np.bincount(patch, normals[:, 2], count)
-    hollow = np.abs(volume) > LEAST_VOLUME * np.bincount(patch, area, count) ** 1.5
+    hollow = np.abs(volume) > LEAST_VOLUME * size**1.5
     inward = np.where(hollow, volume, up) < 0
-    return np.where(inward[patch, None], faces[:, ::-1], faces)
+    faces = np.where(inward[patch, None], faces[:, ::-1], faces)
+    cavity = _inside(points, faces, patch, size, hollow)
+    return np.where(cavity[patch, None], faces[:, ::-1], faces)
+
+
+def _inside(
+    points: Float[np.ndarray, "N 3"],
+    faces: Faces,
+    patch: Int[np.ndarray, " F"],
+    size: Float[np.ndarray, " P"],
+    hollow: Bool[np.ndarray, " P"],
+) -> Bool[np.ndarray, " P"]:
+    """Which patches are inside of the solid that the larger ones bound."""
+    result = np.zeros_like(hollow)
+    order = np.flatnonzero(hollow)[np.argsort(-size[hollow], kind="stable")]
+    if len(order) < 2:
+        return result
+    import igl
+
+    members = [np.flatnonzero(patch == number) for number in order]
+    some = [rows[:: -(-len(rows) // SOME)] for rows in members]
+    seen = np.concatenate([points[faces[rows]].mean(1) for rows in some])
+    first = np.cumsum([0, *map(len, some)])
+    winding = np.zeros(len(seen))
+    for k, number in enumerate(order):
+        result[number] = np.median(winding[first[k] : first[k + 1]]) > 0.5
+        own = faces[members[k]]
+        around = np.asarray(igl.winding_number(points, own, seen))
+        winding += -around if result[number] else around
+    return result
 
 
 def boundary_loops(faces: Faces, count: int) -> list[list[int]]:

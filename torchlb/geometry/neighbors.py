@@ -15,6 +15,7 @@ from scipy import sparse
 from scipy.spatial import KDTree
 from torch import Tensor
 
+from torchlb.geometry.vectors import dot
 from torchlb.geometry.voronoi import natural_neighbors
 
 MIN_ALIGNMENT = 0.5
@@ -24,6 +25,8 @@ MAX_SLOPE = 0.5
 two bounds meet, at 60°."""
 VOID = 1.5
 """A natural neighbour may be this many times farther than the nearest ones; at an open end all else would be."""
+KEPT_AT_ONCE = 2**13
+"""Balls that are gathered at a time."""
 BALL_SURPLUS = 1.5
 """A graph ball holds this many times the points asked for, so that its round core lies inside the ragged edge."""
 
@@ -59,28 +62,33 @@ def _smallest_singular_value(
     return torch.linalg.svdvals(product)[:, -1]
 
 
+def planes_of(frames: Float[Tensor, "N n d"]) -> Float[Tensor, "N n d"] | Float[Tensor, "N n"]:
+    """What `admissible` takes: the unit normals of a surface in R³, else the frames."""
+    return torch.linalg.cross(*frames.unbind(-1)) if frames.shape[1:] == (3, 2) else frames
+
+
 def admissible(
     points: Float[Tensor, "N n"],
-    frames: Float[Tensor, "N n d"],
+    planes: Float[Tensor, "N n d"] | Float[Tensor, "N n"],
     centers: Int[Tensor, " P"],
     others: Int[Tensor, " P"],
-    normals: Float[Tensor, "N n"] | None = None,
 ) -> Bool[Tensor, " P"]:
     """Whether `others[j]` may enter the stencil of `centers[j]`.
 
     It may if their tangent planes are less than 60° apart (σ_min(E_kᵀE_i) ≥ 0.5) and it does not stand above or
-    below the centre's plane (height ≤ 0.5 of the distance). Orientation of the frames is irrelevant. The unit normals
-    of a hypersurface tell the same in less time: σ_min(E_kᵀE_i) = |n_k·n_i|.
+    below the centre's plane (height ≤ 0.5 of the distance). `planes` are frames E, or the unit normals of a
+    hypersurface, which tell the same in less time: σ_min(E_kᵀE_i) = |n_k·n_i|. Orientation is irrelevant.
     """
-    offset = points[others] - points[centers]
-    total = offset.square().sum(-1)
-    if normals is None:
-        height = total - torch.einsum("pn,pnd->pd", offset, frames[centers]).square().sum(-1)
-        cosine = _smallest_singular_value(frames[others], frames[centers])
+    offset = points.index_select(0, others) - points.index_select(0, centers)
+    total = dot(offset, offset)
+    mine, theirs = planes.index_select(0, centers), planes.index_select(0, others)
+    if planes.ndim == 3:
+        flat = torch.einsum("pn,pnd->pd", offset, mine)
+        height = total - dot(flat, flat)
+        cosine = _smallest_singular_value(theirs, mine)
     else:
-        normal = normals[centers]
-        height = (offset * normal).sum(-1).square()
-        cosine = (normals[others] * normal).sum(-1).abs()
+        height = dot(offset, mine).square()
+        cosine = dot(theirs, mine).abs()
     return (height <= MAX_SLOPE**2 * total) & (cosine >= MIN_ALIGNMENT)
 
 
@@ -125,7 +133,8 @@ def nearest_graph(
         return sparse.csr_array((num_rows, num_rows), dtype=np.float32)
     centers = torch.arange(num_rows).repeat_interleave(size)
     flat = others.reshape(-1)
-    good = admissible(points, frames, centers, flat) & admissible(points, frames, flat, centers)
+    planes = planes_of(frames)
+    good = admissible(points, planes, centers, flat) & admissible(points, planes, flat, centers)
     good = good.view(num_rows, size)
     chosen = good & (good.cumsum(1) <= wanted)
     for rows in torch.arange(num_rows).split(2**24 // (size * 128)):
@@ -147,6 +156,7 @@ class GraphBalls:
     graph : (N, N) symmetric adjacency, from `mesh_graph` or `nearest_graph`.
     frames : (N, n, d) tangent frames that decide admission.
     sides : (N, n) from `thin_sides`: also refused is a point on the other side of a thin shape. None if not known.
+    kept : balls of all points that are known already, (index, count); those of slightly other frames serve.
     """
 
     def __init__(
@@ -155,13 +165,20 @@ class GraphBalls:
         graph: sparse.csr_array,
         frames: Float[Tensor, "N n d"],
         sides: Float[Tensor, "N n"] | None = None,
+        kept: tuple[Int[Tensor, "N K"], Int[Tensor, " N"]] | None = None,
     ) -> None:
         self.points = points
         self.graph = graph
         self.frames = frames
         self.sides = sides
-        surface = frames.shape[1:] == (3, 2)
-        self._normals = torch.linalg.cross(*frames.unbind(-1)) if surface else None
+        self.kept = kept
+        self._planes = planes_of(frames)
+
+    def keep(self, size: int) -> None:
+        """Gather the balls of all points, up to `size`, once and for all."""
+        parts = torch.arange(len(self.points)).split(KEPT_AT_ONCE)
+        index, count = zip(*(self(centers, size) for centers in parts), strict=True)
+        self.kept = torch.cat([part.int() for part in index]), torch.cat(count)
 
     def __call__(
         self, centers: Int[Tensor, " B"], size: int
@@ -173,52 +190,59 @@ class GraphBalls:
         index : (B, size), padded by the centre itself where the ball holds fewer.
         count : (B,), how many are real.
         """
+        if self.kept is not None and self.kept[0].shape[1] >= size:
+            index, count = self.kept
+            return index[centers, :size].long(), count[centers].clamp_max(size)
         local, others = self._reach(centers, size)
-        offset = self.points[others] - self.points[centers[local]]
-        distance = offset.square().sum(-1)
-        distance[others == centers[local]] = -1.0  # before all that coincide with it
-        order = distance.argsort(stable=True)  # equal ones stay in the order of the points
-        order = order[local[order].argsort(stable=True)]
-        local, others = local[order], others[order]
+        offset = self.points.index_select(0, others) - self.points[centers[local]]
+        square = dot(offset, offset)
+        square[others == centers[local]] = -1.0  # before all that coincide with it
         total = torch.bincount(local, minlength=len(centers))
-        rank = torch.arange(len(local)) - (total.cumsum(0) - total)[local]
-        kept = rank < size
-        index = centers[:, None].repeat(1, size)
-        index[local[kept], rank[kept]] = others[kept]
-        return index, total.clamp_max(size)
+        place = torch.arange(len(local)) - (total.cumsum(0) - total)[local]
+        shape = len(centers), max([size, *total.tolist()])
+        distance = square.new_full(shape, torch.inf).index_put((local, place), square)
+        index = centers[:, None].repeat(1, shape[1]).index_put((local, place), others)
+        order = distance.argsort(dim=1, stable=True)  # equal ones stay in the order of the points
+        return index.gather(1, order[:, :size]), total.clamp_max(size)
 
     def _admissible(
         self, centers: Int[Tensor, " P"], others: Int[Tensor, " P"]
     ) -> Bool[Tensor, " P"]:
-        good = admissible(self.points, self.frames, centers, others, self._normals)
+        good = admissible(self.points, self._planes, centers, others)
         if self.sides is not None:
-            good &= (self.sides[centers] * self.sides[others]).sum(1) >= 0
+            good &= (
+                dot(self.sides.index_select(0, centers), self.sides.index_select(0, others)) >= 0
+            )
         return good
 
     def _reach(
         self, centers: Int[Tensor, " B"], size: int
     ) -> tuple[Int[Tensor, " P"], Int[Tensor, " P"]]:
-        """Pairs (row of `centers`, point) of the graph balls, grown ring by ring until they are large enough."""
-        num_rows, num_points = len(centers), len(self.points)
-        shape = (num_rows, num_points)
-        start = (np.ones(num_rows, np.float32), centers.numpy(), np.arange(num_rows + 1))
-        visited = sparse.csr_array(start, shape=shape)
-        frontier = visited
-        while frontier.nnz:
-            ring = frontier @ self.graph + visited * np.float32(2**20)  # marks what is known
-            ring = sparse.coo_array(ring)
-            new = ring.data < 2**20
-            local = torch.from_numpy(ring.coords[0][new].astype(np.int64))
-            others = torch.from_numpy(ring.coords[1][new].astype(np.int64))
-            good = self._admissible(centers[local], others).numpy()
-            row, col = ring.coords[0][new][good], ring.coords[1][new][good]
+        """Pairs (row of `centers`, point) of the graph balls, sorted; they grow ring by ring until they are large."""
+        width, known = len(self.points), np.float32(2**20)
+        active = np.arange(len(centers))  # rows that still grow: no others are looked at
+        start = np.ones(len(centers), np.float32), centers.numpy(), np.arange(len(centers) + 1)
+        frontier = visited = sparse.csr_array(start, shape=(len(centers), width))
+        found = [(active, centers.numpy())]
+        while len(active):
+            ring = sparse.coo_array(frontier @ self.graph + visited * known)
+            new = ring.data < known
+            row, col = (end[new].astype(np.int64) for end in ring.coords)
+            good = self._admissible(
+                centers[torch.from_numpy(active[row])], torch.from_numpy(col)
+            ).numpy()
+            row, col = row[good], col[good]
+            found.append((active[row], col))
             ones = np.ones(len(row), np.float32)
-            frontier = sparse.csr_array((ones, (row, col)), shape=shape)
+            frontier = sparse.csr_array((ones, (row, col)), shape=(len(active), width))
             visited = sparse.csr_array(visited + frontier)
-            wanting = np.diff(visited.indptr) < BALL_SURPLUS * size
-            frontier = sparse.csr_array(sparse.diags_array(wanting.astype(np.float32)) @ frontier)
-            frontier.eliminate_zeros()
-        pairs = sparse.coo_array(visited)
+            grows = np.diff(visited.indptr) < BALL_SURPLUS * size
+            grows &= np.diff(frontier.indptr) > 0
+            visited, frontier, active = visited[grows], frontier[grows], active[grows]
+        where = tuple(np.concatenate(ends) for ends in zip(*found, strict=True))
+        balls = sparse.csr_array((np.ones(len(where[0]), np.int8), where), (len(centers), width))
+        balls.sort_indices()
+        pairs = sparse.coo_array(balls)
         return (
             torch.from_numpy(pairs.coords[0].astype(np.int64)),
             torch.from_numpy(pairs.coords[1].astype(np.int64)),

@@ -9,6 +9,7 @@ from torch import Tensor
 from torchlb.fits.polynomials import monomials, num_monomials
 from torchlb.geometry.frames import complete_frames
 from torchlb.geometry.neighbors import admissible
+from torchlb.geometry.vectors import dot
 
 SMOOTH = 4.0
 """From this F on what quadratics miss is taken for shape: of clean clouds F is 15 and more, of pure noise it is 1."""
@@ -61,10 +62,10 @@ def _residuals(
     index = candidates[centers]
     offset, frames = points[index] - points[centers, None], complete_frames(normals)
     pairs = centers.repeat_interleave(index.shape[1]), index.flatten()
-    good = admissible(points, frames, *pairs, normals).view(index.shape)
+    good = admissible(points, normals, *pairs).view(index.shape)
     good[:, 0] = True
     radius = (offset.norm(dim=-1) * good).amax(1)
-    heights = (offset * normals[centers, None]).sum(-1) * good
+    heights = dot(offset, normals[centers, None]) * good
     scale = radius.clamp_min(torch.finfo(radius.dtype).tiny)[:, None, None]
     terms = monomials(offset @ frames[centers] / scale, degree)
     terms = torch.cat([torch.ones_like(terms[..., :1]), terms], -1) * good[..., None]

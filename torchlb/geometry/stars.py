@@ -8,13 +8,11 @@ from __future__ import annotations
 import numpy as np
 import torch
 from jaxtyping import Int
-from scipy import sparse
-from scipy.sparse import csgraph
 
 from torchlb.geometry.cocone import Cloud
 from torchlb.geometry.gaps import ALIGNED, overlapping
-from torchlb.geometry.manifold import Faces, components, edges_of
-from torchlb.geometry.voronoi import natural_neighbors
+from torchlb.geometry.manifold import Faces, components, edges_of, spanning_pairs
+from torchlb.geometry.voronoi import natural_neighbors, star_of, unrolled
 
 
 def local_stars(cloud: Cloud, centers: Int[np.ndarray, " B"]) -> Faces:
@@ -27,18 +25,10 @@ def local_stars(cloud: Cloud, centers: Int[np.ndarray, " B"]) -> Faces:
     offset, normal = points[near[:, 1:]] - points[near[:, :1]], normals[near[:, :1]]
     valid = (normals[near[:, 1:]] * normal).sum(-1).abs() > ALIGNED
     frame = torch.linalg.qr(normal.mT, mode="complete")[0][..., 1:]
-    coords = offset @ frame
-    # Unrolled to their true distance, so that neighbours above one another do not collapse.
-    length = coords.norm(dim=-1, keepdim=True).clamp_min(torch.finfo(coords.dtype).tiny)
-    coords = coords * (offset.norm(dim=-1, keepdim=True) / length)
-    natural = natural_neighbors(coords, valid)
-    angle = torch.atan2(coords[..., 1], coords[..., 0]).masked_fill(~natural, torch.inf)
-    angle, order = angle.sort(dim=1)
-    count = natural.sum(1, keepdim=True)
-    place = torch.arange(angle.shape[1]).expand_as(order)
-    following = torch.where(place + 1 < count, place + 1, 0)
+    coords = unrolled(offset, frame)
+    angle, order, following, real = star_of(coords, natural_neighbors(coords, valid))
     turn = (angle.take_along_dim(following, 1) - angle) % (2 * torch.pi)
-    use = (place < count) & (turn > 0) & (turn < torch.pi)
+    use = real & (turn > 0) & (turn < torch.pi)
     ends = near[:, 1:].take_along_dim(order, 1)
     after = ends.take_along_dim(following, 1)
     found = torch.stack([near[:, :1].expand_as(ends)[use], ends[use], after[use]], 1)
@@ -57,11 +47,7 @@ def gaps_between(
     """The pairs of points of different pieces, one of which has no closed fan of faces: sheets do not grow together."""
     i, j = pairs
     piece = pieces_of(faces, count)
-    outer = np.ones(count, dtype=bool)
-    outer[faces.ravel()] = False
-    edges = edges_of(faces, count)
-    for end in edges.ends:
-        outer[end[edges.rim]] = True
+    outer = edges_of(faces, count).outer
     across = (piece[i] != piece[j]) & (outer[i] | outer[j])
     return i[across], j[across]
 
@@ -72,35 +58,25 @@ def stars_in_gaps(cloud: Cloud, faces: Faces, pairs: tuple[np.ndarray, np.ndarra
     `pairs` are points that belong together: whatever stars leave apart is joined along the shortest of them.
     """
     count = len(cloud.points)
-    edges = edges_of(faces, count)
-    open_ = np.zeros(count, dtype=bool)
-    for end in edges.ends:
-        open_[end[edges.rim]] = True
     at_gap = np.zeros(count, dtype=bool)
     for end in gaps_between(faces, pairs, count):
         at_gap[end] = True
-    at_gap &= open_
+    at_gap &= edges_of(faces, count).outer
     at_gap |= np.bincount(faces.ravel(), minlength=count) == 0
     stars = local_stars(cloud, np.flatnonzero(at_gap))
     around = faces[np.isin(faces, stars[:, 0]).any(1)]
     stars = stars[~overlapping(cloud, stars, around, corners=1)]
-    return np.concatenate([stars, bridges(cloud, faces, stars, pairs)])
+    return np.concatenate([stars, bridges(cloud, np.concatenate([faces, stars]), pairs)])
 
 
-def bridges(
-    cloud: Cloud, faces: Faces, stars: Faces, pairs: tuple[np.ndarray, np.ndarray]
-) -> Faces:
+def bridges(cloud: Cloud, faces: Faces, pairs: tuple[np.ndarray, np.ndarray]) -> Faces:
     """Two triangles, one from either side, at the shortest pair between every two pieces that are still apart."""
     count = len(cloud.points)
-    i, j = gaps_between(faces, pairs, count)
-    piece = pieces_of(np.concatenate([faces, stars]), count)
+    piece = pieces_of(faces, count)
+    i, j = (end[piece[pairs[0]] != piece[pairs[1]]] for end in pairs)
     length = np.linalg.norm(cloud.points[i] - cloud.points[j], axis=1)
     order = np.argsort(length, kind="stable")
-    order = order[piece[i[order]] != piece[j[order]]]
-    ends = np.sort(np.stack([piece[i[order]], piece[j[order]]]), axis=0)
-    _, first = np.unique(ends[0] * count + ends[1], return_index=True)
-    ranks = sparse.csr_array((first + 1.0, (ends[0, first], ends[1, first])), (count, count))
-    number = order[csgraph.minimum_spanning_tree(ranks).data.astype(np.int64) - 1]
+    number = order[spanning_pairs(piece[i[order]], piece[j[order]], count)]
     sides = (i[number], j[number]), (j[number], i[number])
     return np.concatenate([_beside(cloud, piece, *ends) for ends in sides])
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 import torch
@@ -10,9 +11,16 @@ from jaxtyping import Bool, Float, Int
 from scipy import sparse
 from scipy.spatial import Delaunay
 from torch import Tensor
+from torch.nn.functional import normalize
 
-from torchlb.geometry.cocone import Cloud, best_manifold, delaunay_triangles, refined_normals
-from torchlb.geometry.frames import cloud_frames, complete_frames, vertex_normals
+from torchlb.geometry.cocone import (
+    Cloud,
+    Tetrahedra,
+    best_manifold,
+    corrected_normals,
+    refined_normals,
+)
+from torchlb.geometry.frames import cloud_frames, vertex_normals
 from torchlb.geometry.gaps import closed, filled, with_left_points
 from torchlb.geometry.manifold import (
     Faces,
@@ -23,7 +31,7 @@ from torchlb.geometry.manifold import (
     without_specks,
     wound_alike,
 )
-from torchlb.geometry.neighbors import nearest_graph, nearest_neighbors
+from torchlb.geometry.neighbors import admissible, mesh_graph, nearest_neighbors
 from torchlb.geometry.noise import denoised
 from torchlb.geometry.stars import gaps_between, pieces_of, stars_in_gaps
 
@@ -33,6 +41,8 @@ SPACING, REACH = 8, 2.0
 """The reach of a point is so many times the distance to its neighbour of this number."""
 SPECK = 4
 """Patches of fewer triangles are left out."""
+PLACES = 3
+"""Places that are named where sheets touch."""
 FLAT = 1e-6
 """Thickness over width of a cloud that lies in a plane."""
 
@@ -50,6 +60,9 @@ class SurfaceSummary:
     boundary_loops : those that are left.
     components : connected components.
     noise : distance of the points from the surface, root mean square, ℓ; 0 if there is none to be seen.
+    contacts : points the nearest of which is on another sheet, more than three edges away: which of them belong
+        together is a guess. Shapes touch or are too thin for their points there.
+    places : where most of these are, up to three points, ℓ.
     """
 
     points: int
@@ -59,14 +72,32 @@ class SurfaceSummary:
     boundary_loops: int
     components: int
     noise: float
+    contacts: int = 0
+    places: tuple[tuple[float, float, float], ...] = ()
+
+    @classmethod
+    def of(cls, entries: dict[str, Any]) -> SurfaceSummary:
+        """Inverse of `dataclasses.asdict`, also of what JSON makes of it."""
+        entries = dict(entries)
+        places = tuple(map(tuple, entries.pop("places", ())))
+        return cls(**entries, places=places)
 
     def __str__(self) -> str:
-        """Two lines."""
+        """Two lines, or three."""
         noise = f"; noise of {self.noise:.2g} smoothed" if self.noise else ""
-        return (
+        text = (
             f"surface through the cloud: {self.reached} of {self.points} points, {self.stars} triangles of local stars"
             f"{noise}\n  {self.components} components, {self.boundary_loops} boundary loops, {self.holes_closed} gaps "
             "closed"
+        )
+        return f"{text}\n  {self.contact}" if self.contacts else text
+
+    @property
+    def contact(self) -> str:
+        """Where sheets come closer to each other than the points are, in words."""
+        where = ", ".join(f"({x:.3g}, {y:.3g}, {z:.3g})" for x, y, z in self.places)
+        return (
+            f"{self.contacts} points are nearest to one of another sheet, most of them near {where}"
         )
 
 
@@ -102,37 +133,53 @@ def cloud_surface(
     candidates = nearest_neighbors(points, min(NEAREST, len(points)))
     given, frames = normals, cloud_frames(points, candidates, 2)
     if normals is None:
-        normals = refined_normals(points, frames, candidates)
+        first = torch.linalg.cross(*frames.unbind(-1))
+        normals = refined_normals(points, first, candidates, rounds=2)
     points, noise = denoised(points, normals, candidates)
     if noise and given is None:
-        normals = refined_normals(points, complete_frames(normals), candidates)
-    graph = nearest_graph(points, complete_frames(normals), candidates)
+        normals = refined_normals(points, normals, candidates, rounds=2)
     places, near, count = points.numpy(), candidates.numpy(), len(points)
     far = near[:, min(SPACING, near.shape[1] - 1)]
     reach = REACH * np.linalg.norm(places[far] - places, axis=1)
     rim = np.zeros(count, dtype=bool) if boundary is None else boundary.numpy()
-    cloud = Cloud(places, normals.numpy(), near, reach)
-    found, pool = planar_triangles(cloud) or delaunay_triangles(cloud)
+    planar = _planar_triangles(places)
+    if planar is None:
+        tetrahedra = Tetrahedra.of(places)
+        if given is None:
+            normals = corrected_normals(points, normals, candidates, tetrahedra)
+        cloud = Cloud(places, normals.numpy(), near, reach, rim)
+        found, pool = tetrahedra.surface(cloud)
+    else:
+        cloud = Cloud(places, normals.numpy(), near, reach, rim)
+        found = pool = cloud.small(planar)
     faces, seam = wound_alike(places, _clean(best_manifold(places, found), count))
     faces = facing_out(places, _clean(faces[~seam], count))
     cloud = _oriented(cloud, faces)
     for oriented in (True, False):  # a surface with one side only is closed in the second round
-        faces = filled(cloud, faces, pool, rim, oriented=oriented, strict=True)
-    faces = filled(cloud, _clean(faces, count), pool, rim, oriented=True, strict=False)
-    faces, pairs = _clean(faces, count), _own_graph(cloud, graph)
-    faces, done = closed(cloud, faces, rim, _at_gaps(faces, pairs, count))
+        faces = filled(cloud, faces, pool, oriented=oriented, strict=True)
+    faces = filled(cloud, _clean(faces, count), pool, oriented=True, strict=False)
+    faces, pairs = _clean(faces, count), _kin(cloud)
+    faces, done = closed(cloud, faces, _at_gaps(faces, pairs, count))
     faces, _ = wound_alike(places, with_left_points(cloud, faces))
     faces = facing_out(places, faces)
     cloud = _oriented(cloud, faces)
     stars = stars_in_gaps(cloud, faces, pairs)
     loops = boundary_loops(faces, count)
     pieces = pieces_of(np.concatenate([faces, stars]), count)
-    reached, components = len(np.unique(faces)), int(pieces.max()) + 1
-    summary = SurfaceSummary(count, reached, len(stars), len(done), len(loops), components, noise)
-    normals = torch.from_numpy(cloud.normals)
-    upright = frames - normals[..., None] * (normals[:, None] @ frames)
-    frames, triangles = torch.linalg.qr(upright)[0], torch.from_numpy(faces)
+    figures = len(np.unique(faces)), len(stars), len(done), len(loops), int(pieces.max()) + 1
+    summary = SurfaceSummary(count, *figures, noise, *_contacts(cloud, faces))
+    normals, triangles = torch.from_numpy(cloud.normals), torch.from_numpy(faces)
+    frames = _upright(frames, normals)
     return CloudSurface(points, triangles, torch.from_numpy(stars), normals, frames, summary)
+
+
+def _upright(
+    frames: Float[Tensor, "N 3 2"], normals: Float[Tensor, "N 3"]
+) -> Float[Tensor, "N 3 2"]:
+    """Frames under the normals, from the first direction of those given that is not along the normal."""
+    first, second = (frames - normals[..., None] * (normals[:, None] @ frames)).unbind(-1)
+    first = normalize(torch.where(first.norm(dim=1, keepdim=True) > 0.5, first, second))
+    return torch.stack([first, torch.linalg.cross(normals, first)], -1)
 
 
 def _at_gaps(
@@ -158,22 +205,44 @@ def _oriented(cloud: Cloud, faces: Faces) -> Cloud:
     return replace(cloud, normals=torch.where(away[:, None], -normals, normals).numpy())
 
 
-def planar_triangles(cloud: Cloud) -> tuple[Faces, Faces] | None:
-    """As `delaunay_triangles`, of a cloud in a plane; None if it is in none."""
-    centered = cloud.points - cloud.points.mean(0)
+def _planar_triangles(points: Float[np.ndarray, "N 3"]) -> Faces | None:
+    """Delaunay triangles of a cloud in a plane; None if it is in none."""
+    centered = points - points.mean(0)
     _, spread, axes = np.linalg.svd(centered, full_matrices=False)
     if spread[2] > FLAT * spread[0]:
         return None
-    cells = Delaunay(centered @ axes[:2].T).simplices.astype(np.int64)
-    faces = cloud.small(cells)
-    return faces, faces
+    return Delaunay(centered @ axes[:2].T).simplices.astype(np.int64)
 
 
-def _own_graph(cloud: Cloud, graph: sparse.csr_array) -> tuple[np.ndarray, np.ndarray]:
-    """Edges of the cloud's neighbour graph; pieces of fewer points than a neighbourhood have all their nearest, too."""
-    i, j = sparse.coo_array(graph).coords
-    piece = components(i, j, len(cloud.points))
-    lone = np.flatnonzero((np.bincount(piece) < NEAREST)[piece])
-    near = cloud.neighbors[lone, 1 : SPACING + 1]
-    extra = lone.repeat(near.shape[1]), near.ravel()
-    return np.concatenate([i, *extra]), np.concatenate([j, *extra[::-1]])
+def _contacts(cloud: Cloud, faces: Faces) -> tuple[int, tuple[tuple[float, float, float], ...]]:
+    """How many points have their nearest one more than three edges away, or are that; and where most of them are."""
+    count = len(cloud.points)
+    graph = sparse.csr_array(mesh_graph(torch.from_numpy(faces), count) + sparse.eye_array(count))
+    nearest = cloud.neighbors[:, 1]
+    beyond = sparse.csr_array(graph[nearest] @ graph)
+    met = (beyond * graph).sum(1)  # a way of three edges: two from the nearest, one from here
+    touched = np.zeros(count, dtype=bool)
+    touched[met == 0] = touched[nearest[met == 0]] = True
+    near = cloud.neighbors[:, 1 : SPACING + 1]
+    i, j = np.arange(count).repeat(near.shape[1]), near.ravel()
+    both = touched[i] & touched[j]
+    place = components(i[both], j[both], count)[touched]
+    largest = np.argsort(-np.bincount(place), kind="stable")[:PLACES]
+    points = cloud.points[touched]
+    means = [points[place == number].mean(0) for number in largest if (place == number).any()]
+    return int(touched.sum()), tuple((float(x), float(y), float(z)) for x, y, z in means)
+
+
+def _kin(cloud: Cloud) -> tuple[np.ndarray, np.ndarray]:
+    """Pairs of points that belong together: each and its nearest admissible ones; all its nearest in a small piece."""
+    points, normals = torch.from_numpy(cloud.points), torch.from_numpy(cloud.normals)
+    others = torch.from_numpy(cloud.neighbors[:, 1:])
+    i, j = torch.arange(len(points)).repeat_interleave(others.shape[1]), others.reshape(-1)
+    good = admissible(points, normals, i, j) & admissible(points, normals, j, i)
+    good = good.view(others.shape)
+    near = (good & (good.cumsum(1) <= SPACING)).view(-1).numpy()
+    i, j = i.numpy(), j.numpy()
+    piece = components(i[near], j[near], len(points))
+    lone = (np.bincount(piece) < NEAREST)[piece]
+    near |= (lone[:, None] & (np.arange(others.shape[1]) < SPACING)).ravel()
+    return i[near], j[near]

@@ -137,6 +137,33 @@ def largest_gap(coords: Float[Tensor, "B K 2"], valid: Bool[Tensor, "B K"]) -> F
     return turn.diff(dim=1).amax(1)
 
 
+def star_of(
+    coords: Float[Tensor, "B K 2"], natural: Bool[Tensor, "B K"]
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """The natural neighbours in turn around the point.
+
+    Returns
+    -------
+    angle, order : (B, K), ascending, of the neighbours by number; infinite after the last.
+    following : (B, K), the place of the next one in this order.
+    real : (B, K), which places are taken.
+    """
+    angle = torch.atan2(coords[..., 1], coords[..., 0]).masked_fill(~natural, torch.inf)
+    angle, order = angle.sort(dim=1)
+    count = natural.sum(1, keepdim=True)
+    place = torch.arange(coords.shape[1]).expand_as(order)
+    return angle, order, torch.where(place + 1 < count, place + 1, 0), place < count
+
+
+def unrolled(
+    offset: Float[Tensor, "B K n"], frames: Float[Tensor, "B n d"]
+) -> Float[Tensor, "B K d"]:
+    """Coordinates in the tangent plane, at their true distance: neighbours above one another do not collapse."""
+    coords = offset @ frames
+    length = coords.norm(dim=-1, keepdim=True).clamp_min(torch.finfo(coords.dtype).tiny)
+    return coords * (offset.norm(dim=-1, keepdim=True) / length)
+
+
 def _star_cotangents(
     coords: Float[Tensor, "B K 2"], valid: Bool[Tensor, "B K"]
 ) -> Float[Tensor, "B K"]:
@@ -145,16 +172,12 @@ def _star_cotangents(
     A gap of nearly a half-turn (177°) or more is open and has no triangle. Negative values, at obtuse ends, become 0.
     """
     natural = natural_neighbors(coords, valid)
-    angle = torch.atan2(coords[..., 1], coords[..., 0]).masked_fill(~natural, torch.inf)
-    angle, order = angle.sort(dim=1)
-    count = natural.sum(1, keepdim=True)
-    place = torch.arange(coords.shape[1]).expand_as(order)
-    following = torch.where(place + 1 < count, place + 1, 0)
+    angle, order, following, real = star_of(coords, natural)
     here = coords.take_along_dim(order[..., None], dim=1)
     there = here.take_along_dim(following[..., None], dim=1)
     twice_area = here[..., 0] * there[..., 1] - here[..., 1] * there[..., 0]
     flat = 0.05 * here.norm(dim=-1) * there.norm(dim=-1)
-    triangle = (place < count) & (twice_area > flat)
+    triangle = real & (twice_area > flat)
     denominator = torch.where(triangle, twice_area, 1.0)
     # The angle opposite the edge to `here` sits at `there`, and the other way round.
     at_there = ((there - here) * there).sum(-1) / denominator

@@ -24,7 +24,6 @@ import numpy as np
 import torch
 from jaxtyping import Float
 from scipy import sparse
-from scipy.optimize import minimize_scalar
 from scipy.special import ive
 from torch import Tensor
 
@@ -280,6 +279,7 @@ def hyperbola(spread: float, tolerance: float) -> tuple[np.ndarray, np.ndarray]:
     >>> len(z), bool(abs((w * np.exp(z) / (z + 2.0)).sum().real - np.exp(-2.0)) < 1e-8)
     (16, True)
     """
+    from scipy.optimize import minimize_scalar
 
     def reach(alpha: float) -> float:
         left, right = np.pi - 2 * (alpha + SECTOR), 4 * alpha - np.pi + 2 * SECTOR

@@ -66,7 +66,7 @@ def lanczos(
     if null is not None:
         basis[0], dual[0] = null, mass_matrix @ null
     h, end = np.zeros((first, first)), first
-    z, look = generator.standard_normal((BLOCK, size)), first + count + BLOCK
+    z, look = generator.standard_normal((BLOCK, size)), first + 2 * count
     while end + BLOCK <= min(size, LONGEST * (count + BLOCK)):
         coupling = _orthogonalise(z, basis[:end], dual[:end], 1 if tolerance > LOOSE else 2)
         h[:, max(end - BLOCK, first) : end] = coupling.T if end > first else 0.0

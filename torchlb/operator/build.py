@@ -44,6 +44,8 @@ MANY = 0.5
 """Share of low-order rows from which on a warning names them."""
 DOUBTFUL = 0.1
 """Share of the points that do not resolve the surface of a cloud from which on a warning names them."""
+TOUCHING = 0.005
+"""Share of the points at which sheets of a cloud touch from which on a warning says where."""
 REMEDY = "do the points lie on a manifold of dimension {}? If not, pass its dimension as `dim`; else add points"
 
 
@@ -181,7 +183,7 @@ def _build_on_surface(
 
 
 def _warn_of_doubts(surface: CloudSurface, fits: VertexFits) -> None:
-    """A warning that names points where a cloud does not resolve its surface, if they are many."""
+    """Warnings that name points where a cloud does not resolve its surface, if they are many."""
     doubtful = fits.reason == REASONS.index("points do not resolve the surface")
     doubtful |= ~torch.isin(torch.arange(len(doubtful)), surface.faces)
     if float(doubtful.double().mean()) >= DOUBTFUL:
@@ -190,6 +192,11 @@ def _warn_of_doubts(surface: CloudSurface, fits: VertexFits) -> None:
         warn(
             f"points: at {len(index)} of {len(doubtful)} the cloud is too coarse or noisy for the surface through it "
             f"to be trusted ({names}); add points there, or give the mesh if there is one"
+        )
+    if surface.summary.contacts >= TOUCHING * len(doubtful):
+        warn(
+            f"points: {surface.summary.contact}; the surface may join what only touches there, or cut it. Add points "
+            "there, or give the mesh if there is one"
         )
 
 
@@ -294,9 +301,12 @@ def _finished(
     share = float(low.double().mean())
     if share >= MANY:
         reason = Reason(int(rows.reason[low].mode().values)).text
-        warn(
-            f"{share:.0%} of the points have only low-order rows, of first order at best; at most of them: {reason}. "
-            f"{remedy[:1].upper()}{remedy[1:]}; `print(lb.report)` says more"
-        )
+        reason += f". {remedy[:1].upper()}{remedy[1:]}; `print(lb.report)` says more"
+        if pair is not None and pair.fits is not None:
+            _, _, edges, curved = pair.fits.sum(1).tolist()
+            share_curved = f"{curved / max(edges, 1):.0%} of its edges curved"
+            reason += f". Spectrum, diffusion and solves have the weak pair, {share_curved}"
+        low_rows = "have only low-order rows for Δf and ∇f, of first order at best"
+        warn(f"{share:.0%} of the points {low_rows}; at most of them: {reason}")
     faces = torch.zeros(0, shape.frames.shape[-1] + 1, dtype=torch.int64)
     return AssembledOperator(rows, shape, source, asdict(options), certificate, pair, faces)

@@ -8,10 +8,10 @@ from typing import Any
 import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
-from scipy import sparse
-from scipy.sparse import csgraph
 from scipy.spatial import KDTree
 from torch import Tensor
+
+from torchlb.geometry.manifold import edges_of, two_orientations
 
 ArrayLike = Tensor | np.ndarray | Sequence[Any]
 """What becomes a tensor."""
@@ -153,9 +153,8 @@ def _triangles(vertices: Float[Tensor, "N n"], quads: Int[Tensor, "F 4"]) -> Int
 def turned_faces(faces: Int[Tensor, "F v"]) -> Bool[Tensor, " F"]:
     """Which triangles to turn round so that the two at an edge run along it in opposite directions.
 
-    Each face stands for two nodes, itself and itself turned round; joined across edges, an orientable component falls
-    into its two orientations, of which the one with fewer turned faces is taken. One that has one side only stays in
-    one piece, and as it is.
+    Of the two orientations of a component the one with fewer turned faces is taken. One that has one side only stays as
+    it is.
 
     >>> turned_faces(torch.tensor([[0, 1, 2], [1, 2, 3], [3, 2, 4]])).tolist()
     [True, False, False]
@@ -163,16 +162,10 @@ def turned_faces(faces: Int[Tensor, "F v"]) -> Bool[Tensor, " F"]:
     count = len(faces)
     if faces.shape[1] != 3 or count == 0:
         return torch.zeros(count, dtype=torch.bool)
-    start, end = (faces.roll(-i, 1).flatten() for i in (0, 1))
-    edge = torch.minimum(start, end) * (faces.max() + 1) + torch.maximum(start, end)
-    _, number, uses = torch.unique(edge, return_inverse=True, return_counts=True)
-    order = number.argsort(stable=True)
-    first, second = order[uses[number[order]] == 2].view(-1, 2).T
-    i, j = first // 3, second // 3
-    against = (start[first] == start[second]) * count
-    ends = torch.cat([i, i + count]), torch.cat([j + against, j + count - against])
-    graph = sparse.coo_array((np.ones(2 * len(i)), ends), shape=(2 * count, 2 * count))
-    own, other = csgraph.connected_components(graph, directed=False)[1].reshape(2, count)
+    edges = edges_of(faces.numpy(), int(faces.max()) + 1)
+    one, two = edges.twins
+    against = edges.ends[0][one] == edges.ends[0][two]
+    own, other = two_orientations(one // 3, two // 3, against, count)
     turned, component = own > other, np.minimum(own, other)
     share = np.bincount(component, turned) / np.maximum(np.bincount(component), 1)
     return torch.from_numpy(turned ^ (share > 0.5)[component])

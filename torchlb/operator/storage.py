@@ -188,7 +188,7 @@ class OperatorStorage(nn.Module):
 
     @property
     def spectral_bounds(self) -> Bounds:
-        """The ellipse that holds the spectrum of Δ, 1/ℓ²; found when the operator is built, and stored with it.
+        """The ellipse that holds the spectrum of Δ, 1/ℓ²; stored with the operator, once it was asked for.
 
         Beside a weak pair that of −D⁻¹K₁, the linear pair with lumped mass, by which flows beyond the basis are made.
         """
@@ -198,7 +198,7 @@ class OperatorStorage(nn.Module):
     @property
     def bounds(self) -> Tensor:
         """`spectral_bounds` as a float64 tensor (2,) on the CPU, NaN for no height, which compiled code can take."""
-        if self._bounds is None:  # from a file or state of an older torchlb
+        if self._bounds is None:  # of a bare stencil, or from an older torchlb
             self.set_bounds(spectral_bounds(*self._flow_matrix()))
         assert self._bounds is not None
         return self._bounds
@@ -290,7 +290,7 @@ class OperatorStorage(nn.Module):
         self.source, self.options = state["source"], dict(state["options"])
         found, sizes, bounds = (state.get(key) for key in ("certificate", "sizes", "bounds"))
         surface = state.get("surface")
-        self.surface = None if surface is None else SurfaceSummary(**surface)
+        self.surface = None if surface is None else SurfaceSummary.of(surface)
         self.certificate = None if found is None else Certificate(**found)
         self.sizes, self.parts = None if sizes is None else tuple(sizes), state.get("parts")
         self.set_bounds(bounds and Bounds(*bounds))

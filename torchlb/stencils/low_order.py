@@ -17,7 +17,7 @@ from torch import Tensor
 from torchlb.baseline.robust import robust_rows
 from torchlb.geometry.boundary import Boundary
 from torchlb.geometry.neighbors import GraphBalls, nearest_neighbors
-from torchlb.geometry.voronoi import cell_laplacian, cell_volume
+from torchlb.geometry.voronoi import cell_laplacian, cell_volume, unrolled
 
 
 class MeshLowOrder:
@@ -112,11 +112,8 @@ class CloudLowOrder:
             index[alone, : self.few] = self._nearest[centers[alone]]
             count[alone] = self.few
         offset = points[index[:, 1:]] - points[centers, None]
-        coords = offset @ frames[centers]
-        # Unrolled to their true distance, so that neighbours above one another do not collapse.
-        length = coords.norm(dim=-1, keepdim=True).clamp_min(torch.finfo(coords.dtype).tiny)
-        coords = coords * (offset.norm(dim=-1, keepdim=True) / length)
-        return index, coords, torch.arange(1, self.size) < count[:, None]
+        valid = torch.arange(1, self.size) < count[:, None]
+        return index, unrolled(offset, frames[centers]), valid
 
     @cached_property
     def _nearest(self) -> Int[Tensor, "N K"]:

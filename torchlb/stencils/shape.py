@@ -172,12 +172,14 @@ def surface_shape(
     start = GraphBalls(points, mesh_graph(triangles, len(points)), initial, sides)
     fits = VertexFits(start, fit_degrees) if fit_degrees else None
     balls, order = _refined(start, normal_order, num_neighbors, progress, fits)
-    edge = boundary_of_mesh(points, surface.faces, balls.frames, normal_order)
-    if edge is not None and len(surface.stars):
-        edge = _part(edge, edge.mask & ~torch.isin(torch.arange(len(points)), surface.stars))
-    found = torch.zeros(len(points), dtype=torch.bool) if edge is None else edge.mask
-    if boundary is not None and not torch.equal(boundary, found):
-        edge = boundary_of_cloud(points, boundary, balls.frames, normal_order)
+    edge = None
+    if condition is not None:
+        edge = boundary_of_mesh(points, surface.faces, balls.frames, normal_order)
+        if edge is not None and len(surface.stars):
+            edge = _part(edge, edge.mask & ~torch.isin(torch.arange(len(points)), surface.stars))
+        found = torch.zeros(len(points), dtype=torch.bool) if edge is None else edge.mask
+        if boundary is not None and not torch.equal(boundary, found):
+            edge = boundary_of_cloud(points, boundary, balls.frames, normal_order)
     low_order = MeshLowOrder(points, triangles)
     reference = None if flat else surface.normals if normals is None else normals
     shape = _oriented(balls, reference, order, low_order.areas(), low_order, edge, condition)
@@ -229,6 +231,7 @@ def _refined(
     )
     shared = candidates[0].size == fit_size(initial.shape[-1], degree)
     fits = fits if fits is not None and shared and degree == fits.degrees[0] else None
+    balls.keep(candidates[0].size)
     parts = chunks(len(points), candidates, initial.shape[-1])
     bar = tqdm(parts, "tangent frames", delay=2, disable=not progress, leave=False)
     found, order = zip(
@@ -236,7 +239,8 @@ def _refined(
         strict=True,
     )
     frames = torch.cat(found)
-    return GraphBalls(points, balls.graph, frames, _follow(balls.sides, frames)), torch.cat(order)
+    sides = _follow(balls.sides, frames)
+    return GraphBalls(points, balls.graph, frames, sides, balls.kept), torch.cat(order)
 
 
 def _oriented(
@@ -256,7 +260,7 @@ def _oriented(
         normals = righthanded if reference is None else _turned(righthanded, reference)
         hand = (normals * righthanded).sum(1)[:, None, None].sign()
         frames = torch.cat([hand * frames[..., :1], frames[..., 1:]], -1)
-    balls = GraphBalls(points, balls.graph, frames, balls.sides)
+    balls = GraphBalls(points, balls.graph, frames, balls.sides, balls.kept)
     if condition is None:
         boundary, condition = None, Condition()
     return Shape(points, frames, normals, order, balls, areas, low_order, boundary, condition)
