@@ -15,7 +15,8 @@ from torchlb import (
     heat_flow,
 )
 from torchlb.nn.checks import check_choice
-from torchlb.nn.diffusion_net import Place, _Dropout
+from torchlb.nn.diffusion_net import Block, Place
+from torchlb.nn.pointwise import Dropout
 from torchlb.surfaces import Circle, Sphere, Torus
 
 WIDTH, HIDDEN, BLOCKS = 8, [12, 10], 2
@@ -185,7 +186,7 @@ def test_block_is_its_formula(mesh):
     lb, _ = mesh
     block = DiffusionNetBlock(4, hidden=[6], dropout=False, gradient_features=False, k=30).double()
     x = torch.randn(300, 4).double()
-    diffused = heat_flow(lb, x, block.diffusion.time, k=30)
+    diffused = heat_flow(lb, x, block.diffusion.time, method="spectral", k=30)
     torch.testing.assert_close(block(x, lb), x + block.mlp(torch.cat([x, diffused], dim=1)))
 
 
@@ -200,7 +201,7 @@ def test_dropout_is_there_while_training_only(mesh):
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64, torch.bfloat16])
 def test_dropout_keeps_half_and_doubles_it(dtype):
     """Each value by a coin of its own, those of a seed again, the same ones in the gradient; any other share too."""
-    dropout, x = _Dropout(0.5), torch.ones(150, 77, dtype=dtype, requires_grad=True)
+    dropout, x = Dropout(0.5), torch.ones(150, 77, dtype=dtype, requires_grad=True)
     torch.manual_seed(0)
     y = dropout(x)
     assert y.dtype == dtype
@@ -215,7 +216,7 @@ def test_dropout_keeps_half_and_doubles_it(dtype):
     dropout.p = 0.9
     assert (dropout(x) > 0).double().mean() < 0.15
     assert dropout.eval()(x) is x
-    assert _Dropout(0.5)(x[:0]).shape == (0, 77)
+    assert Dropout(0.5)(x[:0]).shape == (0, 77)
 
 
 def test_a_curve_has_gradient_features_without_rotations():
@@ -229,6 +230,8 @@ def test_a_curve_has_gradient_features_without_rotations():
 def test_arguments_that_are_none():
     with pytest.raises(InputError, match="outputs_at: expected one of"):
         check_choice("outputs_at", "volumes", Place)
+    with pytest.raises(InputError, match="block: expected one of"):
+        check_choice("block", "heat", Block)
     with pytest.raises(InputError, match="expected 3 channels"):
         DiffusionNet(3, 5)(
             torch.zeros(100, 2), LaplaceBeltrami.from_points(Sphere().points(100).float())

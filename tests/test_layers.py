@@ -16,8 +16,11 @@ from torchlb import (
     Diffusion,
     DiffusionNet,
     GradientFeatures,
+    ImplicitDiffusion,
     InputError,
     LaplaceBeltrami,
+    PoissonBlock,
+    PoissonFeatures,
     SpectralConv,
     diffusion_map,
     heat_flow,
@@ -25,7 +28,10 @@ from torchlb import (
     spectral_wavelets,
     wave_kernel_signature,
 )
-from torchlb.surfaces import Circle, Ellipsoid, Sphere, Torus
+from torchlb.nn import systems
+from torchlb.nn.diffusion import LearnedTimes, raw_of_time
+from torchlb.nn.solves import implicit_step, potential
+from torchlb.surfaces import Circle, Ellipsoid, Sphere, Torus, UnitDisk
 
 needs_compiler = pytest.mark.skipif(
     not any(map(shutil.which, ("c++", "g++", "clang++", "cl"))),
@@ -40,9 +46,14 @@ LAYERS = {
     "chebyshev": lambda: Diffusion(CHANNELS, method="chebyshev"),
     "contour": lambda: Diffusion(CHANNELS, method="contour"),
     "convolution": lambda: SpectralConv(CHANNELS, 3, k=K),
+    "implicit": lambda: ImplicitDiffusion(CHANNELS, tolerance=1e-8),
     "gradients": lambda: GradientFeatures(CHANNELS),
+    "poisson": lambda: PoissonFeatures(CHANNELS),
+    "poisson block": lambda: PoissonBlock(CHANNELS),
     "net": lambda: DiffusionNet(CHANNELS, 5, **SMALL),
     "original net": lambda: DiffusionNet(CHANNELS, 5, method="spectral", **SMALL),
+    "implicit net": lambda: DiffusionNet(CHANNELS, 5, block="implicit", **SMALL),
+    "poisson net": lambda: DiffusionNet(CHANNELS, 5, block="poisson", **SMALL),
     "classifier": lambda: DiffusionNet(CHANNELS, 5, outputs_at="global_mean", **SMALL),
 }
 every_layer = pytest.mark.parametrize("name", LAYERS)
@@ -52,7 +63,7 @@ def layer_of(name, dtype=torch.float32):
     """A layer with times that differ, in evaluation."""
     layer = LAYERS[name]().to(dtype).eval()
     for part in layer.modules():
-        if isinstance(part, Diffusion):
+        if isinstance(part, LearnedTimes):
             torch.nn.init.uniform_(part.raw_time, -0.02, 0.3)
     return layer
 
@@ -95,6 +106,88 @@ def test_a_batch_of_eight_shapes_gives_what_they_give_one_by_one(eight, name):
     ours, theirs = (torch.autograd.grad(y.square().sum(), parameters) for y in (together, expected))
     for a, b in zip(ours, theirs, strict=True):
         torch.testing.assert_close(a, b, rtol=1e-3, atol=1e-4 * float(b.abs().max()))
+
+
+SOLVING = {
+    "implicit": lambda: ImplicitDiffusion(2, tolerance=1e-13),
+    "poisson": lambda: PoissonBlock(2, tolerance=1e-13),
+    "poisson, linear": lambda: PoissonBlock(2),
+}
+
+
+@pytest.mark.parametrize("name", SOLVING)
+@pytest.mark.parametrize("kind", ["pair", "stencil", "cotangent", "dirichlet"])
+def test_layers_that_solve_pass_gradcheck(name, kind):
+    """In x and in every parameter, learned times among them."""
+    vertices, faces = Sphere().mesh(40) if kind != "dirichlet" else UnitDisk().mesh(40)
+    lb = {
+        "pair": lambda: LaplaceBeltrami.from_mesh(vertices, faces),
+        "stencil": lambda: stencil_of_mesh(vertices, faces),
+        "cotangent": lambda: LaplaceBeltrami.from_cotangent(vertices, faces),
+        "dirichlet": lambda: LaplaceBeltrami.from_mesh(vertices, faces, condition="dirichlet"),
+    }[kind]()
+    torch.manual_seed(0)
+    layer = SOLVING[name]().double().eval()
+    if name == "implicit":
+        torch.nn.init.uniform_(layer.raw_time, 0.05, 0.3)
+    x = torch.randn(len(vertices), 2, dtype=torch.float64, requires_grad=True)
+    names, values = zip(*layer.named_parameters(), strict=True)
+
+    def run(x, *given):
+        return torch.func.functional_call(layer, dict(zip(names, given, strict=True)), (x, lb))
+
+    assert torch.autograd.gradcheck(run, (x, *values), fast_mode=True)
+
+
+@pytest.mark.parametrize("name", SOLVING)
+def test_a_batch_solves_with_the_factors_of_its_shapes(monkeypatch, name):
+    """What they give one by one to 1e-10, and no system is made for the batch."""
+    shapes = [
+        LaplaceBeltrami.from_mesh(*surface.mesh(n))
+        for surface, n in ((Sphere(), 60), (Torus(), 90))
+    ]
+    layer = SOLVING[name]().double().eval()
+    x = [features(lb, 2) for lb in shapes]
+    alone = torch.cat([layer(f, lb) for f, lb in zip(x, shapes, strict=True)])
+    batch, made = LaplaceBeltrami.batch(shapes), []
+    monkeypatch.setattr(systems.PairSystem, "__init__", lambda *_: made.append(1))
+    torch.testing.assert_close(layer(torch.cat(x), batch), alone, rtol=1e-10, atol=1e-10)
+    assert not made
+    monkeypatch.undo()
+    other = copy.deepcopy(batch)  # knows nothing of its shapes
+    torch.testing.assert_close(layer(torch.cat(x), other), alone, rtol=1e-9, atol=1e-9)
+
+
+def test_implicit_diffusion_is_the_step_of_every_channel():
+    """Times over four decades share factors and differ from a solve each by no more than the tolerance."""
+    lb = LaplaceBeltrami.from_mesh(*Torus().mesh(300))
+    layer = ImplicitDiffusion(9, tolerance=1e-10).double()
+    times = torch.logspace(-4, 0.5, 9, dtype=torch.float64)
+    layer.raw_time.data = raw_of_time(times)
+    x = features(lb, 9)
+    y = layer(x, lb)
+    expected = torch.cat([implicit_step(lb, x[:, c : c + 1], float(times[c])) for c in range(9)], 1)
+    torch.testing.assert_close(y, expected, rtol=1e-7, atol=1e-8)
+
+
+@pytest.mark.parametrize("kind", ["mesh", "cotangent", "points"])
+def test_the_potential_of_a_gradient_is_the_function(kind):
+    """But for its mean, to the order of what solves; of a turned gradient it is zero."""
+    vertices, faces = Ellipsoid().mesh(800)
+    lb = {
+        "mesh": lambda: LaplaceBeltrami.from_mesh(vertices, faces),
+        "cotangent": lambda: LaplaceBeltrami.from_cotangent(vertices, faces),
+        "points": lambda: LaplaceBeltrami.from_points(vertices),
+    }[kind]()
+    f = vertices[:, :1] * vertices[:, 1:2]
+    f = f - (lb.mass @ f) / lb.mass.sum()
+    gradient = lb.local_gradient(f)
+    turned = torch.stack([-gradient[:, 1], gradient[:, 0]], 1)
+    for tolerance, bound in ((None, 0.03), (1e-10, 0.01)):
+        bound = 0.1 if kind == "cotangent" else bound  # whose gradient is first order
+        size = f.abs().max()
+        assert (potential(lb, gradient, tolerance=tolerance) - f).abs().max() <= bound * size
+        assert potential(lb, turned, tolerance=tolerance).abs().max() <= bound * size
 
 
 @pytest.mark.parametrize("cached", [1, 4 * 250, 4 * 10000])
@@ -231,7 +324,7 @@ def test_autocast_to_bfloat16_stays_close(eight, name):
     with torch.autocast("cpu", dtype=torch.bfloat16):
         y = layer(x, lb)
         half = layer(x.bfloat16(), lb)
-    exact = name in ("deflated", "spectral", "chebyshev", "contour", "convolution")
+    exact = name in ("deflated", "spectral", "chebyshev", "contour", "convolution", "implicit")
     scale = float(expected.detach().abs().max())
     assert (y.float() - expected).abs().max() <= (1e-6 if exact else 0.2) * scale
     assert (half.float() - expected).abs().max() <= 0.2 * scale

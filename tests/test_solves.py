@@ -13,7 +13,7 @@ from builders import stencil_of_cloud
 from torchlb import DiffusionError, InputError, LaplaceBeltrami, implicit_step, poisson_solve
 from torchlb.linalg.conjugate_gradients import conjugate_gradients
 from torchlb.nn import systems
-from torchlb.surfaces import Sphere, Torus, UnitDisk
+from torchlb.surfaces import Ellipsoid, Sphere, StarShaped, Torus, UnitDisk
 
 
 def disk(n, condition):
@@ -317,3 +317,11 @@ def test_features_of_another_shape():
     ):
         with pytest.raises(InputError, match="N = 60"):
             solve()
+
+
+@pytest.mark.parametrize("surface", [Ellipsoid(), StarShaped()], ids=["ellipsoid", "star"])
+def test_pairs_in_single_precision_keep_a_cholesky_factor(surface):
+    """Rounded, rows of K do not sum to zero, and constants would make K + εM indefinite."""
+    for build in (LaplaceBeltrami.from_cotangent, LaplaceBeltrami.from_mesh):
+        lb = build(*surface.mesh(300)).float()
+        assert all(systems.system(lb, t).factor.is_cholesky for t in (None, 1e6))

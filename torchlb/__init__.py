@@ -25,6 +25,8 @@ from torchlb.nn.diffusion import Diffusion, heat_flow
 from torchlb.nn.diffusion_net import DiffusionNet, DiffusionNetBlock
 from torchlb.nn.geodesics import geodesic_distance
 from torchlb.nn.gradient_features import GradientFeatures
+from torchlb.nn.implicit_diffusion import ImplicitDiffusion
+from torchlb.nn.poisson_block import PoissonBlock, PoissonFeatures
 from torchlb.nn.solves import implicit_step, poisson_solve
 from torchlb.nn.spectral_conv import SpectralConv
 from torchlb.operator.cleaning import clean_mesh, clean_points
@@ -52,9 +54,12 @@ __all__ = [
     "Eigenbasis",
     "EigenbasisError",
     "GradientFeatures",
+    "ImplicitDiffusion",
     "InputError",
     "LaplaceBeltrami",
     "OperatorFileError",
+    "PoissonBlock",
+    "PoissonFeatures",
     "PrecomputeReport",
     "ShapeResult",
     "SpectralConv",

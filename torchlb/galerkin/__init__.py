@@ -3,5 +3,5 @@
 `elements`: Lagrange triangles and segments. `flips`: folded triangles and slivers out of the way. `nodes`: their
 numbers on a mesh. `rim`: curves through its boundary. `curving`: where the nodes stand on the surface, and where it is
 left flat. `prolongation`: P, from the vertices to the nodes. `assembly`: K_FE and M_FE. `pair`: PᵀK_FE P, PᵀM_FE P and
-the positive mass.
+the positive mass. `medium`: the same for a conductivity.
 """

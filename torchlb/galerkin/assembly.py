@@ -8,6 +8,7 @@ from scipy import sparse
 from torch import Tensor
 
 from torchlb.galerkin.elements import Element
+from torchlb.geometry.vectors import dot
 
 CHUNK = 2**14
 """Elements at a time: some 100 MB."""
@@ -16,7 +17,7 @@ CHUNK = 2**14
 def metric(places: Float[Tensor, "T n 3"], shape: Element) -> Float[Tensor, "T Q 3"]:
     """G = JᵀJ at the Gauss points of elements with nodes at `places`, as (g_ξξ, g_ξη, g_ηη), ℓ²."""
     x, y = (torch.einsum("qn,tnc->tqc", slope, places) for slope in shape.gradients.unbind(-1))
-    return torch.stack([(x * x).sum(-1), (x * y).sum(-1), (y * y).sum(-1)], dim=-1)
+    return torch.stack([dot(x, x), dot(x, y), dot(y, y)], dim=-1)
 
 
 def flat_metric(lengths: Float[Tensor, "T 3"]) -> Float[Tensor, "T 3"]:
@@ -35,9 +36,13 @@ def area_element(g: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch"]:
 
 
 def assemble(
-    g: Float[Tensor, "T Q 3"], nodes: Int[Tensor, "T n"], shape: Element, num_nodes: int
+    g: Float[Tensor, "T Q 3"],
+    nodes: Int[Tensor, "T n"],
+    shape: Element,
+    num_nodes: int,
+    conductivity: Float[Tensor, "T Q"] | None = None,
 ) -> sparse.csr_array:
-    """K_FE + i M_FE, both symmetric: ∫ ∇φ_i·∇φ_j, without a unit, and ∫ φ_i φ_j, ℓ².
+    """K_FE + i M_FE, both symmetric: ∫ κ∇φ_i·∇φ_j, without a unit, and ∫ φ_i φ_j, ℓ²; κ = 1 unless given.
 
     Two real matrices on one pattern, so that they are summed, and later multiplied, at once.
     """
@@ -50,6 +55,8 @@ def assemble(
     for part in torch.arange(len(nodes)).split(CHUNK):
         root = area_element(g[part])
         adjugate = shape.weights[:, None] * g[part] / root[..., None]
+        if conductivity is not None:
+            adjugate = conductivity[part, :, None] * adjugate
         stiffness = adjugate.flatten(1) @ gradients
         blocks.append(torch.complex(stiffness, (shape.weights * root) @ squares))
     return _summed(torch.cat(blocks), nodes, num_nodes)

@@ -81,13 +81,20 @@ def mesh_pair(
 
     A third of the flat triangles `stars` is added.
     """
+    return weak_pair(fitted_surface(points, faces, fits), faces, degree, stars)
+
+
+def fitted_surface(
+    points: Float[Tensor, "N n"], faces: Int[Tensor, "F 3"], fits: VertexFits
+) -> Surface:
+    """A mesh in the plane or in space with the fits of its vertices, in space."""
     if points.shape[1] == 2:
         points, fits = pad(points, (0, 1)), copy(fits)
         fits.frames, fits.heights = pad(fits.frames, (0, 0, 0, 1)), pad(fits.heights, (0, 1))
     outward = vertex_normals(points, faces)
     normals = normals_of_frames(fits.frames)
     normals = normals * (normals * outward).sum(1, keepdim=True).sign()
-    return weak_pair(Surface(points, fits.frames, normals, fits), faces, degree, stars)
+    return Surface(points, fits.frames, normals, fits)
 
 
 def weak_pair(
@@ -103,22 +110,22 @@ def weak_pair(
     count = len(surface.points)
     mesh = curve(surface, lagrange_nodes(faces, count, max(degree, 2)))
     linear = _linear(mesh.lengths, faces, count)
-    extra = _star_pair(surface.points, stars) if stars is not None and len(stars) else None
     if degree == 1:
-        return WeakPair(_stored(linear), mass=torch.from_numpy(_row_sums(linear)))
+        return WeakPair(stored(linear), mass=torch.from_numpy(_row_sums(linear)))
     shape, nodes = triangle(degree), mesh.nodes
     p = prolongation(surface, mesh)
     elements = assemble(mesh.metric, nodes.elements, shape, len(mesh.places))
     pair = sparse.csr_array(p.T) @ (elements @ p)
     mass = positive_mass(p, _row_sums(elements), mesh, linear)
-    if extra is not None:
+    if stars is not None and len(stars):
+        extra = _star_pair(surface.points, stars)
         pair, linear, mass = pair + extra, linear + extra, mass + _row_sums(extra)
     rim = None if len(mesh.rim) == 0 else p.T @ (_rim_mass(mesh) @ p)
     ends = nodes.edges.flatten()
     edges = [torch.bincount(e, minlength=count) for e in (ends, nodes.edges[mesh.curved].flatten())]
     return WeakPair(
-        _stored(pair, rim),
-        _stored(linear),
+        stored(pair, rim),
+        stored(linear),
         torch.from_numpy(mass),
         torch.stack([surface.fits.degree, surface.fits.reason, *edges]),
     )
@@ -181,7 +188,7 @@ def _rim_mass(mesh: CurvedMesh) -> sparse.csr_array:
     return assemble_mass(speed, elements, shape, len(mesh.places))
 
 
-def _stored(pair: Any, rim: Any = None) -> SparsePair:
+def stored(pair: Any, rim: Any = None) -> SparsePair:
     """Exactly symmetric, with rows of K that sum to zero, as real parts on one pattern."""
     pair = sparse.csr_array(pair)
     pair.sort_indices()

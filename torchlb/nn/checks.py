@@ -3,13 +3,18 @@
 from __future__ import annotations
 
 import warnings
-from typing import Any, get_args
+from collections.abc import Callable
+from functools import wraps
+from typing import Any, ParamSpec, TypeVar, get_args
 
 import torch
 from torch import Tensor
 
 from torchlb.errors import InputError
 from torchlb.operator.laplace_beltrami import LaplaceBeltrami
+
+P = ParamSpec("P")
+T = TypeVar("T")
 
 
 def check_shape(x: Tensor, lb: LaplaceBeltrami) -> None:
@@ -67,6 +72,19 @@ def check_features(
                 stacklevel=2,
             )
     return torch.promote_types(x.dtype, torch.float32)
+
+
+def uncompiled(function: Callable[P, T]) -> Callable[P, T]:
+    """`torch.compiler.disable`, put off until something is compiled: it loads the compiler, in more than a second."""
+
+    @wraps(function)
+    def called(*args: P.args, **options: P.kwargs) -> T:
+        if torch.compiler.is_compiling():
+            disabled: Any = torch.compiler.disable(function)
+            return disabled(*args, **options)
+        return function(*args, **options)
+
+    return called
 
 
 def check_choice(name: str, value: str, choices: Any) -> None:

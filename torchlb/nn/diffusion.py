@@ -206,7 +206,21 @@ def _expanded(
     return y.view(x.shape[1], x.shape[0], x.shape[2]).transpose(0, 1)
 
 
-class Diffusion(nn.Module):
+class LearnedTimes(nn.Module):
+    """A time of its own for each channel, positive by parametrisation."""
+
+    def __init__(self, channels: int, init_time: float) -> None:
+        super().__init__()
+        self.channels = channels
+        self.raw_time = nn.Parameter(raw_of_time(torch.full((channels,), init_time)))
+
+    @property
+    def time(self) -> Float[Tensor, " C"]:
+        """Diffusion times t > 0, ℓ²."""
+        return softplus(self.raw_time, beta=SHARPNESS)
+
+
+class Diffusion(LearnedTimes):
     """Diffusion of each channel for a time of its own, which is learned: y_c = e^{t_c Δ}x_c.
 
     Parameters
@@ -240,15 +254,9 @@ class Diffusion(nn.Module):
         init_time: float = 0.01,
         tolerance: float = TOLERANCE,
     ) -> None:
-        super().__init__()
-        self.channels, self.method = channels, checked_method(method)
+        super().__init__(channels, init_time)
+        self.method = checked_method(method)
         self.k, self.tolerance = k, tolerance
-        self.raw_time = nn.Parameter(raw_of_time(torch.full((channels,), init_time)))
-
-    @property
-    def time(self) -> Float[Tensor, " C"]:
-        """Diffusion times t > 0, ℓ²."""
-        return softplus(self.raw_time, beta=SHARPNESS)
 
     def forward(self, x: Float[Tensor, "*B N C"], lb: LaplaceBeltrami) -> Float[Tensor, "*B N C"]:
         """The diffused features, of the shape and type of x: (N, C), or (B, N, C) on one surface."""

@@ -1,13 +1,12 @@
 """DiffusionNet (Sharp, Attaiki, Crane, Ovsjanikov 2022) on any operator: diffusion, gradients, pointwise networks.
 
-What differs from the original: the operator comes in as one argument, `forward(x, lb)`; diffusion is "deflated" unless
-asked to be the original's "spectral"; learned times are positive by parametrisation; batches of different shapes are
-one operator. Its trained weights load: `load_original_state_dict`.
+What differs from the original: the operator comes in as one argument, `forward(x, lb)`; learned times are positive by
+parametrisation; batches of different shapes are one operator; diffusion may be other than "spectral". Weights trained
+on the original load: `load_original_state_dict`.
 """
 
 from __future__ import annotations
 
-from collections import OrderedDict
 from collections.abc import Callable, Mapping, Sequence
 from typing import Literal
 
@@ -19,37 +18,15 @@ from torchlb.errors import InputError
 from torchlb.nn.checks import check_choice, check_features
 from torchlb.nn.diffusion import Diffusion, Method, raw_of_time
 from torchlb.nn.gradient_features import GradientFeatures
+from torchlb.nn.implicit_diffusion import ImplicitDiffusion
+from torchlb.nn.pointwise import mlp
+from torchlb.nn.poisson_block import PoissonBlock
 from torchlb.operator.laplace_beltrami import LaplaceBeltrami
 
 Place = Literal["vertices", "edges", "faces", "global_mean"]
+Block = Literal["diffusion", "implicit", "poisson"]
 LEAST_TIME = 1e-8
 """What the original cuts its times to before it uses them, ℓ²."""
-
-
-class _Dropout(nn.Dropout):
-    """`nn.Dropout`, but where half is dropped on the CPU a random bit decides, and not a random number for each value.
-
-    Except with Intel's library the numbers take ten times as long, a sixth of a training step.
-    """
-
-    def forward(self, input: Tensor) -> Tensor:
-        if not self.training or self.p != 0.5 or input.device.type != "cpu":
-            return super().forward(input)
-        count, place = input.numel(), torch.arange(8, dtype=torch.uint8)
-        bits = torch.randint(256, (-(-count // 8),), dtype=torch.uint8) >> place[:, None] & 1
-        return input * (2 * bits.flatten()[:count].view(input.shape))
-
-
-def _mlp(sizes: Sequence[int], dropout: bool) -> nn.Sequential:
-    """Linear layers with ReLU between them, and half of the values dropped before each but the first."""
-    layers: OrderedDict[str, nn.Module] = OrderedDict()
-    for i in range(len(sizes) - 1):
-        if i > 0:
-            layers[f"relu_{i}"] = nn.ReLU(inplace=True)
-        if i > 0 and dropout:
-            layers[f"dropout_{i}"] = _Dropout(0.5)
-        layers[f"linear_{i}"] = nn.Linear(sizes[i], sizes[i + 1])
-    return nn.Sequential(layers)
 
 
 class DiffusionNetBlock(nn.Module):
@@ -61,7 +38,7 @@ class DiffusionNetBlock(nn.Module):
     hidden : widths of the hidden layers of the pointwise network; [width, width] by default.
     dropout : whether that network drops half of its hidden values while it trains.
     gradient_features, rotations : whether there are any, and whether they turn: see `GradientFeatures`.
-    method, k : of `Diffusion`.
+    method, k : of `Diffusion`; method="implicit" takes `ImplicitDiffusion` in its place.
     """
 
     def __init__(
@@ -72,17 +49,21 @@ class DiffusionNetBlock(nn.Module):
         dropout: bool = True,
         gradient_features: bool = True,
         rotations: bool = True,
-        method: Method = "deflated",
+        method: Method | Literal["implicit"] = "spectral",
         k: int = 128,
     ) -> None:
         super().__init__()
-        self.diffusion = Diffusion(width, method=method, k=k)
+        self.diffusion = (
+            ImplicitDiffusion(width)
+            if method == "implicit"
+            else Diffusion(width, method=method, k=k)
+        )
         self.gradient_features = (
             GradientFeatures(width, rotations=rotations) if gradient_features else None
         )
         inputs = 3 if gradient_features else 2
         hidden = [width, width] if hidden is None else hidden
-        self.mlp = _mlp([inputs * width, *hidden, width], dropout)
+        self.mlp = mlp([inputs * width, *hidden, width], dropout)
 
     def forward(self, x: Float[Tensor, "*B N C"], lb: LaplaceBeltrami) -> Float[Tensor, "*B N C"]:
         """Features (N, width) or (B, N, width) in the shape of x."""
@@ -96,18 +77,24 @@ class DiffusionNetBlock(nn.Module):
 class DiffusionNet(nn.Module):
     """A network of `num_blocks` blocks between two pointwise linear maps.
 
+    Blocks communicate by diffusion in an eigenbasis, "diffusion", or without one: by an "implicit" step of diffusion
+    (`ImplicitDiffusion`), or by a Poisson solve, "poisson" (`PoissonBlock`).
+
     Parameters
     ----------
     in_channels, out_channels : of the features and of the output.
     width : channels of the blocks.
-    num_blocks : number of `DiffusionNetBlock`.
+    num_blocks : number of blocks.
+    block : "diffusion", "implicit" or "poisson".
     outputs_at : "vertices", "edges", "faces" (means over the corners) or "global_mean" (over the surface, by mass).
     last_activation : applied to the output, such as ``lambda y: y.log_softmax(-1)``.
-    hidden, dropout, gradient_features, rotations, method, k : of the blocks.
+    hidden, dropout, rotations : of the blocks.
+    gradient_features : of "diffusion" and "implicit" blocks.
+    method, k : of "diffusion" blocks.
 
     Raises
     ------
-    InputError : for a method or a place that is none.
+    InputError : for a block, a method or a place that is none.
 
     Examples
     --------
@@ -125,30 +112,29 @@ class DiffusionNet(nn.Module):
         *,
         width: int = 128,
         num_blocks: int = 4,
+        block: Block = "diffusion",
         outputs_at: Place = "vertices",
         last_activation: Callable[[Tensor], Tensor] | None = None,
         hidden: Sequence[int] | None = None,
         dropout: bool = True,
         gradient_features: bool = True,
         rotations: bool = True,
-        method: Method = "deflated",
+        method: Method = "spectral",
         k: int = 128,
     ) -> None:
         super().__init__()
         check_choice("outputs_at", outputs_at, Place)
+        check_choice("block", block, Block)
         self.in_channels, self.out_channels = in_channels, out_channels
         self.outputs_at, self.last_activation = outputs_at, last_activation
         self.first_lin = nn.Linear(in_channels, width)
+        shared = {"hidden": hidden, "dropout": dropout, "rotations": rotations}
+        diffusing = {"gradient_features": gradient_features, "k": k}
+        diffusing["method"] = "implicit" if block == "implicit" else method
         self.blocks = nn.ModuleList(
-            DiffusionNetBlock(
-                width,
-                hidden=hidden,
-                dropout=dropout,
-                gradient_features=gradient_features,
-                rotations=rotations,
-                method=method,
-                k=k,
-            )
+            PoissonBlock(width, **shared)
+            if block == "poisson"
+            else DiffusionNetBlock(width, **shared, **diffusing)
             for _ in range(num_blocks)
         )
         self.last_lin = nn.Linear(width, out_channels)

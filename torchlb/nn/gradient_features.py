@@ -12,21 +12,14 @@ from torchlb.nn.checks import check_features
 from torchlb.operator.laplace_beltrami import LaplaceBeltrami
 
 
-class GradientFeatures(nn.Module):
-    """Features tanh(Re⟨∇x_c, Σ_j A_cj ∇x_j⟩) of the gradients, the same in any tangent frame.
+class TangentMap(nn.Module):
+    """A learned linear map of the gradients of C channels, Σ_j A_cj ∇x_j, that commutes with turns of the frames.
 
     Parameters
     ----------
     channels : C.
     rotations : whether A is complex, so that it also turns gradients in the tangent plane; that needs a surface whose
         normals are oriented consistently (a mesh, or a cloud with oriented normals). Without it, any dimension.
-
-    Examples
-    --------
-    >>> theta = torch.arange(36) * torch.pi / 18
-    >>> lb = LaplaceBeltrami.from_points(torch.stack([theta.cos(), theta.sin()], dim=1))
-    >>> GradientFeatures(3, rotations=False)(torch.ones(36, 3), lb).abs().max() < 1e-5
-    tensor(True)
     """
 
     def __init__(self, channels: int, *, rotations: bool = True) -> None:
@@ -38,16 +31,37 @@ class GradientFeatures(nn.Module):
         else:
             self.A = nn.Linear(channels, channels, bias=False)
 
-    def forward(self, x: Float[Tensor, "*B N C"], lb: LaplaceBeltrami) -> Float[Tensor, "*B N C"]:
-        """The features of x, (N, C) or (B, N, C), in its shape and type."""
+    def gradients(self, x: Tensor, lb: LaplaceBeltrami) -> tuple[Tensor, Tensor]:
+        """∇x in the frames, and what the map makes of it, (…, N, d, C); x of (N, C) or (B, N, C)."""
         check_features(x, lb, self.channels, next(self.parameters()))
         if self.rotations and lb.dim != 2:
             raise InputError(f"rotations need a surface, got dim={lb.dim}; use rotations=False")
-        gradient = lb.local_gradient(x).to(x.dtype)  # (…, N, d, C)
-        if self.rotations:  # z ↦ Az of complex numbers is a real map of both parts side by side
-            upper = torch.cat([self.A_re.weight, -self.A_im.weight], dim=1)
-            lower = torch.cat([self.A_im.weight, self.A_re.weight], dim=1)
-            mapped = linear(gradient.flatten(-2), torch.cat([upper, lower])).view_as(gradient)
-        else:
-            mapped = self.A(gradient)
+        gradient = lb.local_gradient(x).to(x.dtype)
+        if not self.rotations:
+            return gradient, self.A(gradient)
+        # z ↦ Az of complex numbers is a real map of both parts side by side
+        upper = torch.cat([self.A_re.weight, -self.A_im.weight], dim=1)
+        lower = torch.cat([self.A_im.weight, self.A_re.weight], dim=1)
+        mapped = linear(gradient.flatten(-2), torch.cat([upper, lower]))
+        return gradient, mapped.view_as(gradient)
+
+
+class GradientFeatures(TangentMap):
+    """Features tanh(Re⟨∇x_c, Σ_j A_cj ∇x_j⟩) of the gradients, the same in any tangent frame.
+
+    Parameters
+    ----------
+    channels, rotations : C, and whether A is complex, see `TangentMap`.
+
+    Examples
+    --------
+    >>> theta = torch.arange(36) * torch.pi / 18
+    >>> lb = LaplaceBeltrami.from_points(torch.stack([theta.cos(), theta.sin()], dim=1))
+    >>> GradientFeatures(3, rotations=False)(torch.ones(36, 3), lb).abs().max() < 1e-5
+    tensor(True)
+    """
+
+    def forward(self, x: Float[Tensor, "*B N C"], lb: LaplaceBeltrami) -> Float[Tensor, "*B N C"]:
+        """The features of x, (N, C) or (B, N, C), in its shape and type."""
+        gradient, mapped = self.gradients(x, lb)
         return torch.tanh((gradient * mapped).sum(-2))

@@ -18,6 +18,7 @@ from numpy.polynomial import chebyshev
 from torch import Tensor
 
 from torchlb.linalg.sparse import multiply
+from torchlb.nn.checks import uncompiled
 from torchlb.nn.systems import PairSystem, system
 from torchlb.operator.laplace_beltrami import LaplaceBeltrami
 
@@ -54,7 +55,7 @@ class _Flow(torch.autograd.Function):
         return grad_x, (slope * x).sum(0), None, None
 
 
-_flow: Any = torch.compiler.disable(_Flow.apply)
+_flow: Any = uncompiled(_Flow.apply)
 
 
 def _summed(

@@ -10,14 +10,15 @@ from torch import Tensor
 
 from torchlb.errors import InputError
 from torchlb.linalg.sparse import csr_product
-from torchlb.nn.checks import as_times, check_shape
-from torchlb.nn.systems import system
+from torchlb.nn.checks import as_times, check_shape, uncompiled
+from torchlb.nn.conduction import Conducting, conducting
+from torchlb.nn.systems import solve_columns
 from torchlb.operator.laplace_beltrami import LaplaceBeltrami
 
 TOLERANCE = 1e-10
 
 
-@torch.compiler.disable
+@uncompiled
 def implicit_step(
     lb: LaplaceBeltrami,
     f: Float[Tensor, "*B N C"] | Float[Tensor, " N"],
@@ -25,6 +26,7 @@ def implicit_step(
     *,
     boundary_values: Tensor | float | None = None,
     flux: Tensor | float | None = None,
+    conductivity: Tensor | None = None,
     tolerance: float = TOLERANCE,
 ) -> Tensor:
     """(1 − tΔ)⁻¹f, one implicit Euler step of heat flow; differentiable in f, t and the boundary's data.
@@ -39,7 +41,9 @@ def implicit_step(
     t : time ≥ 0 in ℓ², one for all channels or (C,).
     boundary_values : u at the points of a Dirichlet condition, a number or of the shape of f, of which only those
         points count; 0 by default.
-    flux : ∂_ν u along the rest of the boundary, units of f by 1/ℓ, in the same way; 0 by default.
+    flux : κ∂_ν u along the rest of the boundary, units of f by 1/ℓ, in the same way; 0 by default.
+    conductivity : κ > 0 of u − t div(κ∇u) = f, of the vertices (N,), its logarithm prolonged as the surface is, or of
+        the faces (F,); 1 by default. On meshes, with the weak pair or the cotangent's; differentiable in it, too.
     tolerance : of the solver, relative.
 
     Raises
@@ -60,22 +64,24 @@ def implicit_step(
     check_shape(x, lb)
     columns, time = _columns(x, as_times(t, x, torch.float64))
     given, poured = (_data(lb, d, n, f) for d, n in ((boundary_values, 0), (flux, 1)))
+    medium = lb if conductivity is None else conducting(lb, conductivity)
     right = _mass(lb, columns)
     if poured is not None:
         right = right + time * _product(lb, 2, poured)
     if given is not None:
-        right = right - _product(lb, 1, given) - time * _product(lb, 0, given)
-    u = _solve(right, time, lb, tolerance)
+        right = right - _product(lb, 1, given) - time * _product(medium, 0, given)
+    u = _solve(right, time, conductivity, given, medium, tolerance)
     return _shaped(u if given is None else u + given, f)
 
 
-@torch.compiler.disable
+@uncompiled
 def poisson_solve(
     lb: LaplaceBeltrami,
     f: Float[Tensor, "*B N C"] | Float[Tensor, " N"],
     *,
     boundary_values: Tensor | float | None = None,
     flux: Tensor | float | None = None,
+    conductivity: Tensor | None = None,
     tolerance: float = TOLERANCE,
 ) -> Tensor:
     """u with −Δu = f; differentiable in f and the boundary's data. Units of f by ℓ².
@@ -97,13 +103,40 @@ def poisson_solve(
     check_shape(x, lb)
     columns, _ = _columns(x, None)
     given, poured = (_data(lb, d, n, f) for d, n in ((boundary_values, 0), (flux, 1)))
+    medium = lb if conductivity is None else conducting(lb, conductivity)
     right = _mass(lb, columns)
     if poured is not None:
         right = right + _product(lb, 2, poured)
     if given is not None:
-        right = right - _product(lb, 0, given)
-    u = _solve(right, None, lb, tolerance)
+        right = right - _product(medium, 0, given)
+    u = _solve(right, None, conductivity, given, medium, tolerance)
     return _shaped(u if given is None else u + given, f)
+
+
+@uncompiled
+def potential(
+    lb: LaplaceBeltrami, field: Float[Tensor, "*B N d C"], *, tolerance: float | None = None
+) -> Float[Tensor, "*B N C"]:
+    """u of mean zero whose gradient is closest to a tangent field v, given in the frames; differentiable in v.
+
+    Ku = Σ_c G_cᵀ(π v_c), G the rows of the gradient and π the mass: u is f less its mean where v = ∇f, up to the order
+    of the operator. With the stencil −Lu = ∇ᵀ(π v)/π.
+
+    Parameters
+    ----------
+    field : (N, d, C) or (B, N, d, C), as `lb.local_gradient` gives it; units of u by 1/ℓ.
+    tolerance : of the solve with the weak pair, relative; None for that of linear elements, which is second order.
+    """
+    weighted = lb.mass.to(field.dtype)[:, None, None] * field
+    products = [
+        lb._apply_rows(values, part, transposed=True)
+        for values, part in zip(lb.gradient_values, weighted.unbind(-2), strict=True)
+    ]
+    right = sum(products[1:], products[0])
+    if not lb.has_weak_form:
+        right = right / lb.mass.double()[:, None]
+    columns, _ = _columns(right, None)
+    return _shaped(_solve(columns, None, None, None, lb, tolerance), field[..., 0, :])
 
 
 def _columns(x: Tensor, time: Tensor | None) -> tuple[Tensor, Tensor]:
@@ -146,7 +179,7 @@ def _data(lb: LaplaceBeltrami, data: Tensor | float | None, kind: int, f: Tensor
     return columns * lb.fixed[:, None] if kind == 0 and lb.fixed is not None else columns
 
 
-def _product(lb: LaplaceBeltrami, number: int, x: Tensor) -> Tensor:
+def _product(lb: LaplaceBeltrami | Conducting, number: int, x: Tensor) -> Tensor:
     """K, M or B times x."""
     crow, col = lb.weak_crow, lb.weak_col
     pattern = [crow, col, crow, col, torch.arange(len(col), device=col.device)]
@@ -160,43 +193,39 @@ def _mass(lb: LaplaceBeltrami, x: Tensor) -> Tensor:
 class _Solve(torch.autograd.Function):
     """u of S(t)u = b: (M + tK)u = b, or Ku = b for a time of None; zero at Dirichlet points.
 
-    Its derivatives are solves with the same matrix: S⁻ᵀg in b, and −⟨S⁻ᵀg, S'(t)u⟩ in t.
+    Its derivatives are solves with the same matrix: S⁻ᵀg in b, −⟨S⁻ᵀg, S'(t)u⟩ in t, and −t⟨S⁻ᵀg, K'(κ)(u + g)⟩ in the
+    conductivity κ, g the `given` values at the boundary.
     """
 
     @staticmethod
-    def forward(ctx: Any, b: Tensor, time: Tensor | None, lb: Any, tolerance: float) -> Tensor:  # pyright: ignore
+    def forward(  # pyright: ignore
+        ctx: Any,
+        b: Tensor,
+        time: Tensor | None,
+        conductivity: Tensor | None,
+        given: Tensor | None,
+        lb: Any,
+        tolerance: Any,
+    ) -> Tensor:
         u = solve_columns(lb, b, time, tolerance)  # pyright: ignore[reportCallIssue]
-        ctx.save_for_backward(time, u)
+        ctx.save_for_backward(time, u, conductivity, given)
         ctx.rest = lb, tolerance
         return u
 
     @staticmethod
     def backward(ctx: Any, g: Tensor) -> tuple[Any, ...]:  # pyright: ignore
-        time, u = ctx.saved_tensors
+        time, u, conductivity, given = ctx.saved_tensors
         lb, tolerance = ctx.rest
         w = solve_columns(lb, g, time, tolerance, True)  # pyright: ignore[reportCallIssue]
         grad_t = None
         if time is not None and ctx.needs_input_grad[1]:
             slope = _product(lb, 0, u) if lb.has_weak_form else -lb(u)
             grad_t = -(w * slope).sum(0)
-        return w, grad_t, None, None
+        grad_kappa = None
+        if conductivity is not None and ctx.needs_input_grad[2]:
+            whole = u if given is None else u + given
+            grad_kappa = -lb.slope(conductivity, w if time is None else time * w, whole)
+        return w, grad_t, grad_kappa, None, None, None
 
 
 _solve: Any = _Solve.apply
-
-
-def solve_columns(
-    lb: LaplaceBeltrami,
-    b: Float[Tensor, "N C"],
-    time: Float[Tensor, " C"] | None,
-    tolerance: float,
-    transposed: bool = False,
-) -> Float[Tensor, "N C"]:
-    """Columns of one time are solved together; a time of 0 has M, or 1, to invert."""
-    if time is None:
-        return system(lb, None).solve(b, tolerance, transposed)
-    u = torch.zeros_like(b, dtype=torch.float64)
-    for t in time.detach().unique().tolist():
-        where = time == t
-        u[:, where] = system(lb, t).solve(b[:, where], tolerance, transposed)
-    return u

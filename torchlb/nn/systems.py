@@ -4,12 +4,14 @@ A system is a K + b M with the rows and columns of Dirichlet points taken out. T
 gradients; the factor of the linear pair, which is spectrally close and 20 times sparser, preconditions them
 (`method.md`, section 10). Where rows of the fits have large weights, K is up to thirty times stiffer than K₁ at single
 points, in functions that live there: a smoothing step before and after the factor's solve then takes less than half the
-steps. Factors are kept as long as the operator that they belong to.
+steps. Many times of one call share factors, those of powers of four. Factors are kept as long as the operator that they
+belong to; a batch takes those of its shapes.
 """
 
 from __future__ import annotations
 
 import atexit
+import math
 from collections import OrderedDict
 from typing import Any
 
@@ -24,19 +26,26 @@ from torch.utils.weak import WeakIdKeyDictionary
 from torchlb.linalg.conjugate_gradients import conjugate_gradients
 from torchlb.linalg.factor import cholesky, factorized
 from torchlb.linalg.sparse import multiply
+from torchlb.nn.conduction import Conducting
+from torchlb.operator.batching import shapes_of
 from torchlb.operator.laplace_beltrami import LaplaceBeltrami
 
 KEPT = 8
 """Factors that are kept for each operator."""
 SMOOTHING = 1.1
 """Of a damped Jacobi step, in units of the absolute row sums: below 2 the preconditioner is positive definite."""
+SINGULAR = 1e-6
+"""Share of M₁ over the area that makes K₁ definite; constants, which it moves alone, are split off."""
+SPACING = 4.0
+"""Between the times of shared factors: M + tK and its factor's matrix then differ by less than that."""
 SHIFT = 1e-9
 """Of an inverted stencil that is singular, in units of its diagonal."""
+Operator = LaplaceBeltrami | Conducting
 _SYSTEMS: Any = WeakIdKeyDictionary()
 atexit.register(_SYSTEMS.clear)  # cholespy reports factors that outlive Python as leaks
 
 
-def system(lb: LaplaceBeltrami, t: float | None) -> PairSystem | StencilSystem:
+def system(lb: Operator, t: float | None) -> PairSystem | StencilSystem:
     """That of an implicit step of a time t, or of a Poisson problem for None."""
     kept = _SYSTEMS.setdefault(lb.values, OrderedDict())
     key = t, lb.values.device
@@ -48,11 +57,47 @@ def system(lb: LaplaceBeltrami, t: float | None) -> PairSystem | StencilSystem:
     return kept[key]
 
 
+def solve_columns(
+    lb: Operator,
+    b: Float[Tensor, "N C"],
+    time: Float[Tensor, " C"] | None,
+    tolerance: float | None,
+    transposed: bool = False,
+) -> Float[Tensor, "N C"]:
+    """(M + tK)⁻¹b of every column by its time, or K⁻¹b for a time of None; with the stencil 1 − tL and −L.
+
+    A time of 0 has M, or 1, to invert. A tolerance of None takes linear elements for the pair.
+    """
+    shapes = shapes_of(lb)
+    if shapes and all(shape.has_weak_form == lb.has_weak_form for shape in shapes):
+        blocks = zip(shapes, b.split([shape.num_points for shape in shapes]), strict=True)
+        parts = [solve_columns(s, part, time, tolerance, transposed) for s, part in blocks]
+        return torch.cat(parts)
+    if time is None:
+        return system(lb, None).solve(b, tolerance, transposed)
+    time = time.detach()
+    level = time
+    if lb.has_weak_form and len(time.unique()) > 1:
+        level = SPACING ** (time.log() / math.log(SPACING)).ceil()
+    u = torch.zeros_like(b, dtype=torch.float64)
+    for t in level.unique().tolist():
+        where = level == t
+        solver = system(lb, t)
+        options = {}
+        if isinstance(solver, PairSystem) and not bool((time[where] == t).all()):
+            options["times"] = time[where]
+        u[:, where] = solver.solve(b[:, where], tolerance, transposed, **options)
+    return u
+
+
 class _Components:
     """Means over the connected components of a shape, and which of them have a Dirichlet point."""
 
-    def __init__(self, lb: LaplaceBeltrami) -> None:
-        crow, col = lb.linear_pair[:2] if lb.has_weak_form else (lb.crow, lb.col)
+    def __init__(self, lb: Operator) -> None:
+        if isinstance(lb, LaplaceBeltrami) and not lb.has_weak_form:
+            crow, col = lb.crow, lb.col
+        else:
+            crow, col, _ = lb.linear_pair
         where = (np.ones(len(col)), col.cpu().numpy(), crow.cpu().numpy())
         graph = sparse.csr_array(where, shape=lb.shape)
         self.count, number = csgraph.connected_components(graph, directed=False)
@@ -60,17 +105,24 @@ class _Components:
         held = torch.zeros(self.count, device=col.device)
         if lb.fixed is not None:
             held = held.index_add(0, self.of, lb.fixed.float())
-        self.free = (held == 0)[self.of][:, None]  # points whose component has no Dirichlet point
+        if self.count > 1:
+            held = held[self.of]
+        self.free = (held == 0)[
+            :, None
+        ]  # points whose component has no Dirichlet point; one for all if there is one
 
-    def sums(self, x: Float[Tensor, "N C"]) -> Float[Tensor, "N C"]:
-        """Of every point the sum over its component."""
-        return x.new_zeros(self.count, x.shape[1]).index_add(0, self.of, x)[self.of]
+    def sums(self, weights: Float[Tensor, "N 1"], x: Float[Tensor, "N C"]) -> Float[Tensor, "_ C"]:
+        """Of every point the weighted sum over its component; one row for all where there is one component."""
+        if self.count == 1:
+            return weights.T @ x
+        found = x.new_zeros(self.count, x.shape[1])
+        return found.index_add(0, self.of, weights * x)[self.of]
 
 
 class PairSystem:
     """K, or M + tK, of a weak pair."""
 
-    def __init__(self, lb: LaplaceBeltrami, t: float | None) -> None:
+    def __init__(self, lb: Operator, t: float | None) -> None:
         stiffness, mass = (v.detach().double() for v in lb.weak_values[:2])
         crow, col, linear = lb.linear_pair
         self.pattern = lb.weak_crow, lb.weak_col
@@ -79,7 +131,8 @@ class PairSystem:
         self.free = None if lb.fixed is None else (~lb.fixed).double()[:, None]
         self.components = _Components(lb)
         self.ones_mass = multiply(*self.pattern, mass, torch.ones_like(lb.mass.double())[:, None])
-        self.area = self.components.sums(self.ones_mass)
+        self.one = torch.ones_like(self.ones_mass)
+        self.area = self.components.sums(self.one, self.ones_mass)
         self.steps = 0
         n = lb.num_points
         first, second = (
@@ -89,8 +142,12 @@ class PairSystem:
             )
             for v in linear[:2]
         )
+        first = first - sparse.diags_array(
+            first.sum(1)
+        )  # rounded to float32 it would be indefinite
         if t is None:
-            scale = sparse.diags_array(self.area[:, 0].rsqrt().cpu().numpy())
+            scale = (SINGULAR / self.area).sqrt().expand(n, 1)[:, 0]
+            scale = sparse.diags_array(scale.cpu().numpy())
             matrix = first + scale @ second @ scale
         else:
             matrix = second + t * first
@@ -106,35 +163,54 @@ class PairSystem:
             self.smoother = SMOOTHING / sums
 
     def solve(
-        self, b: Float[Tensor, "N C"], tolerance: float, transposed: bool = False
+        self,
+        b: Float[Tensor, "N C"],
+        tolerance: float | None,
+        transposed: bool = False,
+        times: Float[Tensor, " C"] | None = None,
     ) -> Float[Tensor, "N C"]:
         """The solution, zero at Dirichlet points, of mean zero on the other components of a Poisson problem.
 
-        On these, constants are split off, for which M + tK is M: they and the mass stay to rounding.
+        On these, constants are split off, for which M + tK is M: they and the mass stay to rounding. A tolerance of
+        None takes the factor's solution, that of linear elements; `times`, from t / 4 to t, are those of the columns.
         """
         b = self._inside(b.double())
-        mean = self._mean(b)
-        right = b - self.ones_mass * mean
-        x, self.steps = conjugate_gradients(
-            self._product, right, self._precondition, tolerance=tolerance
-        )
-        x = x - self._mean(self.ones_mass * x)
-        return x if self.singular else x + mean
+        mean = self._mean(self.one, b)
+        right = torch.addcmul(b, self.ones_mass, mean, value=-1)
+        if tolerance is None:
+            x = self._inside(self.factor.solve(right))
+        else:
+            x, self.steps = conjugate_gradients(
+                lambda x: self._product(x, times),
+                right,
+                lambda r: self._precondition(r, times),
+                tolerance=tolerance,
+            )
+        shift = -self._mean(self.ones_mass, x)
+        return x.add_(shift if self.singular else shift + mean)
 
-    def _mean(self, x: Tensor) -> Tensor:
-        """Sums over components that no Dirichlet point holds, by their areas; 0 on the others."""
-        return torch.where(self.components.free, self.components.sums(x) / self.area, 0.0)
+    def _mean(self, weights: Tensor, x: Tensor) -> Tensor:
+        """Weighted sums over components that no Dirichlet point holds, by their areas; 0 on the others."""
+        return torch.where(self.components.free, self.components.sums(weights, x) / self.area, 0.0)
 
-    def _product(self, x: Tensor) -> Tensor:
-        return self._inside(multiply(*self.pattern, self.values, x))
+    def _product(self, x: Tensor, times: Tensor | None) -> Tensor:
+        if times is None:
+            return self._inside(multiply(*self.pattern, self.values, x))
+        stiffness, mass = (multiply(*self.pattern, v, x) for v in (self.stiffness, self.mass))
+        return self._inside(mass + times * stiffness)
 
-    def _precondition(self, r: Tensor) -> Tensor:
+    def _precondition(self, r: Tensor, times: Tensor | None) -> Tensor:
         """Of a residual: smoothing, the factor's solve, smoothing, so that the whole is symmetric."""
         if self.smoother is None:
-            return self._inside(self.factor.solve(r))
+            return self._coarse(r)
         x = self._inside(self.smoother * r)
-        x = x + self._inside(self.factor.solve(r - self._product(x)))
-        return x + self._inside(self.smoother * (r - self._product(x)))
+        x = x + self._coarse(r - self._product(x, times))
+        return x + self._inside(self.smoother * (r - self._product(x, times)))
+
+    def _coarse(self, r: Tensor) -> Tensor:
+        """The factor's solve, without the constants, which are large from rounding alone where K is singular."""
+        x = self._inside(self.factor.solve(r))
+        return x - self._mean(self.ones_mass, x) if self.singular else x
 
     def _inside(self, x: Tensor) -> Tensor:
         return x if self.free is None else x * self.free
@@ -143,8 +219,9 @@ class PairSystem:
 class StencilSystem:
     """−L, or 1 − tL, of a stencil L, by sparse LU on the CPU."""
 
-    def __init__(self, lb: LaplaceBeltrami, t: float | None) -> None:
+    def __init__(self, lb: Operator, t: float | None) -> None:
         n = lb.num_points
+        assert isinstance(lb, LaplaceBeltrami)
         matrix = sparse.csr_array(lb.to_scipy(), dtype=np.float64)
         self.components = None
         shift = 1.0
@@ -157,9 +234,9 @@ class StencilSystem:
         self.lu = factorized(sparse.csc_array(shift * sparse.eye_array(n) - t * matrix), 1e-2)
 
     def solve(
-        self, b: Float[Tensor, "N C"], tolerance: float, transposed: bool = False
+        self, b: Float[Tensor, "N C"], tolerance: float | None, transposed: bool = False
     ) -> Float[Tensor, "N C"]:
-        """As for the pair; `transposed` for the transposed matrix."""
+        """As for the pair, but exact; `transposed` for the transposed matrix."""
         b = b.double() if self.free is None else b.double() * self.free
         if self.components is not None:
             b = self._without(b, transposed)
@@ -171,7 +248,8 @@ class StencilSystem:
     def _without(self, x: Tensor, transposed: bool) -> Tensor:
         """Without constants, in the mass π, or without π, in the sum."""
         assert self.components is not None
-        area = self.components.sums(self.mass)
-        one, other = (1.0, self.mass) if transposed else (self.mass, 1.0)
-        less = other * self.components.sums(one * x) / area
+        ones = torch.ones_like(self.mass)
+        area = self.components.sums(ones, self.mass)
+        one, other = (ones, self.mass) if transposed else (self.mass, ones)
+        less = other * self.components.sums(one, x) / area
         return x - torch.where(self.components.free, less, 0.0)

@@ -4,5 +4,5 @@
 order was reached where. `storage`: its tensors, and how they travel. `batching`: several shapes as one operator.
 `build`: checked input to finished rows and pair. `stencil_face`: Δf, ∇f and curvature at a point. `weak_face`: the
 matrices of the weak pair, the eigenbasis. `laplace_beltrami`: the class. `dispatch`: any operator by name and options.
-`collate`: samples of a `DataLoader`.
+`medium`: the elements behind the pair. `collate`: samples of a `DataLoader`.
 """

@@ -10,6 +10,7 @@ from typing import Any
 import torch
 from torch import Tensor
 from torch.nn.functional import pad
+from torch.utils.weak import WeakIdKeyDictionary
 
 from torchlb.errors import InputError
 from torchlb.linalg.spectral_bounds import Bounds, join_bounds
@@ -19,6 +20,7 @@ Buffers = dict[str, Tensor]
 BY_POINT = ("mass", "points", "frames", "normals", "on_boundary")
 BY_ENTRY = ("col", "values", "col_t", "order_t")
 PARTS = ("crow", "col", "values")
+_SHAPES: Any = WeakIdKeyDictionary()
 
 
 def join_buffers(shapes: Sequence[Buffers]) -> Buffers:
@@ -83,6 +85,16 @@ def _join_pairs(shapes: Sequence[Buffers]) -> Buffers:
         padded = [pad(values, (0, 0, 0, most - len(values))) for _, _, values in blocks]
         joined[f"{pair}_values"] = torch.cat(padded, dim=1)
     return joined
+
+
+def remember_shapes(batch: Any, shapes: Sequence[Any]) -> None:
+    """So that what is kept of the shapes (factors, say) serves their batch, too."""
+    _SHAPES[batch.values] = tuple(shapes)
+
+
+def shapes_of(batch: Any) -> tuple[Any, ...]:
+    """The operators that a batch was made of, as long as it has not been copied, cast or moved; else none."""
+    return _SHAPES.get(batch.values, ())
 
 
 def _starts(counts: Sequence[int]) -> list[int]:

@@ -12,7 +12,12 @@ from torchlb.fits.rules import WeightsName
 from torchlb.geometry.frames import Projection
 from torchlb.geometry.surface import SurfaceSummary
 from torchlb.operator import build
-from torchlb.operator.batching import join_buffers, join_states, split_buffers
+from torchlb.operator.batching import (
+    join_buffers,
+    join_states,
+    remember_shapes,
+    split_buffers,
+)
 from torchlb.operator.cleaning import ArrayLike, float_type
 from torchlb.operator.stencil_face import StencilFace
 from torchlb.operator.storage import FIT_FIELDS, REPORT_FIELDS
@@ -186,7 +191,9 @@ class LaplaceBeltrami(StencilFace, WeakFace):
         state = join_states([shape.get_extra_state() for shape in shapes], sizes)
         bases = [shape.basis for shape in shapes if shape.basis and not shape.sizes]
         basis = stack_eigenbases(bases) if len(bases) == len(shapes) else None
-        return cls.from_buffers(join_buffers([s.tensors for s in shapes]), state, basis)
+        joined = cls.from_buffers(join_buffers([s.tensors for s in shapes]), state, basis)
+        remember_shapes(joined, shapes)
+        return joined
 
     def unbatch(self) -> list[LaplaceBeltrami]:
         """The operators of the shapes of a `batch`, with all that they had: certificates, bounds, eigenbases.
@@ -227,7 +234,10 @@ class LaplaceBeltrami(StencilFace, WeakFace):
             buffers["on_boundary"] = shape.boundary.mask
         lb = cls.from_buffers(buffers, {"source": built.source, "options": built.options})
         lb.certificate, lb.surface = built.certificate, built.surface
-        _ = lb.bounds  # found once, from values that are not yet rounded
+        if (
+            built.certificate is not None or built.pair is not None
+        ):  # else flows find them, if there are any
+            _ = lb.bounds  # from values that are not yet rounded
         return lb.to(float_type(given))
 
     def extra_repr(self) -> str:

@@ -1,0 +1,133 @@
+"""u − t div(κ∇u) = f: exact solutions, derivatives in κ, and what κ may be."""
+
+import pytest
+import torch
+from torch.autograd import gradcheck
+
+from builders import stencil_of_mesh
+from torchlb import InputError, LaplaceBeltrami, implicit_step, poisson_solve
+from torchlb.galerkin.medium import Medium
+from torchlb.nn.conduction import conducting
+from torchlb.operator.medium import medium_of
+from torchlb.surfaces import Sphere, Torus, UnitDisk
+
+
+def build(kind, n=80):
+    vertices, faces = (UnitDisk() if kind == "dirichlet" else Sphere()).mesh(n)
+    if kind == "cotangent":
+        return LaplaceBeltrami.from_cotangent(vertices, faces)
+    order, condition = (
+        (5, None) if kind == "order 5" else (3, kind if kind == "dirichlet" else None)
+    )
+    return LaplaceBeltrami.from_mesh(vertices, faces, order=order, condition=condition or "neumann")
+
+
+KINDS = ["mesh", "order 5", "cotangent", "dirichlet"]
+every_kind = pytest.mark.parametrize("kind", KINDS)
+
+
+@every_kind
+@pytest.mark.parametrize("at", ["vertices", "faces"])
+def test_a_constant_conductivity_is_a_factor_of_time(kind, at):
+    lb = build(kind, 300)
+    f = torch.randn(300, 2, dtype=torch.float64)
+    kappa = torch.full((300 if at == "vertices" else len(lb.faces),), 0.3, dtype=torch.float64)
+    times = torch.tensor([0.1, 2.0], dtype=torch.float64)
+    exact = {"tolerance": 1e-13}
+    u = implicit_step(lb, f, times, conductivity=kappa, **exact)
+    expected = implicit_step(lb, f, 0.3 * times, **exact)
+    torch.testing.assert_close(u, expected, rtol=0, atol=1e-8)
+    u = poisson_solve(lb, f, conductivity=kappa, **exact)
+    torch.testing.assert_close(u, poisson_solve(lb, f, **exact) / 0.3, rtol=0, atol=1e-8)
+
+
+@pytest.mark.parametrize(
+    ("kind", "bound"), [("mesh", 2e-5), ("order 5", 1e-7), ("cotangent", 1e-2)]
+)
+def test_a_known_solution_on_the_sphere(kind, bound):
+    """u = z, κ = e^{z}: div κ∇u = κ(−2z + 1 − z²); the prolonged logarithm keeps the order."""
+    lb = build(kind, 1000)
+    z = lb.points[:, 2]
+    divergence = z.exp() * (1 - z.square() - 2 * z)
+    u = implicit_step(lb, z - 0.5 * divergence, 0.5, conductivity=z.exp(), tolerance=1e-12)
+    assert (u - z).norm() / z.norm() < bound
+    u = poisson_solve(lb, -divergence, conductivity=z.exp(), tolerance=1e-12)
+    assert (u - z).norm() / z.norm() < 3 * bound
+
+
+@every_kind
+def test_stiffness_is_symmetric_and_positive_for_any_conductivity(kind):
+    """Rough over six decades; constants are in its kernel; linear elements are the cotangent's."""
+    lb = build(kind)
+    for count in (80, len(lb.faces)):
+        kappa = (3 * torch.randn(count, dtype=torch.float64)).exp()
+        medium = conducting(lb, kappa)
+        dense = torch.sparse_csr_tensor(medium.weak_crow, medium.weak_col, medium.weak_values[0])
+        dense = dense.to_dense()
+        scale = dense.abs().max()
+        assert (dense - dense.T).abs().max() <= 1e-12 * scale
+        assert dense.sum(1).abs().max() <= 1e-12 * scale
+        assert torch.linalg.eigvalsh(dense).min() >= -1e-10 * scale
+    flat = Medium.linear(lb.points, lb.faces)
+    ones = torch.ones(80, dtype=torch.float64)
+    matrix = flat.stiffness(flat.at_gauss_points(ones)).toarray()
+    cotangent = LaplaceBeltrami.from_cotangent(lb.points, lb.faces).stiffness.to_dense()
+    torch.testing.assert_close(torch.from_numpy(matrix), cotangent, rtol=0, atol=1e-10)
+
+
+@every_kind
+@pytest.mark.parametrize("at", ["vertices", "faces"])
+def test_derivatives_in_conductivity_data_and_time(kind, at):
+    lb = build(kind, 40)
+    count = 40 if at == "vertices" else len(lb.faces)
+    kappa = torch.rand(count, dtype=torch.float64).add(0.5).requires_grad_()
+    f = torch.randn(40, 2, dtype=torch.float64, requires_grad=True)
+    t = torch.tensor([0.1, 0.3], dtype=torch.float64, requires_grad=True)
+    data = {"boundary_values": 0.5} if kind == "dirichlet" else {}
+
+    def step(kappa, f, t):
+        return implicit_step(lb, f, t, conductivity=kappa, tolerance=1e-13, **data)
+
+    def poisson(kappa, f):
+        return poisson_solve(lb, f, conductivity=kappa, tolerance=1e-13, **data)
+
+    assert gradcheck(step, (kappa, f, t), fast_mode=True)
+    assert gradcheck(poisson, (kappa, f), fast_mode=True)
+
+
+def test_elements_are_made_once():
+    lb = build("mesh")
+    assert medium_of(lb) is medium_of(lb)
+
+
+def test_a_conductivity_is_learned():
+    """κ = e^{c z} from one observed step, by gradient descent on c."""
+    lb = build("mesh", 300)
+    z = lb.points[:, 2]
+    f = torch.stack([z, lb.points[:, 0]], 1)
+    seen = implicit_step(lb, f, 0.5, conductivity=(0.7 * z).exp())
+    c = torch.zeros((), dtype=torch.float64, requires_grad=True)
+    optimizer = torch.optim.LBFGS([c], line_search_fn="strong_wolfe")
+
+    def loss():
+        optimizer.zero_grad()
+        misfit = (implicit_step(lb, f, 0.5, conductivity=(c * z).exp()) - seen).square().sum()
+        misfit.backward()
+        return misfit
+
+    optimizer.step(loss)
+    assert abs(c.item() - 0.7) < 1e-4
+
+
+def test_what_has_no_elements_or_cannot_be_a_conductivity_is_refused():
+    lb, one = build("mesh"), torch.ones(80, dtype=torch.float64)
+    for wrong, message in ((one[1:], "one of each vertex"), (0 * one, "finite, positive")):
+        with pytest.raises(InputError, match=message):
+            implicit_step(lb, one, 0.1, conductivity=wrong)
+    cloud = LaplaceBeltrami.from_points(lb.points)
+    batch = LaplaceBeltrami.batch([lb, build("mesh")])
+    bare = stencil_of_mesh(*Torus().mesh(80))
+    for other, remedy in ((cloud, "from_mesh"), (batch, "unbatch"), (bare, "weak pair")):
+        ones = torch.ones(other.num_points, dtype=torch.float64)
+        with pytest.raises(InputError, match=remedy):
+            poisson_solve(other, ones, conductivity=ones)

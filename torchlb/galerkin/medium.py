@@ -1,0 +1,111 @@
+"""div κ∇ on the elements of a weak pair: its stiffness, and derivatives in κ (`method.md`, section 10)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Float, Int
+from scipy import sparse
+from torch import Tensor
+
+from torchlb.galerkin.assembly import CHUNK, area_element, assemble, flat_metric
+from torchlb.galerkin.curving import Surface, curve
+from torchlb.galerkin.elements import Element, triangle
+from torchlb.galerkin.nodes import lagrange_nodes
+from torchlb.galerkin.prolongation import prolongation
+
+
+@dataclass(frozen=True)
+class Medium:
+    """The elements of a weak pair, kept so that stiffnesses for many conductivities cost an assembly each.
+
+    Attributes
+    ----------
+    faces : (F, 3), of the mesh.
+    lengths : (F, 3), of its edges, ℓ, in the order of `EDGES`.
+    prolongation : P, (N + X, N), from the vertices to the nodes.
+    nodes : (F, n), of each element.
+    metric : (F, Q, 3), at its Gauss points.
+    element : its shape functions there.
+    """
+
+    faces: Int[Tensor, "F 3"]
+    lengths: Float[Tensor, "F 3"]
+    prolongation: Any
+    nodes: Int[Tensor, "F n"]
+    metric: Float[Tensor, "F Q 3"]
+    element: Element
+
+    @classmethod
+    def curved(cls, surface: Surface, faces: Int[Tensor, "F 3"], degree: int) -> Medium:
+        """That of `weak_pair` with elements of degree r ≥ 2."""
+        mesh = curve(surface, lagrange_nodes(faces, len(surface.points), degree))
+        p = prolongation(surface, mesh)
+        return cls(faces, mesh.lengths, p, mesh.nodes.elements, mesh.metric, triangle(degree))
+
+    @classmethod
+    def linear(cls, points: Float[Tensor, "N n"], faces: Int[Tensor, "F 3"]) -> Medium:
+        """That of linear elements, whose stiffness for κ = 1 is the cotangent's."""
+        lengths = (points[faces[:, [1, 2, 0]]] - points[faces]).norm(dim=2)
+        element = triangle(1)
+        metric = flat_metric(lengths)[:, None].expand(-1, len(element.weights), 3)
+        same: Any = sparse.eye_array(len(points), format="csr")
+        return cls(faces, lengths, same, faces, metric, element)
+
+    def at_gauss_points(self, conductivity: Tensor) -> Float[Tensor, "F Q"]:
+        """κ there, differentiable: that of each face, or of the vertices (N,), whose logarithm is prolonged.
+
+        So it is positive, and of high order where the fits are.
+        """
+        if len(conductivity) == len(self.faces):
+            return conductivity[:, None].expand(-1, len(self.element.weights))
+        at_nodes = _prolonged(conductivity.log(), self.prolongation)
+        return (at_nodes[self.nodes] @ self.element.values.T).exp()
+
+    def stiffness(self, conductivity: Float[Tensor, "F Q"]) -> sparse.csr_array:
+        """PᵀK_FE(κ)P; symmetric and positive semidefinite for every κ > 0, rows sum to zero."""
+        p = self.prolongation
+        elements = assemble(self.metric, self.nodes, self.element, p.shape[0], conductivity)
+        return sparse.csr_array(p.T @ (elements.real @ p))
+
+    def coarse_stiffness(self, conductivity: Float[Tensor, "F Q"]) -> sparse.csr_array:
+        """K₁(κ) of linear elements on flat triangles, with the mean of κ on each: it preconditions."""
+        shape, share = triangle(1), self.element.weights / self.element.weights.sum()
+        mean = (conductivity @ share)[:, None].expand(-1, len(shape.weights))
+        metric = flat_metric(self.lengths)[:, None].expand(-1, len(shape.weights), 3)
+        return sparse.csr_array(
+            assemble(metric, self.faces, shape, self.prolongation.shape[1], mean).real
+        )
+
+    def sensitivity(self, w: Float[Tensor, "N C"], u: Float[Tensor, "N C"]) -> Float[Tensor, "F Q"]:
+        """∂/∂κ of Σ_c w_cᵀK(κ)u_c at the Gauss points: weights times ∇w·∇u."""
+        at_nodes = [torch.from_numpy(self.prolongation @ x.numpy()) for x in (w, u)]
+        found = []
+        for part in torch.arange(len(self.nodes)).split(max(CHUNK // w.shape[1], 1)):
+            g, nodes = self.metric[part], self.nodes[part]
+            (a, b), (c, d) = (
+                torch.einsum("qnd,tnc->dtqc", self.element.gradients, x[nodes]) for x in at_nodes
+            )
+            products = [b * d, -(a * d + b * c), a * c]
+            total = sum(m * x.sum(-1) for m, x in zip(g.unbind(-1), products, strict=True))
+            found.append(self.element.weights * total / area_element(g))
+        return torch.cat(found)
+
+
+class _Prolonged(torch.autograd.Function):
+    """P x for a vector x."""
+
+    @staticmethod
+    def forward(ctx: Any, x: Tensor, matrix: Any) -> Tensor:  # pyright: ignore[reportIncompatibleMethodOverride]
+        ctx.matrix = matrix
+        return torch.from_numpy(np.asarray(matrix @ x.detach().numpy()))
+
+    @staticmethod
+    def backward(ctx: Any, g: Tensor) -> tuple[Any, ...]:  # pyright: ignore[reportIncompatibleMethodOverride]
+        return torch.from_numpy(np.asarray(ctx.matrix.T @ g.numpy())), None
+
+
+_prolonged: Any = _Prolonged.apply

@@ -1,0 +1,104 @@
+"""An operator whose stiffness is that of div κ∇, as far as the solves ask for one."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from jaxtyping import Bool, Float, Int
+from scipy import sparse
+from torch import Tensor
+
+from torchlb.errors import InputError
+from torchlb.galerkin.medium import Medium
+from torchlb.galerkin.pair import stored
+from torchlb.linalg.sparse import to_scipy
+from torchlb.operator.laplace_beltrami import LaplaceBeltrami
+from torchlb.operator.medium import medium_of
+
+
+@dataclass(frozen=True, eq=False)
+class Conducting:
+    """(K(κ), M) of an operator, under the names of its buffers, and the derivatives of K in κ."""
+
+    lb: LaplaceBeltrami
+    medium: Medium
+    weak_crow: Int[Tensor, " N_plus_1"]
+    weak_col: Int[Tensor, " nnz"]
+    weak_values: Float[Tensor, "2 nnz"]
+    linear_pair: tuple[Tensor, Tensor, Tensor]
+
+    has_weak_form = True
+
+    @property
+    def values(self) -> Tensor:
+        """What factors are kept by."""
+        return self.weak_values
+
+    @property
+    def linear_crow(self) -> Tensor:
+        """Empty where (K, M) is linear itself."""
+        return self.lb.linear_crow
+
+    @property
+    def fixed(self) -> Bool[Tensor, " N"] | None:
+        """As of the operator."""
+        return self.lb.fixed
+
+    @property
+    def mass(self) -> Tensor:
+        """As of the operator."""
+        return self.lb.mass
+
+    @property
+    def num_points(self) -> int:
+        """N."""
+        return self.lb.num_points
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """(N, N)."""
+        return self.lb.shape
+
+    def slope(
+        self, conductivity: Tensor, w: Float[Tensor, "N C"], u: Float[Tensor, "N C"]
+    ) -> Tensor:
+        """∂/∂κ of Σ_c w_cᵀK(κ)u_c, of the shape of κ."""
+        density = self.medium.sensitivity(w.detach().cpu(), u.detach().cpu())
+        with torch.enable_grad():
+            kappa = conductivity.detach().cpu().double().requires_grad_()
+            total = (self.medium.at_gauss_points(kappa) * density).sum()
+        return torch.autograd.grad(total, kappa)[0].to(conductivity)
+
+
+def conducting(lb: LaplaceBeltrami, conductivity: Tensor) -> Conducting:
+    """The operator with the stiffness of div κ∇, κ > 0 of the vertices (N,) or of the faces (F,).
+
+    Raises
+    ------
+    InputError : for another shape, values that are not positive, and operators that are not of a triangle mesh.
+    """
+    medium = medium_of(lb)
+    kappa = conductivity.detach().cpu().double()
+    if kappa.shape not in ((lb.num_points,), (len(medium.faces),)):
+        raise InputError(
+            f"conductivity: expected one of each vertex, ({lb.num_points},), or face, ({len(medium.faces)},), got "
+            f"{tuple(kappa.shape)}"
+        )
+    if not bool(((kappa > 0) & kappa.isfinite()).all()):
+        raise InputError(f"conductivity: expected finite, positive values, got {kappa.min():.3g}")
+    at_gauss_points = medium.at_gauss_points(kappa)
+    mass = _mass(lb, lb.weak_crow, lb.weak_col, lb.weak_values)
+    pair = stored(medium.stiffness(at_gauss_points) + 1j * mass)
+    linear = pair
+    if len(lb.linear_crow):
+        linear = stored(medium.coarse_stiffness(at_gauss_points) + 1j * _mass(lb, *lb.linear_pair))
+    (crow, col, values), near = (
+        [t.to(lb.device) for t in (part.crow, part.col, part.values)] for part in (pair, linear)
+    )
+    return Conducting(lb, medium, crow, col, values, (near[0], near[1], near[2]))
+
+
+def _mass(lb: LaplaceBeltrami, crow: Tensor, col: Tensor, values: Tensor) -> Any:
+    return sparse.csr_array(to_scipy(crow, col, values[1].double(), lb.shape))
