@@ -2,8 +2,15 @@
 
 import importlib.metadata
 import importlib.util
+import json
+import os
 import platform
+import subprocess
+import sys
+from collections.abc import Sequence
 from datetime import date
+from pathlib import Path
+from typing import Any
 
 import torch
 
@@ -33,3 +40,25 @@ def versions() -> list[str]:
         else:
             lines.append(f"{package} is not installed; its rows are left out.")
     return [f"{date.today().isoformat()}; {', '.join(found)}.", *lines]
+
+
+def peak() -> float:
+    """MiB of memory that this process has had at most; Linux tells."""
+    status = Path("/proc/self/status").read_text()
+    return (
+        int(next(line for line in status.splitlines() if line.startswith("VmHWM")).split()[1])
+        / 2**10
+    )
+
+
+def alone(script: str, arguments: Sequence[str]) -> Any:
+    """What a script prints last, as JSON, from a process of its own with one thread."""
+    threads = {f"{library}_NUM_THREADS": "1" for library in ("OMP", "MKL", "OPENBLAS")}
+    done = subprocess.run(
+        [sys.executable, script, *arguments],
+        stdout=subprocess.PIPE,
+        text=True,
+        check=True,
+        env=os.environ | threads,
+    )
+    return json.loads(done.stdout.splitlines()[-1])

@@ -189,23 +189,28 @@ def compadre(degree: int) -> Apply:
     """Generalised moving least squares of a polynomial degree on estimated tangent planes."""
 
     def apply(case: Case) -> tuple[Any, float, float]:
-        _kokkos()
-        import pycompadre
-
-        points = case.points.numpy()
-        gmls = pycompadre.GMLS(degree, 3, "QR", "MANIFOLD", "NO_CONSTRAINT", degree)
-        gmls.setWeightingType("power")
-        gmls.setWeightingParameter(2)
-        helper = pycompadre.ParticleHelper(gmls)
-        helper.generateKDTree(points)
-        helper.generateNeighborListsFromKNNSearchAndSet(points, degree, 2, COMPADRE_EPSILON)
-        operation = pycompadre.TargetOperation.LaplacianOfScalarPointEvaluation
-        gmls.addTargets(operation)
-        gmls.generateAlphas(1, False)
+        helper, operation = compadre_operator(case.points.numpy(), degree)
         total = helper.getNeighborLists().getTotalNeighborsOverAllLists()
-        return helper.applyStencil(case.values.numpy(), operation), total / len(points), 1.0
+        return helper.applyStencil(case.values.numpy(), operation), total / len(case.points), 1.0
 
     return apply
+
+
+def compadre_operator(points: np.ndarray, degree: int) -> tuple[Any, Any]:
+    """A `ParticleHelper` with the stencils, and the operation that they are of."""
+    _kokkos()
+    import pycompadre
+
+    gmls = pycompadre.GMLS(degree, 3, "QR", "MANIFOLD", "NO_CONSTRAINT", degree)
+    gmls.setWeightingType("power")
+    gmls.setWeightingParameter(2)
+    helper = pycompadre.ParticleHelper(gmls)
+    helper.generateKDTree(points)
+    helper.generateNeighborListsFromKNNSearchAndSet(points, degree, 2, COMPADRE_EPSILON)
+    operation = pycompadre.TargetOperation.LaplacianOfScalarPointEvaluation
+    gmls.addTargets(operation)
+    gmls.generateAlphas(1, False)
+    return helper, operation
 
 
 def peers() -> dict[str, Apply]:

@@ -16,38 +16,21 @@ from pathlib import Path
 import numpy as np
 import robust_laplacian
 import torch
-import trimesh
 from _common import versions
 from scipy import sparse
 from scipy.sparse.linalg import eigsh
 
 from torchlb import LaplaceBeltrami
-from torchlb.surfaces import Sphere
+from torchlb.surfaces import Sphere, limit_surface
 
 PAIRS = 41
 
 
-def limit(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    """Where Loop subdivision takes the vertices of a closed mesh."""
-    ends = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]).T
-    graph = sparse.csr_array((np.ones(ends.shape[1]), ends), shape=(len(vertices),) * 2)
-    valence = np.bincount(ends[0], minlength=len(vertices))
-    beta = (5 / 8 - (3 / 8 + np.cos(2 * np.pi / valence) / 4) ** 2) / valence
-    share = 1 / (3 / (8 * beta) + valence)
-    return (1 - valence * share)[:, None] * vertices + share[:, None] * (graph @ vertices)
-
-
-def surface(shape: dict[str, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
-    """Level 4 of the limit surface."""
-    vertices, faces = shape["control"].astype(float), shape["faces0"].astype(np.int64)
-    for _ in range(4):
-        vertices, faces = trimesh.remesh.subdivide_loop(vertices, faces)
-    return limit(vertices, faces), faces
-
-
 def clouds(shape: dict[str, np.ndarray], quick: bool):
     """(name, points)."""
-    vertices, faces = surface(shape)
+    control = torch.from_numpy(shape["control"].astype(float))
+    points, meshes = limit_surface(control, torch.from_numpy(shape["faces0"].astype(np.int64)), 4)
+    vertices, faces = points.numpy(), meshes[4].numpy()
     corners = vertices[faces]
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     area = np.linalg.norm(normals, axis=1) / 2

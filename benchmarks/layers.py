@@ -21,6 +21,14 @@ from torch.nn.functional import cross_entropy
 from torchlb import DiffusionNet, LaplaceBeltrami
 from torchlb.surfaces import StarShaped
 
+COMMUNICATION = {
+    "spectral": {},
+    "deflated": {"method": "deflated"},
+    "implicit": {"block": "implicit"},
+    "Poisson": {"block": "poisson"},
+}
+"""How the points of a network hear of each other."""
+
 
 def medians(
     steps: dict[str, Callable[[], object]], repeats: int, device: str
@@ -77,15 +85,15 @@ def training_step(shape: dict[str, object], width: int, k: int, repeats: int, de
     """`shape`: operators by name, (of which "original" only has the spectral diffusion)."""
     steps = {}
     for kind, lb in shape.items():
-        for method in ("spectral", "deflated") if kind != "original" else ("spectral",):
-            steps[f"{kind}, {method}"] = step_of(lb, method, width, k, device)
+        for name in COMMUNICATION if kind != "original" else ("spectral",):
+            steps[f"{kind}, {name}"] = step_of(lb, name, width, k, device)
     title = f"Training step of 4 blocks, width = {width}, k = {k}"
     table(title, medians(steps, repeats, device), "original, spectral")
 
 
-def step_of(lb: object, method: str, width: int, k: int, device: str) -> Callable[[], None]:
+def step_of(lb: object, name: str, width: int, k: int, device: str) -> Callable[[], None]:
     torch.manual_seed(0)
-    net = DiffusionNet(3, 8, width=width, method=method, k=k).to(device)
+    net = DiffusionNet(3, 8, width=width, k=k, **COMMUNICATION[name]).to(device)
     optimizer = torch.optim.Adam(net.parameters())
     points = lb.points.to(device)  # type: ignore[attr-defined]
     labels = (points[:, 0] > 0).long()
@@ -101,7 +109,7 @@ def step_of(lb: object, method: str, width: int, k: int, device: str) -> Callabl
 def epoch(shapes: list[LaplaceBeltrami], width: int, k: int, repeats: int, device: str) -> None:
     """A training step for each shape, against a single step for all of them."""
     batch = LaplaceBeltrami.batch(shapes)
-    for method in ("spectral", "deflated"):
+    for method in ("spectral", "deflated", "Poisson"):
         alone = [step_of(lb, method, width, k, device) for lb in shapes]
         steps = {
             "one by one, 8 steps": lambda alone=alone: [step() for step in alone],

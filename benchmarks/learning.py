@@ -1,9 +1,10 @@
 """The same DiffusionNet on different operators, as a Markdown table: python benchmarks/learning.py [--data PATH].
 
 PATH is that of examples/train_segmentation.py (without it, its ellipsoids): two of three shapes train as meshes of
-about `--points` vertices; the others test, as such meshes, as clouds of as many points on the undecimated meshes, as
-meshes decimated by quadric error instead of by edge length, and as meshes of half as many vertices. Inputs are x, y, z,
-every shape turned at random, also those that test. Weights, order and turns of a seed are the same for all operators.
+about `--points` vertices; the others test, as such meshes, decimated by quadric error instead of by edge length, with
+half and twice as many vertices, refined once to the limit of Loop's subdivision, as clouds of as many points on the
+undecimated meshes, and as these with Gaussian noise of a tenth of √(area/N). Inputs are x, y, z, every shape turned at
+random, also those that test. Weights, order and turns of a seed are the same for all operators.
 
 torchlb: `from_mesh`, and `from_points` on clouds. cotangent: `from_cotangent`; it has none for clouds, which get
 torchlb's. original: what DiffusionNet's own code computes, written from its description: potpourri3d's cotangent
@@ -34,7 +35,8 @@ from scipy.spatial import KDTree
 from torch import Tensor
 from tqdm import tqdm
 
-from torchlb import DiffusionNet, Eigenbasis, LaplaceBeltrami
+from torchlb import DiffusionNet, Eigenbasis, InputError, LaplaceBeltrami
+from torchlb.surfaces import limit_surface
 
 sys.path.append(str(Path(__file__).parents[1] / "examples"))
 from train_segmentation import decimated, evaluate, read, sampled, train_epoch
@@ -46,7 +48,7 @@ NEIGHBORS = 30
 class Original:
     """DiffusionNet's own operators of one shape, with what a network asks of a `LaplaceBeltrami`."""
 
-    dim = 2
+    dim, sizes = 2, ()
 
     def __init__(self, vertices: Tensor, faces: Tensor | None, k: int) -> None:
         points = vertices.numpy()
@@ -65,6 +67,7 @@ class Original:
         self.basis = Eigenbasis(
             tensor(values).clamp_min(0), evecs, self.mass, evecs * self.mass[:, None]
         )
+        self.basis_left = self.basis.left
         self.gradients = tangent_gradients(points, None if faces is None else faces.numpy())
 
     def to(self, device: str) -> Original:
@@ -73,6 +76,7 @@ class Original:
             setattr(self, name, getattr(self, name).to(device))
         parts = (self.basis.eigenvalues, self.basis.eigenvectors, self.mass, self.basis.left)
         self.basis = Eigenbasis(*(part.to(device) for part in parts))
+        self.basis_left = self.basis.left
         self.gradients = [matrix.to(device) for matrix in self.gradients]
         return self
 
@@ -138,12 +142,34 @@ def by_quadrics(vertices: Tensor, faces: Tensor, labels: Tensor, size: int) -> S
     return torch.tensor(coarse), torch.tensor(triangles), labels[torch.tensor(origin)]
 
 
+def refined(vertices: Tensor, faces: Tensor, labels: Tensor, size: int) -> Shape:
+    """The decimated mesh on its smooth limit, with four times as many vertices; each with the nearest old label."""
+    vertices, faces, labels = decimated(vertices, faces, labels, size)
+    try:
+        points, meshes = limit_surface(vertices, faces, 1)
+    except InputError:  # open, or a pinch that decimation left
+        return vertices, faces, labels
+    return points, meshes[1], labels[KDTree(vertices.numpy()).query(points.numpy())[1]]
+
+
+def noisy(vertices: Tensor, faces: Tensor, labels: Tensor, size: int, seed: int) -> Shape:
+    """A cloud whose points are off by a tenth of the spacing."""
+    points, _, found = sampled(vertices, faces, labels, size, seed=seed)
+    spacing = float(igl.doublearea(vertices.numpy(), faces.numpy()).sum() / 2 / len(points)) ** 0.5
+    random = torch.Generator().manual_seed(seed)
+    noise = torch.randn(points.shape, dtype=points.dtype, generator=random)
+    return points + 0.1 * spacing * noise, None, found
+
+
 def test_sets(whole: list[Any], size: int) -> dict[str, list[Shape]]:
     makers: dict[str, Callable[..., Any]] = {
         "meshes": lambda i, s: decimated(*s, size),
-        "clouds": lambda i, s: sampled(*s, size, seed=i),
         "by quadrics": lambda i, s: by_quadrics(*s, size),
         "half": lambda i, s: decimated(*s, size // 2),
+        "twice": lambda i, s: decimated(*s, 2 * size),
+        "refined": lambda i, s: refined(*s, size),
+        "clouds": lambda i, s: sampled(*s, size, seed=i),
+        "noisy clouds": lambda i, s: noisy(*s, size, seed=i),
     }
     return {name: [make(i, s) for i, s in enumerate(whole)] for name, make in makers.items()}
 
@@ -162,7 +188,7 @@ def precompute(kind: str, sets: dict[str, list[Shape]], k: int) -> tuple[dict[st
 
 
 def run(
-    method: str, data: dict[str, list[Any]], classes: int, seed: int, options: argparse.Namespace
+    layer: str, data: dict[str, list[Any]], classes: int, seed: int, options: argparse.Namespace
 ) -> tuple[dict[str, float], float]:
     """Accuracies on the test sets of one training, and the median seconds of an epoch."""
     torch.manual_seed(seed)
@@ -172,13 +198,14 @@ def run(
         width=options.width,
         num_blocks=options.blocks,
         rotations=False,
-        method=method,
+        block=layer if layer in ("implicit", "poisson") else "diffusion",
+        method="spectral" if layer in ("implicit", "poisson") else layer,
         k=options.k,
     )
     optimizer = torch.optim.Adam(net.parameters(), lr=3e-3)
     schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, options.epochs)
     seconds = []
-    for epoch in tqdm(range(options.epochs), f"{method}, seed {seed}", leave=False):
+    for epoch in tqdm(range(options.epochs), f"{layer}, seed {seed}", leave=False):
         start = time.perf_counter()
         train_epoch(net, optimizer, data["train"], 1000 * (seed + 1) + epoch)
         schedule.step()
@@ -193,12 +220,16 @@ def main() -> None:
     parser.add_argument("--quick", action="store_true", help="few points and epochs: does it run?")
     parser.add_argument("--points", type=int, default=1500)
     parser.add_argument("--epochs", type=int, default=30)
-    parser.add_argument("--seeds", type=int, default=3)
+    parser.add_argument("--seeds", type=int, default=5)
     parser.add_argument("--k", type=int, default=64)
     parser.add_argument("--width", type=int, default=32)
     parser.add_argument("--blocks", type=int, default=3)
+    parser.add_argument("--operators", nargs="+", default=["torchlb", "cotangent", "original"])
     parser.add_argument(
-        "--methods", nargs="+", default=["spectral", "deflated"], help="of diffusion, on torchlb's"
+        "--layers",
+        nargs="+",
+        default=["spectral", "implicit", "poisson"],
+        help="blocks, or methods of diffusion; on the original's operators spectral alone",
     )
     options = parser.parse_args()
     if options.quick:
@@ -219,14 +250,14 @@ def main() -> None:
         f"num_blocks={options.blocks}, k={options.k}; accuracy in % of the points, mean ± deviation of "
         f"{options.seeds} seeds; one thread.\n"
     )
-    columns = ["operators", "diffusion", *list(sets)[1:], "s an epoch"]
+    columns = ["operators", "layers", *list(sets)[1:], "s an epoch"]
     columns += ["s to precompute, a mesh / cloud"]
     print("| " + " | ".join(columns) + " |\n|" + "---|" * len(columns), flush=True)
-    for kind in ("torchlb", "cotangent", "original"):
+    for kind in options.operators:
         data, cost = precompute(kind, sets, options.k)
-        for method in options.methods if kind != "original" else ["spectral"]:
-            runs = [run(method, data, classes, seed, options) for seed in range(options.seeds)]
-            cells = [kind, method]
+        for layer in options.layers if kind != "original" else ["spectral"]:
+            runs = [run(layer, data, classes, seed, options) for seed in range(options.seeds)]
+            cells = [kind, layer]
             for name in list(sets)[1:]:
                 values = [100 * accuracies[name] for accuracies, _ in runs]
                 cells.append(f"{np.mean(values):.1f} ± {np.std(values):.1f}")
