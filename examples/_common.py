@@ -3,6 +3,7 @@
 import argparse
 from pathlib import Path
 
+import igl
 import matplotlib as mpl
 
 mpl.use("Agg")  # pictures go to files; no screen is needed
@@ -10,7 +11,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 import torch
 
-from torchlb.surfaces import StarShaped
+from torchlb.surfaces import StarShaped, limit_surface
 
 # Elevation and azimuth of an eye that sees the outer side of a left hemisphere.
 LEFT = (15.0, 200.0)
@@ -47,6 +48,36 @@ def cortex(kind="infl_left", points=0):
     mesh = load_surf_mesh(fetch_surf_fsaverage("fsaverage5")[kind])  # no download
     vertices, faces = np.array(mesh.coordinates, float), np.array(mesh.faces, int)
     return torch.tensor(vertices), torch.tensor(faces), f"fsaverage5 ({kind})", "mm"
+
+
+def smooth_cortex(points, levels):
+    """Name and meshes (vertices, faces) of the levels 0, 1, … of a folded cortical surface made smooth, of area 1.
+
+    It is decimated to so many points and subdivided to its limit, on which the vertices of all levels stand: those of
+    a coarse one are the first of a finer one.
+    """
+    vertices, faces, name, _ = cortex("pial_left")
+    control = igl.qslim(vertices.numpy(), faces.numpy(), 2 * points - 4)
+    places, levels = limit_surface(*(torch.from_numpy(a) for a in control[:2]), levels)
+    a, b, c = places[levels[-1]].unbind(1)
+    area = torch.linalg.cross(b - a, c - a).norm(dim=1).sum() / 2
+    places = (places - places.mean(0)) / area.sqrt()
+    return f"{name}, made smooth", [(places[: int(f.max()) + 1], f) for f in levels]
+
+
+def minimize(loss, unknowns, steps):
+    """LBFGS with a line search, in place."""
+    optimizer = torch.optim.LBFGS(
+        unknowns, max_iter=steps, tolerance_change=1e-14, line_search_fn="strong_wolfe"
+    )
+
+    def closure():
+        optimizer.zero_grad()
+        value = loss()
+        value.backward()
+        return value
+
+    optimizer.step(closure)
 
 
 def save(figure, folder, name):

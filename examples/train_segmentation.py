@@ -113,9 +113,7 @@ def main(arguments=None):
     parser.add_argument("--operator", choices=["stencil", "cotangent"], default="stencil")
     parser.add_argument("--test", choices=["meshes", "clouds"], default="meshes")
     parser.add_argument("--decimate", type=int, default=2000, help="vertices of a shape")
-    parser.add_argument(
-        "--method", default="deflated", help="of the diffusion; spectral is quicker"
-    )
+    parser.add_argument("--method", default="spectral", help="of the diffusion")
     parser.add_argument("--epochs", type=int, default=30)
     parser.add_argument("--width", type=int, default=32, help="channels of the network")
     parser.add_argument("--k", type=int, default=64, help="eigenpairs")
