@@ -23,6 +23,8 @@ demo.draw_surface(vertices, faces, lb, name, unit, ROOT / "docs" / "surface.png"
 vertices, faces, name, _ = cortex("pial_left")
 lb = LaplaceBeltrami.from_mesh(vertices, faces)
 print(lb.report)
-figure, ax = plt.subplots(figsize=(8, 4), layout="constrained")
-plot_orders(vertices, faces, lb.report.order, ax=ax, title=f"order reached, {name}", view=LEFT)
+figure, axes = plt.subplots(1, 2, figsize=(13, 4), layout="constrained")
+title = f"order of the stencil, {name}"
+plot_orders(vertices, faces, lb.report.order, ax=axes[0], title=title, view=LEFT)
+demo.draw_reached(vertices, faces, lb, axes[1], LEFT)
 figure.savefig(ROOT / "docs" / "cortex.png", dpi=90)
