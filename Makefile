@@ -7,6 +7,8 @@ TORCH ?= torch==2.13.0
 TORCH_INDEX ?=
 # Surface for the demo; empty: the one that the demo brings.
 MESH ?=
+# Limit shapes for the benchmarks (benchmarks/README.md says what they hold); empty: those that need none.
+SHAPES ?=
 
 BIN := .venv/bin
 
@@ -36,8 +38,10 @@ format: .venv/installed-dev ## put the files in ruff's format
 docs: .venv/installed-dev ## build the documentation into site/
 	$(BIN)/mkdocs build --strict
 
-bench: .venv/installed-bench ## run every benchmark; they print Markdown
-	@for file in benchmarks/[a-z]*.py; do $(BIN)/python "$$file" || exit 1; done
+bench: .venv/installed-bench ## run the benchmarks, with SHAPES="a.npz b.npz" those on limit shapes, too
+	@for file in accuracy layers learning robustness speed; do $(BIN)/python benchmarks/$$file.py || exit 1; done
+	@for file in $(if $(SHAPES),clouds conductivity limit_shapes) time_to_accuracy; do \
+		$(BIN)/python benchmarks/$$file.py $(SHAPES) || exit 1; done
 
 clean: ## remove .venv, caches and build products
 	rm -rf .venv build dist site .pytest_cache .ruff_cache

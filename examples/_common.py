@@ -17,16 +17,15 @@ from torchlb.surfaces import StarShaped, limit_surface
 LEFT = (15.0, 200.0)
 
 
-def read_options(doc, arguments=None, **numbers):
-    """Options of the command line: --output and, by name, whole numbers with a default and what they are."""
+def read_options(doc, arguments=None, **others):
+    """Options of the command line: --output and, by name, whole numbers (or a path, None) and what they are."""
     parser = argparse.ArgumentParser(description=doc.splitlines()[0])
     parser.add_argument(
         "--output", type=Path, default=Path("gallery_output"), help="for the picture"
     )
-    for name, (default, text) in numbers.items():
-        parser.add_argument(
-            f"--{name}", type=int, default=default, help=f"{text} (default: {default})"
-        )
+    for name, (default, text) in others.items():
+        kind, note = (Path, "") if default is None else (int, f" (default: {default})")
+        parser.add_argument(f"--{name}", type=kind, default=default, help=text + note)
     return parser.parse_args(arguments)
 
 
@@ -50,19 +49,25 @@ def cortex(kind="infl_left", points=0):
     return torch.tensor(vertices), torch.tensor(faces), f"fsaverage5 ({kind})", "mm"
 
 
-def smooth_cortex(points, levels):
-    """Name and meshes (vertices, faces) of the levels 0, 1, … of a folded cortical surface made smooth, of area 1.
+def smoothed(vertices, faces, points, levels, decimate=igl.qslim):
+    """Meshes (vertices, faces) of the levels 0, 1, … of a closed surface made smooth, of area 1, and where it was.
 
     It is decimated to so many points and subdivided to its limit, on which the vertices of all levels stand: those of
-    a coarse one are the first of a finer one.
+    a coarse one are the first of a finer one. The last thing returned has the number of the given vertex that each
+    point of level 0 was.
     """
-    vertices, faces, name, _ = cortex("pial_left")
-    control = igl.qslim(vertices.numpy(), faces.numpy(), 2 * points - 4)
+    control = decimate(vertices.numpy(), faces.numpy(), 2 * points - 4)
     places, levels = limit_surface(*(torch.from_numpy(a) for a in control[:2]), levels)
     a, b, c = places[levels[-1]].unbind(1)
     area = torch.linalg.cross(b - a, c - a).norm(dim=1).sum() / 2
     places = (places - places.mean(0)) / area.sqrt()
-    return f"{name}, made smooth", [(places[: int(f.max()) + 1], f) for f in levels]
+    return [(places[: int(f.max()) + 1], f) for f in levels], torch.from_numpy(control[3])
+
+
+def smooth_cortex(points, levels):
+    """Name and `smoothed` meshes of a folded cortical surface."""
+    vertices, faces, name, _ = cortex("pial_left")
+    return f"{name}, made smooth", smoothed(vertices, faces, points, levels)[0]
 
 
 def minimize(loss, unknowns, steps):

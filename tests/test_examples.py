@@ -176,6 +176,7 @@ def test_segmentation_reads_one_shape_a_file_or_a_stack_and_drops_loose_vertices
 GALLERY = {  # options of a small run, and what it prints
     "first_laplacian": (["--points", "300"], "cloud: relative error of Δf "),
     "mesh_independent_modes": (["--points", "100", "--k", "8"], "     394  torchlb "),
+    "match_bodies": (["--points", "150", "--k", "30"], "refined, torchlb: half of the points "),
     "cotangent_vs_orders": (["--points", "960"], "   cotangent     order 1     order 3"),
     "cortical_eigenmodes": (["--points", "400", "--k", "10"], "     torchlb        LaPy   cosine"),
     "diffusion_distances": (["--points", "400", "--k", "40"], "on a sphere of 400 points: 1"),
@@ -200,6 +201,15 @@ def test_an_example_of_the_gallery_prints_its_result_and_writes_one_picture(name
     load(name).main(["--output", str(tmp_path), *arguments])
     assert printed in capsys.readouterr().out
     assert pictures_in(tmp_path) == [f"{name}.png"]
+
+
+def test_bodies_to_match_are_read_from_a_file(tmp_path):
+    vertices, faces = (t.numpy() for t in Ellipsoid().mesh(250))
+    stack = np.stack([vertices, 2 * vertices, 3 * vertices]).astype("f4")
+    np.savez(tmp_path / "a.npz", vertices=stack, faces=faces.astype("i4"))
+    pair, triangles, _ = load("match_bodies").read(tmp_path / "a.npz", 2, 0)
+    assert np.allclose(pair, stack[[2, 0]])
+    assert (triangles.numpy() == faces).all()
 
 
 @pytest.mark.parametrize("name", NEEDS)

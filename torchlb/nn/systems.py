@@ -183,7 +183,7 @@ class PairSystem:
             x, self.steps = conjugate_gradients(
                 lambda x: self._product(x, times),
                 right,
-                lambda r: self._precondition(r, times),
+                self._precondition,
                 tolerance=tolerance,
             )
         shift = -self._mean(self.ones_mass, x)
@@ -199,13 +199,13 @@ class PairSystem:
         stiffness, mass = (multiply(*self.pattern, v, x) for v in (self.stiffness, self.mass))
         return self._inside(mass + times * stiffness)
 
-    def _precondition(self, r: Tensor, times: Tensor | None) -> Tensor:
-        """Of a residual: smoothing, the factor's solve, smoothing, so that the whole is symmetric."""
+    def _precondition(self, r: Tensor) -> Tensor:
+        """Of a residual: smoothing, the factor's solve, smoothing, so that the whole is symmetric; all at time t."""
         if self.smoother is None:
             return self._coarse(r)
         x = self._inside(self.smoother * r)
-        x = x + self._coarse(r - self._product(x, times))
-        return x + self._inside(self.smoother * (r - self._product(x, times)))
+        x = x + self._coarse(r - self._product(x, None))
+        return x + self._inside(self.smoother * (r - self._product(x, None)))
 
     def _coarse(self, r: Tensor) -> Tensor:
         """The factor's solve, without the constants, which are large from rounding alone where K is singular."""
