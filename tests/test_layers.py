@@ -50,6 +50,7 @@ LAYERS = {
     "gradients": lambda: GradientFeatures(CHANNELS),
     "poisson": lambda: PoissonFeatures(CHANNELS),
     "poisson block": lambda: PoissonBlock(CHANNELS),
+    "poisson block, fields": lambda: PoissonBlock(CHANNELS, fields=True),
     "net": lambda: DiffusionNet(CHANNELS, 5, **SMALL),
     "original net": lambda: DiffusionNet(CHANNELS, 5, method="spectral", **SMALL),
     "implicit net": lambda: DiffusionNet(CHANNELS, 5, block="implicit", **SMALL),
@@ -112,6 +113,7 @@ SOLVING = {
     "implicit": lambda: ImplicitDiffusion(2, tolerance=1e-13),
     "poisson": lambda: PoissonBlock(2, tolerance=1e-13),
     "poisson, linear": lambda: PoissonBlock(2),
+    "poisson, fields": lambda: PoissonBlock(2, fields=True),
 }
 
 

@@ -33,6 +33,8 @@ LONG = 1.4
 """A Voronoi cell that reaches so many times as far as along the normal has another one."""
 FAR = 1e6
 """Extents of the cloud at which its outer Voronoi cells end."""
+MOVED = 1e-8
+"""Of points before they are triangulated, in units of the extent: far above rounding, far below any spacing."""
 FLAT = 1e-10
 """Tetrahedra of less volume, over the cube of their longest side, have no circumcentre to speak of; triangles alike."""
 RIDGE = 1e-13
@@ -133,10 +135,16 @@ class Tetrahedra:
 
     @classmethod
     def of(cls, points: Float[np.ndarray, "N 3"]) -> Tetrahedra:
-        """Those of a cloud that lies in no plane."""
-        delaunay = Delaunay(points)
+        """Those of a cloud that lies in no plane.
+
+        Points are moved a little for it: many on one sphere are one cell with as many corners, which takes Qhull a time
+        quadratic in their number (7,000: 15 s, moved 0.3 s).
+        """
+        random = np.random.default_rng(0).standard_normal(points.shape)
+        moved = points + MOVED * np.ptp(points, axis=0).max() * random
+        delaunay = Delaunay(moved)
         cells, beyond = delaunay.simplices.astype(np.int64), delaunay.neighbors
-        centers = _circumcenters(points, cells)
+        centers = _circumcenters(moved, cells)
         faces, here, there, apex = [], [], [], []
         for k in range(4):
             own = np.flatnonzero(beyond[:, k] < np.arange(len(cells)))
@@ -151,12 +159,10 @@ class Tetrahedra:
         )
         hull = second < 0
         ends = centers[first], centers[second]
-        outer = triangles[hull]
-        normal = np.cross(
-            points[outer[:, 1]] - points[outer[:, 0]], points[outer[:, 2]] - points[outer[:, 0]]
-        )
+        a, b, c = moved[triangles[hull]].swapaxes(0, 1)
+        normal = np.cross(b - a, c - a)
         normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), TINY)
-        inside = points[outer[:, 0]] - points[np.concatenate(apex)[hull]]
+        inside = a - moved[np.concatenate(apex)[hull]]
         away = np.sign((inside * normal).sum(1, keepdims=True)) * normal
         ends[1][hull] = ends[0][hull] + FAR * np.ptp(points, axis=0).max() * away
         return cls(points, cells, centers, triangles, ends, hull)

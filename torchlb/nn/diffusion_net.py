@@ -88,8 +88,7 @@ class DiffusionNet(nn.Module):
     block : "diffusion", "implicit" or "poisson".
     outputs_at : "vertices", "edges", "faces" (means over the corners) or "global_mean" (over the surface, by mass).
     last_activation : applied to the output, such as ``lambda y: y.log_softmax(-1)``.
-    hidden, dropout, rotations : of the blocks.
-    gradient_features : of "diffusion" and "implicit" blocks.
+    hidden, dropout, gradient_features, rotations : of the blocks.
     method, k : of "diffusion" blocks.
 
     Raises
@@ -129,8 +128,8 @@ class DiffusionNet(nn.Module):
         self.outputs_at, self.last_activation = outputs_at, last_activation
         self.first_lin = nn.Linear(in_channels, width)
         shared = {"hidden": hidden, "dropout": dropout, "rotations": rotations}
-        diffusing = {"gradient_features": gradient_features, "k": k}
-        diffusing["method"] = "implicit" if block == "implicit" else method
+        shared["gradient_features"] = gradient_features
+        diffusing = {"method": "implicit" if block == "implicit" else method, "k": k}
         self.blocks = nn.ModuleList(
             PoissonBlock(width, **shared)
             if block == "poisson"

@@ -1,6 +1,8 @@
-"""A block that acts on gradients and comes back by a Poisson solve: global in one step, and no eigenbasis.
+"""A block that solves a Poisson problem for learned sources: global in one step, and no eigenbasis.
 
-After PoissonNet (Maesumi, Thambiraja and others 2025), here with gradients at the points, mapped as in DiffusionNet.
+After PoissonNet (Maesumi, Thambiraja and others 2025), which maps gradients and comes back by such a solve. Sources at
+the points are added here, since mapped gradients alone give back what came in: by them a segmentation of bodies from
+coordinates stays at half of the points, by sources alone it reaches nine tenths (benchmarks/README.md, learning).
 """
 
 from __future__ import annotations
@@ -11,48 +13,67 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from torchlb.nn.gradient_features import TangentMap
+from torchlb.nn.checks import check_features
+from torchlb.nn.gradient_features import GradientFeatures, TangentMap
 from torchlb.nn.pointwise import mlp
 from torchlb.nn.solves import potential
 from torchlb.operator.laplace_beltrami import LaplaceBeltrami
 
+SOURCE = 3.0
+"""Size of the sources at the start in units of the features', 1/ℓ²: about λ_1 of a shape of radius one."""
 
-class PoissonFeatures(TangentMap):
-    """u_c with ∇u_c closest to the field g_c Σ_j A_cj ∇x_j, of mean zero: Ku = ∇ᵀ(π v) for each field v.
 
-    The map A of the gradients is linear, the gates g = sigmoid(Bx + b) are pointwise: where they close the field stops,
-    as at an edge. With gates and A of one u is x less its mean.
+class PoissonFeatures(nn.Module):
+    """u_c with −Δu_c = s_c − ∇·v_c, of mean zero, for learned sources s = Wx and fields v.
+
+    The fields, if there are any, are g_c Σ_j A_cj ∇x_j: a linear map A of the gradients and gates g = sigmoid(Bx + b),
+    where they close the field stops, as at an edge. With gates and A of one and no source u is x less its mean.
 
     Parameters
     ----------
-    channels, rotations : C, and whether A is complex, see `TangentMap`.
+    channels : C.
+    fields : whether there are fields; a step of a network takes a third as long again.
+    rotations : whether A is complex, see `TangentMap`.
     tolerance : of the solves with the weak pair, relative; by default linear elements are taken, one exact solve, since
         what is learned has no need of more. Without a weak pair the stencil's.
     """
 
     def __init__(
-        self, channels: int, *, rotations: bool = True, tolerance: float | None = None
+        self,
+        channels: int,
+        *,
+        fields: bool = False,
+        rotations: bool = True,
+        tolerance: float | None = None,
     ) -> None:
-        super().__init__(channels, rotations=rotations)
-        self.gate = nn.Linear(channels, channels)
-        self.tolerance = tolerance
+        super().__init__()
+        self.channels, self.tolerance = channels, tolerance
+        self.source = nn.Linear(channels, channels, bias=False)
+        with torch.no_grad():
+            self.source.weight.mul_(SOURCE)
+        self.map = TangentMap(channels, rotations=rotations) if fields else None
+        self.gate = nn.Linear(channels, channels) if fields else None
 
     def forward(self, x: Float[Tensor, "*B N C"], lb: LaplaceBeltrami) -> Float[Tensor, "*B N C"]:
         """The features of x, (N, C) or (B, N, C), in its shape and type."""
-        _, field = self.gradients(x, lb)
-        field = torch.sigmoid(self.gate(x))[..., None, :] * field
-        return potential(lb, field, tolerance=self.tolerance)
+        check_features(x, lb, self.channels, self.source.weight)
+        field = None
+        if self.map is not None and self.gate is not None:
+            _, field = self.map.gradients(x, lb)
+            field = torch.sigmoid(self.gate(x))[..., None, :] * field
+        return potential(lb, field, self.source(x), tolerance=self.tolerance)
 
 
 class PoissonBlock(nn.Module):
-    """Poisson features, a pointwise network of them and of what came in, and a skip connection.
+    """Poisson features, gradient features of them, a pointwise network of these and x, and a skip connection.
 
     Parameters
     ----------
     width : channels in and out.
     hidden : widths of the hidden layers of the pointwise network; [width, width] by default.
     dropout : whether that network drops half of its hidden values while it trains.
-    rotations, tolerance : of `PoissonFeatures`.
+    gradient_features, rotations : whether there are any, and whether they turn: see `GradientFeatures`.
+    fields, tolerance : of `PoissonFeatures`.
 
     Examples
     --------
@@ -69,14 +90,25 @@ class PoissonBlock(nn.Module):
         *,
         hidden: Sequence[int] | None = None,
         dropout: bool = True,
+        gradient_features: bool = True,
         rotations: bool = True,
+        fields: bool = False,
         tolerance: float | None = None,
     ) -> None:
         super().__init__()
-        self.features = PoissonFeatures(width, rotations=rotations, tolerance=tolerance)
+        self.features = PoissonFeatures(
+            width, fields=fields, rotations=rotations, tolerance=tolerance
+        )
+        self.gradient_features = (
+            GradientFeatures(width, rotations=rotations) if gradient_features else None
+        )
         hidden = [width, width] if hidden is None else hidden
-        self.mlp = mlp([2 * width, *hidden, width], dropout)
+        self.mlp = mlp([(3 if gradient_features else 2) * width, *hidden, width], dropout)
 
     def forward(self, x: Float[Tensor, "*B N C"], lb: LaplaceBeltrami) -> Float[Tensor, "*B N C"]:
         """Features (N, width) or (B, N, width) in the shape of x."""
-        return x + self.mlp(torch.cat([x, self.features(x, lb)], dim=-1))
+        solved = self.features(x, lb)
+        features = [x, solved]
+        if self.gradient_features is not None:
+            features.append(self.gradient_features(solved, lb))
+        return x + self.mlp(torch.cat(features, dim=-1))

@@ -115,28 +115,40 @@ def poisson_solve(
 
 @uncompiled
 def potential(
-    lb: LaplaceBeltrami, field: Float[Tensor, "*B N d C"], *, tolerance: float | None = None
+    lb: LaplaceBeltrami,
+    field: Float[Tensor, "*B N d C"] | None,
+    source: Float[Tensor, "*B N C"] | None = None,
+    *,
+    tolerance: float | None = None,
 ) -> Float[Tensor, "*B N C"]:
-    """u of mean zero whose gradient is closest to a tangent field v, given in the frames; differentiable in v.
+    """u with −Δu = s − ∇·v, of mean zero, for a tangent field v, given in the frames, and a source s; differentiable.
 
-    Ku = Σ_c G_cᵀ(π v_c), G the rows of the gradient and π the mass: u is f less its mean where v = ∇f, up to the order
-    of the operator. With the stencil −Lu = ∇ᵀ(π v)/π.
+    Ku = Σ_c G_cᵀ(π v_c) + π s, G the rows of the gradient and π the mass; with the stencil −L for K, and the right side
+    over π. For a field alone u's gradient is closest to it; where v = ∇f it is f less its mean, up to the order.
 
     Parameters
     ----------
-    field : (N, d, C) or (B, N, d, C), as `lb.local_gradient` gives it; units of u by 1/ℓ.
+    field : (N, d, C) or (B, N, d, C), as `lb.local_gradient` gives it, units of u by 1/ℓ; None for none.
+    source : (N, C) or (B, N, C), units of u by 1/ℓ²; its mean is taken off.
     tolerance : of the solve with the weak pair, relative; None for that of linear elements, which is second order.
     """
-    weighted = lb.mass.to(field.dtype)[:, None, None] * field
-    products = [
-        lb._apply_rows(values, part, transposed=True)
-        for values, part in zip(lb.gradient_values, weighted.unbind(-2), strict=True)
-    ]
+    products = []
+    if source is not None:
+        products.append(lb.mass.to(source.dtype)[:, None] * source)
+    if field is not None:
+        weighted = lb.mass.to(field.dtype)[:, None, None] * field
+        products += [
+            lb._apply_rows(values, part, transposed=True)
+            for values, part in zip(lb.gradient_values, weighted.unbind(-2), strict=True)
+        ]
     right = sum(products[1:], products[0])
-    if not lb.has_weak_form:
-        right = right / lb.mass.double()[:, None]
-    columns, _ = _columns(right, None)
-    return _shaped(_solve(columns, None, None, None, lb, tolerance), field[..., 0, :])
+    columns, _ = _columns(right if lb.has_weak_form else right / lb.mass.double()[:, None], None)
+    if source is None and field is not None:
+        source = field[..., 0, :]
+    assert source is not None, "neither field nor source"
+    return _shaped(
+        _solve(columns, None, None, None, lb, tolerance), source
+    )  # in its shape and type
 
 
 def _columns(x: Tensor, time: Tensor | None) -> tuple[Tensor, Tensor]:
