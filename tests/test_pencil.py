@@ -9,11 +9,14 @@ import torch
 import trimesh
 from scipy import linalg, sparse
 
+from torchlb import LaplaceBeltrami
 from torchlb.errors import EigenbasisError
 from torchlb.linalg.factor import cholesky
 from torchlb.linalg.lanczos import lanczos
+from torchlb.spectral import pencil
 from torchlb.spectral.eigenbasis import stack_eigenbases, unstack_eigenbases
 from torchlb.spectral.pencil import pencil_eigenbasis
+from torchlb.surfaces import Ellipsoid
 
 
 def path_matrix(size, shift):
@@ -209,3 +212,19 @@ def test_a_tolerance_beyond_rounding_is_an_error():
     stiffness, mass_matrix, linear = weak_pair(37, 41)
     with pytest.raises(EigenbasisError, match="larger tolerance"):
         solved(stiffness, mass_matrix, 5, linear=linear, tolerance=0.0)
+
+
+def test_factors_take_over_where_sweeps_stall(monkeypatch):
+    """With a warning, and to the same eigenvalues; beyond the size that is factored an error says what to do."""
+    lb = LaplaceBeltrami.from_mesh(*Ellipsoid().mesh(900))
+    expected = lb.eigenbasis(10, tolerance=1e-10).eigenvalues
+    monkeypatch.setattr(pencil, "SWEEPS", 1)
+    fresh = LaplaceBeltrami.from_mesh(*Ellipsoid().mesh(900))
+    with pytest.warns(UserWarning, match="after 1 sweeps some of 10 eigenvalues .* Factors of the"):
+        found = fresh.eigenbasis(10, tolerance=1e-10)
+    torch.testing.assert_close(found.eigenvalues, expected, rtol=1e-9, atol=1e-9)
+    gram = found.eigenvectors.T @ (fresh.mass_matrix @ found.eigenvectors)
+    torch.testing.assert_close(gram, torch.eye(len(gram), dtype=gram.dtype), rtol=0, atol=1e-8)
+    monkeypatch.setattr(pencil, "prefers_krylov", lambda size: True)
+    with pytest.raises(EigenbasisError, match="ask for a larger tolerance"):
+        LaplaceBeltrami.from_mesh(*Ellipsoid().mesh(900)).eigenbasis(10, tolerance=1e-10)

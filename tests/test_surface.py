@@ -5,6 +5,7 @@ from functools import cache
 import numpy as np
 import pytest
 import torch
+import trimesh
 
 from builders import stencil_of_cloud
 from torchlb import InputError, LaplaceBeltrami
@@ -139,6 +140,29 @@ def test_rings_far_apart_are_one_tube(size):
     a, b, c = points[surface.faces].unbind(1)
     area = float(torch.linalg.cross(b - a, c - a).norm(dim=1).sum() / 2)
     assert area == pytest.approx(2 * np.pi * 8 + 4 * np.pi, rel=0.02)
+
+
+def test_circles_of_latitude_are_one_sphere():
+    """A quarter of the points on rings much closer in them than to the next one; four on a circle everywhere."""
+    polar = torch.pi * (torch.arange(30).double() + 0.5) / 30
+    angle = 2 * torch.pi * torch.arange(30).double() / 30
+    polar, angle = (t.flatten() for t in torch.meshgrid(polar, angle, indexing="ij"))
+    points = torch.stack([polar.sin() * angle.cos(), polar.sin() * angle.sin(), polar.cos()], 1)
+    lb = LaplaceBeltrami.from_points(points)
+    assert len(lb.faces) == 2 * len(points) - 4
+    assert (edges_of(lb.faces.numpy(), len(points)).uses == 2).all()
+    values = lb.eigenbasis(9).eigenvalues
+    expected = torch.tensor([0.0, 2, 2, 2, 6, 6, 6, 6, 6], dtype=values.dtype)
+    torch.testing.assert_close(values, expected, rtol=1e-3, atol=1e-9)
+
+
+def test_subdivided_faces_of_a_box_are_its_surface():
+    """Flat sides where many points are on one circle or sphere."""
+    box = trimesh.creation.box().subdivide().subdivide().subdivide()
+    lb = LaplaceBeltrami.from_points(torch.tensor(box.vertices.copy()))
+    assert float(lb.mass.sum()) == pytest.approx(6, rel=0.04)
+    values = lb.eigenbasis(4).eigenvalues
+    assert ((values[1:] - 4.16).abs() < 0.2).all()
 
 
 def test_walls_of_cavities_face_into_them():

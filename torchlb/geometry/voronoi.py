@@ -48,10 +48,9 @@ def _inverse_radius(
     valid: Bool[Tensor, "B K"],
     directions: Float[Tensor, "B u d"],
 ) -> Float[Tensor, "B K u"]:
-    """2 y_j·u / |y_j|²: the largest over j is 1 / r(u). Negative for neighbours behind the point."""
+    """2 y_j·u / |y_j|²: the largest over j is 1 / r(u), if it is positive; 0 for those that are not valid."""
     square = coords.square().sum(-1, keepdim=True).clamp_min(torch.finfo(coords.dtype).tiny)
-    inverse = 2 * (coords / square) @ directions.mT
-    return inverse.masked_fill(~valid[..., None], -torch.inf)
+    return (2 * coords / square).masked_fill(~valid[..., None], 0.0) @ directions.mT
 
 
 def natural_neighbors(
