@@ -35,7 +35,14 @@ from scipy.spatial import KDTree
 from torch import Tensor
 from tqdm import tqdm
 
-from torchlb import DiffusionNet, Eigenbasis, ImplicitDiffusion, InputError, LaplaceBeltrami
+from torchlb import (
+    DiffusionNet,
+    Eigenbasis,
+    ImplicitDiffusion,
+    InputError,
+    LaplaceBeltrami,
+    heat_kernel_signature,
+)
 from torchlb.surfaces import limit_surface
 
 sys.path.append(str(Path(__file__).parents[1] / "examples"))
@@ -161,7 +168,18 @@ def noisy(vertices: Tensor, faces: Tensor, labels: Tensor, size: int, seed: int)
     return points + 0.1 * spacing * noise, None, found
 
 
-def test_sets(whole: list[Any], size: int) -> dict[str, list[Shape]]:
+class OnSignatures(torch.nn.Module):
+    """A network whose features are heat kernel signatures, at 16 times from 0.01 to 1, in place of coordinates."""
+
+    def __init__(self, net: torch.nn.Module, k: int) -> None:
+        super().__init__()
+        self.net, self.k, self.times = net, k, torch.logspace(-2, 0, 16)
+
+    def forward(self, _: Tensor, lb: LaplaceBeltrami) -> Tensor:
+        return self.net(heat_kernel_signature(lb, self.times, k=self.k).float(), lb)
+
+
+def test_sets(whole: list[Any], size: int, names: list[str]) -> dict[str, list[Shape]]:
     makers: dict[str, Callable[..., Any]] = {
         "meshes": lambda i, s: decimated(*s, size),
         "by quadrics": lambda i, s: by_quadrics(*s, size),
@@ -171,7 +189,7 @@ def test_sets(whole: list[Any], size: int) -> dict[str, list[Shape]]:
         "clouds": lambda i, s: sampled(*s, size, seed=i),
         "noisy clouds": lambda i, s: noisy(*s, size, seed=i),
     }
-    return {name: [make(i, s) for i, s in enumerate(whole)] for name, make in makers.items()}
+    return {name: [makers[name](i, s) for i, s in enumerate(whole)] for name in names or makers}
 
 
 def precompute(kind: str, sets: dict[str, list[Shape]], k: int) -> tuple[dict[str, list[Any]], str]:
@@ -192,8 +210,8 @@ def run(
 ) -> tuple[dict[str, float], float]:
     """Accuracies on the test sets of one training, and the median seconds of an epoch."""
     torch.manual_seed(seed)
-    net = DiffusionNet(
-        3,
+    net: torch.nn.Module = DiffusionNet(
+        16 if options.signatures else 3,
         classes,
         width=options.width,
         num_blocks=options.blocks,
@@ -205,6 +223,8 @@ def run(
     for part in net.modules():
         if isinstance(part, ImplicitDiffusion):
             part.tolerance = 1e-3
+    if options.signatures:
+        net = OnSignatures(net, options.k)
     optimizer = torch.optim.Adam(net.parameters(), lr=3e-3)
     schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, options.epochs)
     seconds = []
@@ -234,13 +254,15 @@ def main() -> None:
         default=["spectral", "implicit", "poisson"],
         help="blocks, or methods of diffusion; on the original's operators spectral alone",
     )
+    parser.add_argument("--sets", nargs="+", default=[], help="test sets (default: all)")
+    parser.add_argument("--signatures", action="store_true", help="instead of coordinates")
     options = parser.parse_args()
     if options.quick:
         options.points, options.epochs, options.k, options.width = 300, 3, 24, 16
     torch.set_num_threads(1)
     shapes = read(options.data)
     sets = {"train": [decimated(*s, options.points) for i, s in enumerate(shapes) if i % 3 < 2]}
-    sets |= test_sets(shapes[2::3], options.points)
+    sets |= test_sets(shapes[2::3], options.points, options.sets)
     classes = int(max(labels.max() for _, _, labels in shapes)) + 1
     peers = ("potpourri3d", "robust_laplacian")
     print("# Learning\n", *versions(), sep="\n")

@@ -66,7 +66,7 @@ def main(arguments=None):
         off = (there[0][found[: len(truth)]] - there[0][truth]).norm(dim=1).sort().values
         print(f"{label}: half of the points within {off.median():.3f} √area")
         axes[2].plot(off, torch.linspace(0, 100, len(off)), label=label)
-    axes[2].set(xlabel="distance from the true place, √area", ylabel="points within it, %")
+    axes[2].set(xlabel="distance from the true place, √area", ylabel="points within, %")
     axes[2].legend(loc="lower right", frameon=False)
     axes[3].barh(list(bars), list(bars.values()), color="0.5")
     axes[3].set_title("distance of their ShapeDNA")

@@ -10,6 +10,7 @@ import torch
 from jaxtyping import Float, Int
 from scipy import sparse
 from torch import Tensor
+from torch.autograd.function import once_differentiable
 
 from torchlb.galerkin.assembly import CHUNK, area_element, assemble, flat_metric
 from torchlb.galerkin.curving import Surface, curve
@@ -104,6 +105,7 @@ class _Prolonged(torch.autograd.Function):
         return torch.from_numpy(np.asarray(matrix @ x.detach().numpy()))
 
     @staticmethod
+    @once_differentiable
     def backward(ctx: Any, g: Tensor) -> tuple[Any, ...]:  # pyright: ignore[reportIncompatibleMethodOverride]
         return torch.from_numpy(np.asarray(ctx.matrix.T @ g.numpy())), None
 

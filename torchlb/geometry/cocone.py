@@ -33,8 +33,8 @@ LONG = 1.4
 """A Voronoi cell that reaches so many times as far as along the normal has another one."""
 FAR = 1e6
 """Extents of the cloud at which its outer Voronoi cells end."""
-MOVED = 1e-8
-"""Of points before they are triangulated, in units of the extent: far above rounding, far below any spacing."""
+MOVED = 1e-5
+"""Of points before they are triangulated, in units of the spacing: far above rounding."""
 FLAT = 1e-10
 """Tetrahedra of less volume, over the cube of their longest side, have no circumcentre to speak of; triangles alike."""
 RIDGE = 1e-13
@@ -134,14 +134,14 @@ class Tetrahedra:
     hull: Bool[np.ndarray, " F"]
 
     @classmethod
-    def of(cls, points: Float[np.ndarray, "N 3"]) -> Tetrahedra:
-        """Those of a cloud that lies in no plane.
+    def of(cls, points: Float[np.ndarray, "N 3"], spacing: Float[np.ndarray, " N"]) -> Tetrahedra:
+        """Those of a cloud that lies in no plane; `spacing`, ℓ, to the nearest other point.
 
         Points are moved a little for it: many on one sphere are one cell with as many corners, which takes Qhull a time
         quadratic in their number (7,000: 15 s, moved 0.3 s).
         """
         random = np.random.default_rng(0).standard_normal(points.shape)
-        moved = points + MOVED * np.ptp(points, axis=0).max() * random
+        moved = points + MOVED * spacing[:, None] * random
         delaunay = Delaunay(moved)
         cells, beyond = delaunay.simplices.astype(np.int64), delaunay.neighbors
         centers = _circumcenters(moved, cells)

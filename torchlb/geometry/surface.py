@@ -144,7 +144,8 @@ def cloud_surface(
     rim = np.zeros(count, dtype=bool) if boundary is None else boundary.numpy()
     planar = _planar_triangles(places)
     if planar is None:
-        tetrahedra = Tetrahedra.of(places)
+        nearest = np.linalg.norm(places[near[:, 1]] - places, axis=1)
+        tetrahedra = Tetrahedra.of(places, nearest)
         if given is None:
             normals = corrected_normals(points, normals, candidates, tetrahedra)
         cloud = Cloud(places, normals.numpy(), near, reach, rim)

@@ -18,7 +18,9 @@ T = TypeVar("T")
 
 
 def check_shape(x: Tensor, lb: LaplaceBeltrami) -> None:
-    """InputError unless x is (N, C) or (B, N, C) with the N of the operator."""
+    """InputError unless x is (N, C) or (B, N, C) with the N of the operator, TypeError unless it is a tensor."""
+    if not isinstance(x, Tensor):
+        raise TypeError(f"expected f as a tensor, got {type(x)}; torch.as_tensor(f) makes one")
     if x.ndim not in (2, 3) or x.shape[-2] != lb.num_points:
         raise InputError(
             f"expected features of shape (N, C) or (B, N, C) with N = {lb.num_points}, got {tuple(x.shape)}"

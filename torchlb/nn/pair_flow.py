@@ -16,6 +16,7 @@ import torch
 from jaxtyping import Float
 from numpy.polynomial import chebyshev
 from torch import Tensor
+from torch.autograd.function import once_differentiable
 
 from torchlb.linalg.sparse import multiply
 from torchlb.nn.checks import uncompiled
@@ -48,6 +49,7 @@ class _Flow(torch.autograd.Function):
         return _summed(lb, x, time, tolerance, False)[0]  # pyright: ignore[reportCallIssue]
 
     @staticmethod
+    @once_differentiable
     def backward(ctx: Any, g: Tensor) -> tuple[Any, ...]:  # pyright: ignore[reportIncompatibleMethodOverride]
         x, time = ctx.saved_tensors
         lb, tolerance = ctx.rest

@@ -7,6 +7,7 @@ from typing import Any
 import torch
 from jaxtyping import Float
 from torch import Tensor
+from torch.autograd.function import once_differentiable
 
 from torchlb.errors import InputError
 from torchlb.linalg.sparse import csr_product
@@ -225,6 +226,7 @@ class _Solve(torch.autograd.Function):
         return u
 
     @staticmethod
+    @once_differentiable
     def backward(ctx: Any, g: Tensor) -> tuple[Any, ...]:  # pyright: ignore
         time, u, conductivity, given = ctx.saved_tensors
         lb, tolerance = ctx.rest
