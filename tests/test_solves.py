@@ -10,7 +10,14 @@ import torch
 from torch.autograd import gradcheck
 
 from builders import stencil_of_cloud
-from torchlb import DiffusionError, InputError, LaplaceBeltrami, implicit_step, poisson_solve
+from torchlb import (
+    DiffusionError,
+    InputError,
+    LaplaceBeltrami,
+    heat_flow,
+    implicit_step,
+    poisson_solve,
+)
 from torchlb.linalg.conjugate_gradients import conjugate_gradients
 from torchlb.nn import systems
 from torchlb.surfaces import Ellipsoid, Sphere, StarShaped, Torus, UnitDisk
@@ -167,6 +174,18 @@ def test_data_of_a_boundary_enter_with_the_order(condition, data):
     coarse, fine = torch.tensor(errors)
     assert (coarse < 1e-3).all()
     assert (fine < coarse / 8).all()
+
+
+@pytest.mark.parametrize("solve", [implicit_step, heat_flow])
+def test_second_derivatives_are_an_error(solve):
+    """And not half of what they should be."""
+    lb = BUILDERS["cotangent"]()
+    t = torch.tensor(0.1, dtype=torch.float64, requires_grad=True)
+    x = lb.points[:, 0].clone().requires_grad_()
+    slopes = torch.autograd.grad(solve(lb, x, t).pow(2).sum(), (x, t), create_graph=True)
+    for slope in slopes:
+        with pytest.raises(RuntimeError, match="once_differentiable"):
+            slope.sum().backward(retain_graph=True)
 
 
 def test_given_values_are_taken_at_the_boundary():
