@@ -1,10 +1,11 @@
 """The same DiffusionNet on different operators, as a Markdown table: python benchmarks/learning.py [--data PATH].
 
 PATH is that of examples/train_segmentation.py (without it, its ellipsoids): two of three shapes train as meshes of
-about `--points` vertices; the others test, as such meshes, decimated by quadric error instead of by edge length, with
-half and twice as many vertices, refined once to the limit of Loop's subdivision, as clouds of as many points on the
-undecimated meshes, and as these with Gaussian noise of a tenth of √(area/N). Inputs are x, y, z, every shape turned at
-random, also those that test. Weights, order and turns of a seed are the same for all operators.
+about `--train` vertices, `--points` unless given. The others test as meshes of `--points`, decimated by quadric error
+instead of by edge length, with half and twice as many vertices, refined once to the limit of Loop's subdivision, as
+clouds of as many points on the undecimated meshes, and as these with Gaussian noise of a tenth of √(area/N). Inputs are
+x, y, z, every shape turned at random, also those that test. Weights, order and turns of a seed are the same for all
+operators.
 
 torchlb: `from_mesh`, and `from_points` on clouds. cotangent: `from_cotangent`; it has none for clouds, which get
 torchlb's. original: what DiffusionNet's own code computes, written from its description: potpourri3d's cotangent
@@ -242,6 +243,7 @@ def main() -> None:
     parser.add_argument("--data", type=Path)
     parser.add_argument("--quick", action="store_true", help="few points and epochs: does it run?")
     parser.add_argument("--points", type=int, default=1500)
+    parser.add_argument("--train", type=int, help="vertices to train on (default: --points)")
     parser.add_argument("--epochs", type=int, default=30)
     parser.add_argument("--seeds", type=int, default=5)
     parser.add_argument("--k", type=int, default=64)
@@ -261,7 +263,8 @@ def main() -> None:
         options.points, options.epochs, options.k, options.width = 300, 3, 24, 16
     torch.set_num_threads(1)
     shapes = read(options.data)
-    sets = {"train": [decimated(*s, options.points) for i, s in enumerate(shapes) if i % 3 < 2]}
+    size = options.train or options.points
+    sets = {"train": [decimated(*s, size) for i, s in enumerate(shapes) if i % 3 < 2]}
     sets |= test_sets(shapes[2::3], options.points, options.sets)
     classes = int(max(labels.max() for _, _, labels in shapes)) + 1
     peers = ("potpourri3d", "robust_laplacian")
@@ -270,7 +273,7 @@ def main() -> None:
         "With", ", ".join(f"{name} {importlib.metadata.version(name)}" for name in peers), end="."
     )
     print(
-        f"\n\n{len(sets['train'])} shapes train, {len(shapes[2::3])} test; {options.points} points, "
+        f"\n\n{len(sets['train'])} shapes train, {len(shapes[2::3])} test; {options.points} points, to train {size}, "
         f"{classes} labels, {options.epochs} epochs of Adam (3e-3, cosine), width={options.width}, "
         f"num_blocks={options.blocks}, k={options.k}; accuracy in % of the points, mean ± deviation of "
         f"{options.seeds} seeds; one thread.\n"
