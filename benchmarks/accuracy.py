@@ -251,7 +251,7 @@ def bar(jobs: Sequence[Any], name: str) -> Iterable[Any]:
 
 def verdict(label: str, misses: Sequence[str]) -> None:
     """One line on whether everything held, and what did not."""
-    print(f"{label}: {'all hold' if not misses else 'MISSED by ' + '; '.join(misses)}.", flush=True)
+    print(f"{label}: {'all' if not misses else 'all but ' + '; '.join(misses)}.", flush=True)
 
 
 def converge(

@@ -29,11 +29,12 @@ def filled(
     oriented: bool,
     strict: bool,
 ) -> Faces:
-    """The faces and those of the pool, or ears between two rim edges, that extend them without folds or overlaps.
+    """The faces and what extends them without folds or overlaps; the very array where there is nothing.
 
-    Best first, in rounds, until nothing fits; no ear has all its corners on a declared boundary. If `oriented`, the
-    faces and normals agree on which way is out, and triangles have to agree with them. If not `strict` they may face
-    away from the normals by nearly a right angle, and overlap what they share no edge with.
+    Triangles of the pool, or ears between two rim edges, best first, in rounds, until nothing fits; no ear has all its
+    corners on a declared boundary. If `oriented`, the faces and normals agree on which way is out, and triangles have
+    to agree with them. If not `strict` they may face away from the normals by nearly a right angle, and overlap what
+    they share no edge with.
     """
     count = len(cloud.points)
     outer = edges_of(faces, count).outer  # only there can anything be added
@@ -52,7 +53,9 @@ def filled(
         new = _proposals(cloud, edges, half, candidates, oriented, ALIGNED if strict else TILTED)
         new = new[~overlapping(cloud, new, around)] if strict else new
         if len(new) == 0:
-            return np.concatenate([inner, around])
+            return (
+                faces if len(inner) + len(around) == len(faces) else np.concatenate([inner, around])
+            )
         best = np.full(count, len(new))
         np.minimum.at(best, new.ravel(), np.arange(len(new)).repeat(3))
         chosen = (best[new] == np.arange(len(new))[:, None]).all(1)
@@ -181,7 +184,7 @@ def closed(
         if ears is not None:
             done.append(loop)
             new.append(np.array(ears))
-    return np.concatenate(new), done
+    return np.concatenate(new) if done else faces, done
 
 
 def _clipped(cloud: Cloud, loop: list[int], known: set[int]) -> list[list[int]] | None:

@@ -112,6 +112,7 @@ class CloudSurface:
     stars : (S, 3), local triangles where it has gaps, of which a third counts.
     normals : (N, 3), unit, on the side of the faces.
     frames : (N, 3, 2), orthonormal, under the normals; they turn with the points.
+    neighbors : (N, K), the nearest points of each, itself first.
     summary : how that was found.
     """
 
@@ -120,6 +121,7 @@ class CloudSurface:
     stars: Int[Tensor, "S 3"]
     normals: Float[Tensor, "N 3"]
     frames: Float[Tensor, "N 3 2"]
+    neighbors: Int[Tensor, "N K"]
     summary: SurfaceSummary
 
 
@@ -154,16 +156,15 @@ def cloud_surface(
         cloud = Cloud(places, normals.numpy(), near, reach, rim)
         found = pool = cloud.small(planar)
     faces, seam = wound_alike(places, _clean(best_manifold(places, found), count))
-    faces = facing_out(places, _clean(faces[~seam], count))
+    faces = facing_out(places, _clean(faces[~seam], count) if seam.any() else faces)
     cloud = _oriented(cloud, faces)
-    for oriented in (True, False):  # a surface with one side only is closed in the second round
-        faces = filled(cloud, faces, pool, oriented=oriented, strict=True)
-    faces = filled(cloud, _clean(faces, count), pool, oriented=True, strict=False)
-    faces, pairs = _clean(faces, count), _kin(cloud)
+    bare, faces = faces, _without_gaps(cloud, faces, pool)
+    pairs = _kin(cloud)
     faces, done = closed(cloud, faces, _at_gaps(faces, pairs, count))
-    faces, _ = wound_alike(places, with_left_points(cloud, faces))
-    faces = facing_out(places, faces)
-    cloud = _oriented(cloud, faces)
+    faces = with_left_points(cloud, faces)
+    if faces is not bare:
+        faces = facing_out(places, wound_alike(places, faces)[0])
+        cloud = _oriented(cloud, faces)
     stars = stars_in_gaps(cloud, faces, pairs)
     loops = boundary_loops(faces, count)
     pieces = pieces_of(np.concatenate([faces, stars]), count)
@@ -171,7 +172,9 @@ def cloud_surface(
     summary = SurfaceSummary(count, *figures, noise, *_contacts(cloud, faces))
     normals, triangles = torch.from_numpy(cloud.normals), torch.from_numpy(faces)
     frames = _upright(frames, normals)
-    return CloudSurface(points, triangles, torch.from_numpy(stars), normals, frames, summary)
+    return CloudSurface(
+        points, triangles, torch.from_numpy(stars), normals, frames, candidates, summary
+    )
 
 
 def _upright(
@@ -181,6 +184,16 @@ def _upright(
     first, second = (frames - normals[..., None] * (normals[:, None] @ frames)).unbind(-1)
     first = normalize(torch.where(first.norm(dim=1, keepdim=True) > 0.5, first, second))
     return torch.stack([first, torch.linalg.cross(normals, first)], -1)
+
+
+def _without_gaps(cloud: Cloud, faces: Faces, pool: Faces) -> Faces:
+    """The faces, clean, with all that fits into their gaps, clean again; they themselves where nothing does."""
+    count, more = len(cloud.points), faces
+    for oriented in (True, False):  # a surface with one side only is closed in the second round
+        more = filled(cloud, more, pool, oriented=oriented, strict=True)
+    faces = faces if more is faces else _clean(more, count)
+    more = filled(cloud, faces, pool, oriented=True, strict=False)
+    return faces if more is faces else _clean(more, count)
 
 
 def _at_gaps(

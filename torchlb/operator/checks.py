@@ -44,8 +44,9 @@ def check_points(points: ArrayLike, what: str = "points") -> Float[Tensor, "N n"
     try:
         points = as_tensor(points)
     except (TypeError, ValueError, RuntimeError) as error:
+        hint = "; a mesh goes to from_trimesh" if hasattr(points, "faces") else ""
         raise InputError(
-            f"{what}: expected an (N, n) tensor or array, got {type(points)}"
+            f"{what}: expected an (N, n) tensor or array, got {type(points)}{hint}"
         ) from error
     if points.ndim != 2:
         raise InputError(f"{what}: expected shape (N, n), got {tuple(points.shape)}")

@@ -13,8 +13,9 @@ import torch
 from jaxtyping import Bool, Float, Int
 from scipy import sparse
 from torch import Tensor
+from torch.nn.functional import pad
 
-from torchlb.baseline.robust import robust_rows
+from torchlb.baseline.robust import LEAST_AREA, robust_rows
 from torchlb.geometry.boundary import Boundary
 from torchlb.geometry.neighbors import GraphBalls, nearest_neighbors
 from torchlb.geometry.voronoi import cell_laplacian, cell_volume, unrolled
@@ -24,15 +25,24 @@ class MeshLowOrder:
     """Rows and areas of robust_laplacian on a triangle mesh."""
 
     def __init__(self, vertices: Float[Tensor, "N n"], faces: Int[Tensor, "F 3"]) -> None:
-        self._matrix, self._areas = robust_rows(vertices, faces)
+        self.vertices, self.faces = vertices, faces
+
+    @cached_property
+    def _robust(self) -> tuple[sparse.csr_array, Float[Tensor, " N"]]:
+        return robust_rows(self.vertices, self.faces)
 
     def areas(self) -> Float[Tensor, " N"]:
-        """A third of the triangles around each vertex, ℓ²."""
-        return self._areas
+        """A third of the triangles around each vertex, ℓ²; robust_laplacian's where some have next to none."""
+        corners = pad(self.vertices, (0, 3 - self.vertices.shape[1]))[self.faces]
+        sides = corners[:, 1:] - corners[:, :1]
+        area = torch.linalg.cross(sides[:, 0], sides[:, 1]).norm(dim=1) / 2
+        thirds = torch.zeros_like(self.vertices[:, 0])
+        thirds.index_add_(0, self.faces.reshape(-1), (area / 3).repeat_interleave(3))
+        return thirds if (thirds > LEAST_AREA * thirds.mean()).all() else self._robust[1]
 
     def rows(self, centers: Int[Tensor, " B"]) -> sparse.csr_array:
         """Rows (B, N) of Δ, 1/ℓ²."""
-        return sparse.csr_array(self._matrix[centers.numpy()])
+        return sparse.csr_array(self._robust[0][centers.numpy()])
 
 
 class CloudLowOrder:

@@ -167,8 +167,7 @@ def surface_shape(
     initial = mesh_frames(points, triangles) if flat else surface.frames
     sides = None
     if not flat:
-        candidates = nearest_neighbors(points, min(CANDIDATES[2], len(points)))
-        sides = thin_sides(points, surface.normals, nearest_pairs(candidates))
+        sides = thin_sides(points, surface.normals, nearest_pairs(surface.neighbors))
     start = GraphBalls(points, mesh_graph(triangles, len(points)), initial, sides)
     fits = VertexFits(start, fit_degrees) if fit_degrees else None
     balls, order = _refined(start, normal_order, num_neighbors, progress, fits)
