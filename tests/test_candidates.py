@@ -8,10 +8,8 @@ import torch
 from torchlb.fits.polynomials import num_monomials
 from torchlb.fits.rules import SIZE_FACTORS
 from torchlb.geometry.candidates import (
-    CHUNK_BYTES,
     Candidate,
     Search,
-    chunks,
     list_candidates,
     stencil_candidates,
 )
@@ -37,15 +35,6 @@ def test_a_given_size_replaces_the_listed_ones():
     candidates = list_candidates(2, [4, 3], ["polyharmonic", "least_squares"], num_neighbors=31)
     assert [candidate.size for candidate in candidates] == [31] * 4
     assert [candidate.degree for candidate in candidates] == [4, 4, 3, 3]
-
-
-@pytest.mark.parametrize("degree", [2, 9])
-def test_chunks_cover_all_points_within_the_bound(degree):
-    candidates = list_candidates(2, [degree])
-    parts = chunks(100_000, candidates, 2)
-    assert torch.equal(torch.cat(parts), torch.arange(100_000))
-    entry = 8 * max(candidate.size for candidate in candidates) * num_monomials(2, degree)
-    assert max(len(part) for part in parts) * entry <= max(CHUNK_BYTES, 64 * entry)
 
 
 @pytest.fixture(scope="module")
@@ -86,6 +75,14 @@ def test_every_centre_takes_the_first_candidate_that_passes(balls):
         (number, int(c)) for c in centers for number in range(int(willing[c]) + 1)
     )
     assert [number for number, _ in tried] == sorted(number for number, _ in tried)
+
+
+def test_pieces_cover_all_centres_within_the_bound(balls, monkeypatch):
+    entry = 8 * CANDIDATES[0].size * num_monomials(2, CANDIDATES[0].degree)
+    monkeypatch.setattr("torchlb.geometry.candidates.PIECE_BYTES", 100 * entry)
+    pieces = list(Search(balls, torch.arange(300), CANDIDATES[:1]))
+    assert torch.equal(torch.cat([rows for _, rows, _ in pieces]), torch.arange(300))
+    assert [len(rows) for _, rows, _ in pieces] == [100, 100, 100]
 
 
 def test_start_keeps_rows_off_the_candidates_before_their_own(balls):

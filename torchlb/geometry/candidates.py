@@ -14,8 +14,8 @@ from torchlb.fits.polynomials import num_monomials
 from torchlb.fits.rules import SIZE_FACTORS
 from torchlb.geometry.neighbors import GraphBalls
 
-CHUNK_BYTES = 2**28
-"""Bound on one array of a chunk of points: about four of them live at once."""
+PIECE_BYTES = 2**24
+"""Bound on one array of a piece: they stay near the processor, and glibc uses their memory again."""
 
 
 class Candidate(NamedTuple):
@@ -81,20 +81,12 @@ def stencil_candidates(
     ]
 
 
-def chunks(
-    num_points: int, candidates: Sequence[Candidate], dim: int
-) -> tuple[Int[Tensor, " B"], ...]:
-    """Consecutive centres, so many at a time that one (B, K, M) array stays below `CHUNK_BYTES`."""
-    size = max(candidate.size for candidate in candidates)
-    columns = num_monomials(dim, candidates[0].degree)
-    return torch.arange(num_points).split(max(64, CHUNK_BYTES // (8 * size * columns)))
-
-
 class Search:
     """Every centre tries the candidates in turn, until one settles it.
 
-    Iterating gives (number of the candidate, rows of `centers` that try it, their neighbourhoods (b, K)); who has tried
-    it is settled, or turned away from more than this candidate, before the next.
+    Iterating gives (number of the candidate, rows of `centers` that try it, their neighbourhoods (b, K)), so many rows
+    at a time that a (b, K, M) array stays below `PIECE_BYTES`; who has tried it is settled, or turned away from more
+    than this candidate, before the next.
 
     Parameters
     ----------
@@ -109,6 +101,7 @@ class Search:
         start: Int[Tensor, " B"] | None = None,
     ) -> None:
         self.balls, self.centers, self.candidates = balls, centers, candidates
+        self._dim = balls.frames.shape[-1]
         self._next = torch.zeros_like(centers) if start is None else start.clone()
 
     def settle(self, rows: Int[Tensor, " b"]) -> None:
@@ -136,6 +129,8 @@ class Search:
                 within = [c.size for c in self.candidates if c.size <= 2 * candidate.size]
                 held = candidate.size if held == 0 else max(within)
                 index, count = self.balls(self.centers[pending], held)
-            tried = eligible & (count >= candidate.size)
-            if tried.any():
-                yield number, pending[tried], index[tried, : candidate.size]
+            tried = (eligible & (count >= candidate.size)).nonzero()[:, 0]
+            entry = 8 * candidate.size * num_monomials(self._dim, candidate.degree)
+            for piece in tried.split(max(64, PIECE_BYTES // entry)):
+                if len(piece):
+                    yield number, pending[piece], index[piece, : candidate.size]

@@ -20,7 +20,7 @@ from torchlb.fits.polynomials import monomials
 from torchlb.fits.weights import window
 from torchlb.geometry.frames import complete_frames
 from torchlb.geometry.manifold import Faces, edges_of
-from torchlb.geometry.neighbors import admissible
+from torchlb.geometry.neighbors import AT_ONCE, admissible_neighbors
 from torchlb.geometry.vectors import dot
 
 COCONE = np.sin(np.pi / 8)
@@ -91,27 +91,35 @@ def refined_normals(
     The quadratics need not go through the point itself, which lessens what noise does to the slope.
     """
     centers = torch.arange(len(points)) if centers is None else centers
-    index = candidates[centers]
-    pairs = centers.repeat_interleave(index.shape[1]), index.flatten()
-    offset = points[index] - points[centers, None]
-    distance = offset.norm(dim=-1)
-    unit = torch.eye(6, dtype=points.dtype)
     for _ in range(rounds):
-        own, frames = normals[centers], complete_frames(normals[centers])
-        good = admissible(points, normals, *pairs).view(index.shape)
-        good[:, 0] = True
-        reach = (distance * good).amax(1, keepdim=True).clamp_min(TINY)
-        weight = window((distance / reach).clamp_max(1.1)) * good
-        terms = monomials(offset @ frames / reach[..., None], 2)
-        terms = torch.cat([torch.ones_like(terms[..., :1]), terms], -1) * weight[..., None]
-        heights = weight * dot(offset, own[:, None]) / reach
-        square = terms.mT @ terms
-        square += RIDGE * square.diagonal(dim1=-2, dim2=-1).sum(-1)[:, None, None] * unit
-        slope = torch.linalg.solve(square, terms.mT @ heights[..., None])[:, 1:3]
-        found = normalize(own - (frames @ slope)[..., 0])
-        sound = (good.sum(1) > 7) & (slope[..., 0].norm(dim=1) < 1)
-        normals = normals.index_put((centers[sound],), found[sound])
+        parts = [
+            _slopes_removed(points, normals, candidates[part]) for part in centers.split(AT_ONCE)
+        ]
+        normals = normals.index_put((centers,), torch.cat(parts))
     return normals
+
+
+def _slopes_removed(
+    points: Float[Tensor, "N 3"], normals: Float[Tensor, "N 3"], index: Int[Tensor, "B K"]
+) -> Float[Tensor, "B 3"]:
+    """The normals of the first of each row, turned by the slope of a quadratic through the others."""
+    own = normals[index[:, 0]]
+    frames = complete_frames(own)
+    offset = points[index] - points[index[:, :1]]
+    distance = offset.norm(dim=-1)
+    good = admissible_neighbors(points, normals, index)
+    good[:, 0] = True
+    reach = (distance * good).amax(1, keepdim=True).clamp_min(TINY)
+    weight = window((distance / reach).clamp_max(1.1)) * good
+    terms = monomials(offset @ frames / reach[..., None], 2)
+    terms = torch.cat([torch.ones_like(terms[..., :1]), terms], -1) * weight[..., None]
+    heights = weight * dot(offset, own[:, None]) / reach
+    square = terms.mT @ terms
+    trace = square.diagonal(dim1=-2, dim2=-1).sum(-1)
+    square += RIDGE * trace[:, None, None] * torch.eye(6, dtype=points.dtype)
+    slope = torch.linalg.solve(square, terms.mT @ heights[..., None])[:, 1:3]
+    sound = (good.sum(1) > 7) & (slope[..., 0].norm(dim=1) < 1)
+    return torch.where(sound[:, None], normalize(own - (frames @ slope)[..., 0]), own)
 
 
 @dataclass(frozen=True)

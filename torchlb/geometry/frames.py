@@ -15,7 +15,13 @@ from torch import Tensor
 
 from torchlb.fits.weights import MAX_RESIDUAL, centered_fit, window
 from torchlb.geometry.candidates import Candidate, Search
-from torchlb.geometry.neighbors import MIN_ALIGNMENT, GraphBalls, admissible, planes_of
+from torchlb.geometry.neighbors import (
+    AT_ONCE,
+    MIN_ALIGNMENT,
+    GraphBalls,
+    admissible_neighbors,
+    planes_of,
+)
 from torchlb.geometry.vertex_fits import VertexFits
 
 MAX_GRADIENT_GROWTH = 15.0
@@ -32,26 +38,30 @@ def cloud_frames(
     Each further round takes the nearest that the frames before found admissible, so that the other side of a thin
     sheet drops out. Error O(h) on a smooth surface.
     """
-    offset = points[candidates] - points[:, None]
-    distance = offset.norm(dim=-1)
-    centers = torch.arange(len(points)).repeat_interleave(candidates.shape[1])
-    pairs = centers, candidates.flatten()
-    good = torch.ones_like(candidates, dtype=torch.bool)
-    half = (candidates.shape[1] + 1) // 2
+    planes = None
     frames = torch.empty(0)
     for _ in range(rounds):
-        near = good & (good.cumsum(1) <= half)
-        reach = (distance * near).amax(1, keepdim=True).clamp_min(torch.finfo(distance.dtype).tiny)
-        weight = window((distance / reach).clamp_max(1.1)) * near
-        frames = _principal_directions(offset, weight, dim)
-        good = admissible(points, planes_of(frames), *pairs).view(candidates.shape)
+        parts = candidates.split(AT_ONCE)
+        frames = torch.cat([_principal_directions(points, part, planes, dim) for part in parts])
+        planes = planes_of(frames)
     return frames
 
 
 def _principal_directions(
-    offset: Float[Tensor, "N K n"], weight: Float[Tensor, "N K"], dim: int
-) -> Float[Tensor, "N n d"]:
-    """Leading eigenvectors of the weighted covariance."""
+    points: Float[Tensor, "N n"],
+    index: Int[Tensor, "B K"],
+    planes: Float[Tensor, "N n d"] | Float[Tensor, "N n"] | None,
+    dim: int,
+) -> Float[Tensor, "B n d"]:
+    """Leading eigenvectors of the weighted covariance of the nearer half of those that `planes` admit."""
+    offset = points[index] - points[index[:, :1]]
+    distance = offset.norm(dim=-1)
+    near = torch.ones_like(index, dtype=torch.bool)
+    if planes is not None:
+        near = admissible_neighbors(points, planes, index)
+    near = near & (near.cumsum(1) <= (index.shape[1] + 1) // 2)
+    reach = (distance * near).amax(1, keepdim=True).clamp_min(torch.finfo(distance.dtype).tiny)
+    weight = window((distance / reach).clamp_max(1.1)) * near
     weight = weight / weight.sum(1, keepdim=True)
     centered = offset - (weight[..., None] * offset).sum(1, keepdim=True)
     covariance = centered.mT @ (weight[..., None] * centered)

@@ -25,8 +25,9 @@ MAX_SLOPE = 0.5
 two bounds meet, at 60°."""
 VOID = 1.5
 """A natural neighbour may be this many times farther than the nearest ones; at an open end all else would be."""
-KEPT_AT_ONCE = 2**13
-"""Balls that are gathered at a time."""
+AT_ONCE = 2**13
+"""Points whose neighbours are looked at together: memory is used again, page by page the kernel would clear it."""
+PAIRS_AT_ONCE = 2**16
 BALL_SURPLUS = 1.5
 """A graph ball holds this many times the points asked for, so that its round core lies inside the ragged edge."""
 
@@ -79,6 +80,11 @@ def admissible(
     below the centre's plane (height ≤ 0.5 of the distance). `planes` are frames E, or the unit normals of a
     hypersurface, which tell the same in less time: σ_min(E_kᵀE_i) = |n_k·n_i|. Orientation is irrelevant.
     """
+    parts = zip(centers.split(PAIRS_AT_ONCE), others.split(PAIRS_AT_ONCE), strict=True)
+    return torch.cat([_admissible_part(points, planes, *part) for part in parts])
+
+
+def _admissible_part(points: Tensor, planes: Tensor, centers: Tensor, others: Tensor) -> Tensor:
     offset = points.index_select(0, others) - points.index_select(0, centers)
     total = dot(offset, offset)
     mine, theirs = planes.index_select(0, centers), planes.index_select(0, others)
@@ -90,6 +96,16 @@ def admissible(
         height = dot(offset, mine).square()
         cosine = dot(theirs, mine).abs()
     return (height <= MAX_SLOPE**2 * total) & (cosine >= MIN_ALIGNMENT)
+
+
+def admissible_neighbors(
+    points: Float[Tensor, "N n"],
+    planes: Float[Tensor, "N n d"] | Float[Tensor, "N n"],
+    index: Int[Tensor, "B K"],
+) -> Bool[Tensor, "B K"]:
+    """Which points of each row may enter the stencil of its first, see `admissible`."""
+    centers = index[:, 0].repeat_interleave(index.shape[1])
+    return admissible(points, planes, centers, index.flatten()).view(index.shape)
 
 
 def _graph(i: np.ndarray, j: np.ndarray, num_points: int) -> sparse.csr_array:
@@ -176,7 +192,7 @@ class GraphBalls:
 
     def keep(self, size: int) -> None:
         """Gather the balls of all points, up to `size`, once and for all."""
-        parts = torch.arange(len(self.points)).split(KEPT_AT_ONCE)
+        parts = torch.arange(len(self.points)).split(AT_ONCE)
         index, count = zip(*(self(centers, size) for centers in parts), strict=True)
         self.kept = torch.cat([part.int() for part in index]), torch.cat(count)
 

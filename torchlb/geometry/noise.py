@@ -8,7 +8,7 @@ from torch import Tensor
 
 from torchlb.fits.polynomials import monomials, num_monomials
 from torchlb.geometry.frames import complete_frames
-from torchlb.geometry.neighbors import admissible
+from torchlb.geometry.neighbors import admissible_neighbors
 from torchlb.geometry.vectors import dot
 
 SMOOTH = 4.0
@@ -60,14 +60,13 @@ def _residuals(
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Radius, number of admissible neighbours, sum of squares that polynomials through them leave, height at 0."""
     index = candidates[centers]
-    offset, frames = points[index] - points[centers, None], complete_frames(normals)
-    pairs = centers.repeat_interleave(index.shape[1]), index.flatten()
-    good = admissible(points, normals, *pairs).view(index.shape)
+    offset, frames = points[index] - points[centers, None], complete_frames(normals[centers])
+    good = admissible_neighbors(points, normals, index)
     good[:, 0] = True
     radius = (offset.norm(dim=-1) * good).amax(1)
     heights = dot(offset, normals[centers, None]) * good
     scale = radius.clamp_min(torch.finfo(radius.dtype).tiny)[:, None, None]
-    terms = monomials(offset @ frames[centers] / scale, degree)
+    terms = monomials(offset @ frames / scale, degree)
     terms = torch.cat([torch.ones_like(terms[..., :1]), terms], -1) * good[..., None]
     square = terms.mT @ terms
     square += RIDGE * good.sum(1)[:, None, None] * torch.eye(square.shape[-1]).to(square)

@@ -11,7 +11,7 @@ from tqdm import tqdm
 
 from torchlb.errors import InputError
 from torchlb.geometry.boundary import Boundary, boundary_of_cloud, boundary_of_mesh, detect_boundary
-from torchlb.geometry.candidates import chunks, list_candidates
+from torchlb.geometry.candidates import list_candidates
 from torchlb.geometry.frames import (
     cloud_frames,
     complete_frames,
@@ -20,7 +20,13 @@ from torchlb.geometry.frames import (
     refine_frames,
     vertex_normals,
 )
-from torchlb.geometry.neighbors import GraphBalls, mesh_graph, nearest_graph, nearest_neighbors
+from torchlb.geometry.neighbors import (
+    AT_ONCE,
+    GraphBalls,
+    mesh_graph,
+    nearest_graph,
+    nearest_neighbors,
+)
 from torchlb.geometry.orientation import (
     consistently_wound,
     nearest_pairs,
@@ -231,7 +237,7 @@ def _refined(
     shared = candidates[0].size == fit_size(initial.shape[-1], degree)
     fits = fits if fits is not None and shared and degree == fits.degrees[0] else None
     balls.keep(candidates[0].size)
-    parts = chunks(len(points), candidates, initial.shape[-1])
+    parts = torch.arange(len(points)).split(AT_ONCE)
     bar = tqdm(parts, "tangent frames", delay=2, disable=not progress, leave=False)
     found, order = zip(
         *(refine_frames(balls, centers, candidates, fits) for centers in bar),
