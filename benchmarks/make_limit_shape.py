@@ -26,18 +26,15 @@ from torchlb.surfaces import limit_surface
 LEVELS, PAIRS = 4, 41
 
 
-def controlled(path: Path, size: int) -> tuple[Tensor, Tensor]:
-    """Control points, scaled for a limit surface of area 1, and their faces."""
+def decimated(path: Path, size: int) -> tuple[Tensor, Tensor]:
+    """Control points and their faces."""
     shape, triangles = read_shape(path)
     if triangles is None:
         raise SystemExit(f"{path}: expected a closed mesh, got points alone")
     control, coarse, _, _ = igl.decimate(shape.numpy(), triangles.numpy(), 2 * size)
     if len(control) == 0:
         raise SystemExit(f"{path}: expected a manifold, libigl does not decimate others")
-    faces = torch.from_numpy(coarse.astype(np.int64))
-    points, meshes = limit_surface(torch.from_numpy(control), faces, LEVELS)
-    area = igl.doublearea(points.numpy(), meshes[-1].numpy()).sum() / 2
-    return torch.from_numpy(control / np.sqrt(area)), faces
+    return torch.from_numpy(control), torch.from_numpy(coarse.astype(np.int64))
 
 
 def answers(points: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -60,9 +57,11 @@ def main() -> None:
     parser.add_argument("out", type=Path, help="the .npz to write")
     parser.add_argument("--control", type=int, default=1200, help="number of control points")
     options = parser.parse_args()
-    control, faces = controlled(options.mesh, options.control)
+    control, faces = decimated(options.mesh, options.control)
     limit, levels = limit_surface(control, faces, LEVELS)
-    points, meshes = limit.numpy(), [level.numpy() for level in levels]
+    meshes = [level.numpy() for level in levels]
+    side = np.sqrt(igl.doublearea(limit.numpy(), meshes[-1]).sum() / 2)
+    points = limit.numpy() / side
     counts = [int(mesh.max()) + 1 for mesh in meshes]
     second, third, fourth = (answers(points[: counts[i]], meshes[i]) for i in (2, 3, 4))
     coarse, fine = (b[0] + (b[0] - a[0]) / 3 for a, b in ((second, third), (third, fourth)))
@@ -74,7 +73,7 @@ def main() -> None:
     np.savez(
         options.out,
         **{f"faces{i}": meshes[i] for i in range(3)},
-        control=control.numpy(),
+        control=control.numpy() / side,
         vertices=points[: counts[2]],
         eigenvalues=fine,
         uncertainty=uncertainty,

@@ -15,7 +15,13 @@ from torch import Tensor
 from torchlb.errors import InputError
 from torchlb.geometry.candidates import list_candidates
 from torchlb.geometry.frames import cloud_frames, mesh_frames, normals_of_frames, refine_frames
-from torchlb.geometry.neighbors import GraphBalls, mesh_graph, nearest_graph, nearest_neighbors
+from torchlb.geometry.neighbors import (
+    AT_ONCE,
+    GraphBalls,
+    mesh_graph,
+    nearest_graph,
+    nearest_neighbors,
+)
 from torchlb.geometry.voronoi import largest_gap
 
 OPEN_ANGLE, NEAREST = 2.3, 32
@@ -116,7 +122,7 @@ def detect_boundary(
     if frames.shape[-1] != 2:
         raise InputError("boundary: can be detected on surfaces only; give the mask of its points")
     masks = []
-    for centers in torch.arange(len(points)).split(8192):
+    for centers in torch.arange(len(points)).split(AT_ONCE):
         index, count = balls(centers, NEAREST)
         coords = (points[index[:, 1:]] - points[centers, None]) @ frames[centers]
         masks.append(largest_gap(coords, torch.arange(1, NEAREST) < count[:, None]) > OPEN_ANGLE)

@@ -101,7 +101,6 @@ class Search:
         start: Int[Tensor, " B"] | None = None,
     ) -> None:
         self.balls, self.centers, self.candidates = balls, centers, candidates
-        self._dim = balls.frames.shape[-1]
         self._next = torch.zeros_like(centers) if start is None else start.clone()
 
     def settle(self, rows: Int[Tensor, " b"]) -> None:
@@ -115,7 +114,7 @@ class Search:
 
     def __iter__(self) -> Iterator[tuple[int, Int[Tensor, " b"], Int[Tensor, "b K"]]]:
         """Candidates that somebody can try; balls are gathered small at first, since most rows settle early."""
-        pending = torch.arange(len(self.centers))
+        pending, dim = torch.arange(len(self.centers)), self.balls.frames.shape[-1]
         held = 0
         index = count = torch.empty(0)
         for number, candidate in enumerate(self.candidates):
@@ -130,7 +129,7 @@ class Search:
                 held = candidate.size if held == 0 else max(within)
                 index, count = self.balls(self.centers[pending], held)
             tried = (eligible & (count >= candidate.size)).nonzero()[:, 0]
-            entry = 8 * candidate.size * num_monomials(self._dim, candidate.degree)
+            entry = 8 * candidate.size * num_monomials(dim, candidate.degree)
             for piece in tried.split(max(64, PIECE_BYTES // entry)):
                 if len(piece):
                     yield number, pending[piece], index[piece, : candidate.size]

@@ -56,10 +56,10 @@ def _principal_directions(
     """Leading eigenvectors of the weighted covariance of the nearer half of those that `planes` admit."""
     offset = points[index] - points[index[:, :1]]
     distance = offset.norm(dim=-1)
-    near = torch.ones_like(index, dtype=torch.bool)
+    good = torch.ones_like(index, dtype=torch.bool)
     if planes is not None:
-        near = admissible_neighbors(points, planes, index)
-    near = near & (near.cumsum(1) <= (index.shape[1] + 1) // 2)
+        good = admissible_neighbors(points, planes, index)
+    near = good & (good.cumsum(1) <= (index.shape[1] + 1) // 2)
     reach = (distance * near).amax(1, keepdim=True).clamp_min(torch.finfo(distance.dtype).tiny)
     weight = window((distance / reach).clamp_max(1.1)) * near
     weight = weight / weight.sum(1, keepdim=True)

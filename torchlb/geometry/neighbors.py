@@ -26,8 +26,9 @@ two bounds meet, at 60°."""
 VOID = 1.5
 """A natural neighbour may be this many times farther than the nearest ones; at an open end all else would be."""
 AT_ONCE = 2**13
-"""Points whose neighbours are looked at together: memory is used again, page by page the kernel would clear it."""
+"""Points whose neighbours are looked at together: of small arrays the memory is used again."""
 PAIRS_AT_ONCE = 2**16
+"""Pairs of points that are looked at together, for the same reason."""
 BALL_SURPLUS = 1.5
 """A graph ball holds this many times the points asked for, so that its round core lies inside the ragged edge."""
 

@@ -8,7 +8,7 @@ from torch import Tensor
 
 from torchlb.fits.polynomials import monomials, num_monomials
 from torchlb.geometry.frames import complete_frames
-from torchlb.geometry.neighbors import admissible_neighbors
+from torchlb.geometry.neighbors import AT_ONCE, admissible_neighbors
 from torchlb.geometry.vectors import dot
 
 SMOOTH = 4.0
@@ -43,7 +43,7 @@ def denoised(
     if ratio[use].median() > SMOOTH:
         return points, 0.0
     moved, squares = points.clone(), []
-    for part in torch.arange(len(points)).split(2**15):
+    for part in torch.arange(len(points)).split(AT_ONCE):
         _, counts, left, offset = _residuals(points, normals, candidates, part, 2)
         known = counts > num_monomials(2, 2) + 2
         moved[part] += torch.where(known, offset, 0.0)[:, None] * normals[part]

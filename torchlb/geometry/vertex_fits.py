@@ -11,7 +11,7 @@ from torch import Tensor
 from torchlb.fits.polynomials import num_monomials
 from torchlb.fits.rules import SIZE_FACTORS
 from torchlb.fits.weights import CenteredFit, centered_fit
-from torchlb.geometry.neighbors import GraphBalls
+from torchlb.geometry.neighbors import AT_ONCE, GraphBalls
 
 MAX_CONDITION = 1e5
 MAX_MISFIT = {2: 0.3}
@@ -85,7 +85,7 @@ class VertexFits:
         """The same; the vertices without a fit have tried the degrees in turn."""
         for degree in self.degrees:
             size, terms = fit_size(2, degree), num_monomials(2, degree) - 1
-            for centers in (self.degree == 0).nonzero()[:, 0].split(2**13):
+            for centers in (self.degree == 0).nonzero()[:, 0].split(AT_ONCE):
                 index, count = balls(centers, size)
                 enough = count - 1 >= LEAST * terms
                 centers, index, count = centers[enough], index[enough], count[enough]
