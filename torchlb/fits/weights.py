@@ -159,6 +159,7 @@ class CenteredFit:
     residual : (B,): largest violation of the moment equations of the first derivatives.
     values : (B, K − 1, M − 1), the monomials V at the neighbours.
     root : (B, K − 1), √ω.
+    degree : m.
     """
 
     coefficients: Float[Tensor, "B M neighbors"]
@@ -167,6 +168,12 @@ class CenteredFit:
     residual: Float[Tensor, " B"]
     values: Float[Tensor, "B neighbors M"]
     root: Float[Tensor, "B neighbors"]
+    degree: int
+
+    def lebesgue(self, places: Float[Tensor, "B P d"]) -> Float[Tensor, " B"]:
+        """Lebesgue constant: by how much the fit can exceed the values at these places, ℓ, in local coordinates."""
+        rows = cardinal(self.coefficients, places / self.radius[:, None, None], self.degree)
+        return rows.abs().sum(-1).amax(1)
 
     def misfit(self, heights: Float[Tensor, "B neighbors n"]) -> Float[Tensor, " B"]:
         """Largest weighted distance of the heights from their fit, over ρ."""
@@ -193,8 +200,21 @@ def centered_fit(
     coefficients = (inverse / scale[..., None]) @ (q * root[..., None]).mT
     dim = coords.shape[-1]
     first = coefficients[:, :dim] @ values - torch.eye(r.shape[-1])[:dim].to(r)
-    condition = _condition(inverse)
-    return CenteredFit(coefficients, radius, condition, first.abs().amax((1, 2)), values, root)
+    residual = first.abs().amax((1, 2))
+    return CenteredFit(coefficients, radius, _condition(inverse), residual, values, root, degree)
+
+
+def cardinal(
+    coefficients: Float[Tensor, "B M neighbors"], places: Float[Tensor, "B P d"], degree: int
+) -> Float[Tensor, "B P K"]:
+    """What each value, the centre's first, adds to a fit with these coefficients at places in units of its radius.
+
+    >>> line = centered_fit(torch.tensor([[[-1.0], [1.0]]], dtype=torch.float64), 2)
+    >>> cardinal(line.coefficients, torch.tensor([[[0.5]]], dtype=torch.float64), 2).round(decimals=12).tolist()
+    [[[0.75, -0.125, 0.375]]]
+    """
+    others = monomials(places, degree) @ coefficients
+    return torch.cat([1 - others.sum(-1, keepdim=True), others], -1)
 
 
 def least_squares_weights(

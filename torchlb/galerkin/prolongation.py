@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+
 import torch
+from jaxtyping import Int
 from scipy import sparse
 from torch import Tensor
 
-from torchlb.fits.polynomials import monomials
-from torchlb.galerkin.curving import CurvedMesh, Surface, node_ends
+from torchlb.fits.weights import cardinal
+from torchlb.galerkin.curving import CurvedMesh, Ends, Surface, node_ends
+from torchlb.geometry.vertex_fits import Fits
 
-CHUNK = 2**15
-"""Pairs of a node and a vertex at a time: some 100 MB at degree 4."""
+AT_ONCE = 2**11
+"""Vertices whose nodes are looked at together: some 10 MB at degree 4."""
 
 
 def prolongation(surface: Surface, mesh: CurvedMesh) -> sparse.csr_array:
@@ -30,20 +34,35 @@ def prolongation(surface: Surface, mesh: CurvedMesh) -> sparse.csr_array:
         rows.append(count + node)
         cols.append(vertex)
         values.append(weight)
-    fits, top = surface.fits, int(surface.fits.degree.max())
-    for part in by_fit[ends.node].nonzero()[:, 0].split(CHUNK):
-        node, vertex, share = ends.node[part], ends.vertex[part], ends.share[part, None]
-        offset = mesh.places[count + node] - surface.points[vertex]
-        y = (offset[:, None] @ surface.frames[vertex])[:, 0] / fits.radius[vertex, None]
-        powers = monomials(y, top)
-        others = (powers[:, None] @ fits.coefficients[vertex, : powers.shape[1]])[:, 0]
-        row = torch.cat([1 - others.sum(1, keepdim=True), others], 1) * share
-        rows.append((count + node)[:, None].expand_as(row).flatten())
-        cols.append(fits.index[vertex].flatten())
-        values.append(row.flatten())
+    for block, part, own in _of_fits(surface.fits.blocks, ends, by_fit[ends.node], count):
+        used, vertex = own >= 0, block.vertices[part]
+        node = count + ends.node[own]
+        offset = mesh.places[node] - surface.points[vertex, None]
+        y = offset @ surface.frames[vertex] / surface.fits.radius[vertex, None, None]
+        row = cardinal(block.coefficients[part], y, block.degree) * ends.share[own][..., None]
+        index = block.points[part, None].expand_as(row)
+        rows.append(node[used].repeat_interleave(row.shape[2]))
+        cols.append(index[used].flatten())
+        values.append(row[used].flatten())
     where = torch.cat(rows).int().numpy(), torch.cat(cols).int().numpy()
     shape = (len(mesh.places), count)
     return sparse.csr_array((torch.cat(values).numpy(), where), shape=shape)
+
+
+def _of_fits(
+    blocks: list[Fits], ends: Ends, used: Tensor, count: int
+) -> Iterator[tuple[Fits, Int[Tensor, " b"], Int[Tensor, "b E"]]]:
+    """Parts of the blocks of fits, and the numbers of the used ends at each of their vertices, padded by −1."""
+    order = used.nonzero()[:, 0]
+    order = order[ends.vertex[order].argsort(stable=True)]
+    number = torch.bincount(ends.vertex[order], minlength=count)
+    start = number.cumsum(0) - number
+    for block in blocks if len(order) else []:
+        uses = number[block.vertices]
+        for part in uses.argsort().split(AT_ONCE):  # of about as many ends each
+            slot = torch.arange(int(uses[part].max()))
+            own = order[(start[block.vertices[part], None] + slot).clamp_max(len(order) - 1)]
+            yield block, part, torch.where(slot < uses[part, None], own, -1)
 
 
 def _rim_entries(mesh: CurvedMesh) -> tuple[Tensor, Tensor, Tensor]:

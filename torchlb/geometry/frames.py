@@ -13,7 +13,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from torchlb.fits.weights import MAX_RESIDUAL, centered_fit, window
+from torchlb.fits.weights import centered_fit, window
 from torchlb.geometry.candidates import Candidate, Search
 from torchlb.geometry.neighbors import (
     AT_ONCE,
@@ -22,10 +22,8 @@ from torchlb.geometry.neighbors import (
     admissible_neighbors,
     planes_of,
 )
-from torchlb.geometry.vertex_fits import VertexFits
+from torchlb.geometry.vertex_fits import VertexFits, is_regular
 
-MAX_GRADIENT_GROWTH = 15.0
-"""A slope is trusted if ρ Σ|w| of its weights stays below this; good stencils have 2 to 8."""
 NO_NORMAL = 1e-12
 """A sum of normals below this share of the products of the edges is rounding."""
 
@@ -94,8 +92,8 @@ def refine_frames(
 ) -> tuple[Float[Tensor, "B n d"], Int[Tensor, " B"]]:
     """Frames of order q at `centers`, by fits of degree q to the heights over those of `balls`.
 
-    Each centre takes the first candidate whose fit has full rank, bounded weights and a tilt below 60°. The fits of the
-    very first candidate are kept in `fits`, where the weak form finds them.
+    Each centre takes the first candidate whose fit is regular, and has a tilt below 60°. Such fits are kept in `fits`,
+    too, where the weak form finds them.
 
     Returns
     -------
@@ -104,6 +102,7 @@ def refine_frames(
     """
     points, frames = balls.points, balls.frames[centers]
     order = torch.zeros(len(centers), dtype=torch.int64)
+    middles = (points[balls.longest[centers]] - points[centers, None]) @ frames / 2
     search = Search(balls, centers, candidates)
     for number, rows, index in search:
         frame = frames[rows]
@@ -114,11 +113,10 @@ def refine_frames(
         gradient = fit.coefficients[:, : coords.shape[-1]]
         slope = gradient @ heights / fit.radius[:, None, None]  # (b, d, n), in the normal space
         refined, _ = torch.linalg.qr(frame + slope.mT)
-        growth = gradient.abs().sum(2).amax(-1)
-        passed = (fit.residual <= MAX_RESIDUAL) & (growth <= MAX_GRADIENT_GROWTH)
-        passed &= _cosine_bound(slope) & refined.isfinite().all(-1).all(-1)
-        if fits is not None and number == 0:
-            fits.take(centers[rows], index, fit, heights)
+        regular = is_regular(fit, middles[rows])
+        passed = regular & _cosine_bound(slope) & refined.isfinite().all(-1).all(-1)
+        if fits is not None:
+            fits.take(centers[rows], index, fit, heights, regular)
         frames[rows[passed]] = refined[passed]
         order[rows[passed]] = candidates[number].degree
         search.settle(rows[passed])

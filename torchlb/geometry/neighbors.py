@@ -8,6 +8,8 @@ pool, ordered by distance. A path across a crease is cut there, where the tangen
 
 from __future__ import annotations
 
+from functools import cached_property
+
 import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
@@ -29,6 +31,8 @@ AT_ONCE = 2**13
 """Points whose neighbours are looked at together: of small arrays the memory is used again."""
 PAIRS_AT_ONCE = 2**16
 """Pairs of points that are looked at together, for the same reason."""
+EDGES = 6
+"""The longest edges of a point, in whose middles its fit is judged."""
 BALL_SURPLUS = 1.5
 """A graph ball holds this many times the points asked for, so that its round core lies inside the ragged edge."""
 
@@ -164,6 +168,27 @@ def nearest_graph(
     return _graph(centers.numpy()[pick], flat.numpy()[pick], num_rows)
 
 
+def longest_edges(
+    points: Float[Tensor, "N n"], graph: sparse.csr_array, count: int
+) -> Int[Tensor, "N count"]:
+    """The other ends of the longest edges of every point; padded by the point itself.
+
+    >>> path = mesh_graph(torch.tensor([[0, 1], [1, 2]]), 3)
+    >>> longest_edges(torch.tensor([[0.0], [1.0], [3.0]]), path, 1).tolist()
+    [[1], [2], [1]]
+    """
+    row, col = (torch.from_numpy(end.astype(np.int64)) for end in sparse.coo_array(graph).coords)
+    length = (points[col] - points[row]).square().sum(1)
+    order = torch.from_numpy(np.lexsort((-length.numpy(), row.numpy())))
+    row, col = row[order], col[order]
+    number = torch.bincount(row, minlength=len(points))
+    place = torch.arange(len(row)) - (number.cumsum(0) - number)[row]
+    result = torch.arange(len(points))[:, None].repeat(1, count)
+    keep = place < count
+    result[row[keep], place[keep]] = col[keep]
+    return result
+
+
 class GraphBalls:
     """The nearest points of a graph ball, for any chunk of centres.
 
@@ -190,6 +215,11 @@ class GraphBalls:
         self.sides = sides
         self.kept = kept
         self._planes = planes_of(frames)
+
+    @cached_property
+    def longest(self) -> Int[Tensor, "N edges"]:
+        """The other ends of the longest `EDGES` edges of every point, see `longest_edges`."""
+        return longest_edges(self.points, self.graph, EDGES)
 
     def keep(self, size: int) -> None:
         """Gather the balls of all points, up to `size`, once and for all."""

@@ -3,17 +3,19 @@
 from __future__ import annotations
 
 from math import ceil
+from typing import NamedTuple
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from torchlb.fits.polynomials import num_monomials
-from torchlb.fits.rules import SIZE_FACTORS
-from torchlb.fits.weights import CenteredFit, centered_fit
+from torchlb.fits.weights import MAX_RESIDUAL, CenteredFit, centered_fit
+from torchlb.geometry.candidates import Search, list_candidates
 from torchlb.geometry.neighbors import AT_ONCE, GraphBalls
 
-MAX_CONDITION = 1e5
+MAX_LEBESGUE = 10.0
+"""Of a fit in the middles of the edges of its point; where neighbours lie well around it has less than 2."""
 MAX_MISFIT = {2: 0.3}
 """Of the heights of a quadratic, which is the last resort; all others have to follow them to `FAITHFUL`."""
 FAITHFUL = 0.05
@@ -27,10 +29,27 @@ LEAST = 1.5
 """Neighbours per polynomial without which a fit is not tried."""
 
 
+class Fits(NamedTuple):
+    """Fits of one degree to as many points each.
+
+    Attributes
+    ----------
+    vertices : (b,).
+    degree : m.
+    points : (b, K), the vertex first; padded by the vertex, whose coefficients are then zero.
+    coefficients : (b, M − 1, K − 1), as in `CenteredFit`.
+    """
+
+    vertices: Int[Tensor, " b"]
+    degree: int
+    points: Int[Tensor, "b K"]
+    coefficients: Float[Tensor, "b M neighbors"]
+
+
 class VertexFits:
     """Fits of the highest degree that passes at each vertex.
 
-    A fit passes if its condition is bounded and its heights are followed. Those of the first degree come from
+    A fit passes if its Lebesgue constant is bounded and the heights are followed. Those of the first degree come from
     `refine_frames`, which makes them anyway; `complete` makes the others, also of fewer points.
 
     Parameters
@@ -42,62 +61,107 @@ class VertexFits:
     ----------
     frames : (N, n, d).
     degree : (N,), m of each fit; 0 where none passed, which leaves the vertex flat.
-    index : (N, K), its points, the vertex first; padded by the vertex.
-    coefficients : (N, M − 1, K − 1), as in `CenteredFit`, zero beyond a fit's own points and monomials.
-    heights : (N, M − 1, n), ℓ: of the surface over the tangent plane, as vectors.
+    heights : (N, M − 1, n), ℓ: of the surface over the tangent plane, as vectors; zero beyond a fit's own monomials.
     radius : (N,), ℓ.
     reason : (N,), why the first degree was not reached, a place in `REASONS`.
     """
 
     def __init__(self, balls: GraphBalls, degrees: tuple[int, ...]) -> None:
         points, self.frames, self.degrees = balls.points, balls.frames, degrees
-        count, size = len(points), fit_size(2, degrees[0])
-        terms = num_monomials(2, degrees[0]) - 1
+        count, terms = len(points), num_monomials(2, degrees[0]) - 1
         self.degree = torch.zeros(count, dtype=torch.int64)
-        self.index = torch.arange(count)[:, None].repeat(1, size)
-        self.coefficients = points.new_zeros(count, terms, size - 1)
         self.heights = points.new_zeros(count, terms, points.shape[1])
         self.radius = points.new_ones(count)
         self.reason = torch.ones(count, dtype=torch.int64)
+        self._blocks: list[Fits] = []
+
+    @property
+    def blocks(self) -> list[Fits]:
+        """The fits, those of one degree and size together."""
+        kinds: dict[tuple[int, int], list[Fits]] = {}
+        for block in self._blocks:
+            kinds.setdefault((block.degree, block.points.shape[1]), []).append(block)
+        self._blocks = [
+            Fits(
+                torch.cat([b.vertices for b in alike]),
+                degree,
+                torch.cat([b.points for b in alike]),
+                torch.cat([b.coefficients for b in alike]),
+            )
+            if len(alike) > 1
+            else alike[0]
+            for (degree, _), alike in kinds.items()
+        ]
+        return self._blocks
 
     def take(
         self,
-        centers: Int[Tensor, " B"],
+        vertices: Int[Tensor, " B"],
         index: Int[Tensor, "B K"],
         fit: CenteredFit,
         heights: Float[Tensor, "B neighbors n"],
-        degree: int | None = None,
+        regular: Bool[Tensor, " B"],
     ) -> None:
-        """Keep those of the fits that pass, of the first degree by default."""
-        degree = degree or self.degrees[0]
-        regular = fit.condition <= MAX_CONDITION
+        """Keep those of the regular fits that follow the heights, for vertices that have none yet."""
+        degree, terms = fit.degree, fit.coefficients.shape[1]
+        if degree not in self.degrees:
+            return
         good = regular & (fit.misfit(heights) <= MAX_MISFIT.get(degree, FAITHFUL))
         if degree == self.degrees[0]:
-            self.reason[centers] = torch.where(good, 0, torch.where(regular, 3, 2))
-        kept, terms, size = centers[good], fit.coefficients.shape[1], index.shape[1]
+            self.reason[vertices] = torch.where(good, 0, torch.where(regular, 3, 2))
+        good &= self.degree[vertices] == 0
+        if not good.any():
+            return
+        kept, coefficients = vertices[good], fit.coefficients[good]
         self.degree[kept] = degree
-        self.index[kept, :size] = index[good]
-        self.coefficients[kept, :terms, : size - 1] = fit.coefficients[good]
-        self.heights[kept, :terms] = (fit.coefficients @ heights)[good]
+        self.heights[kept, :terms] = coefficients @ heights[good]
         self.radius[kept] = fit.radius[good]
+        self._blocks.append(Fits(kept, degree, index[good], coefficients))
 
     def complete(self, balls: GraphBalls) -> VertexFits:
         """The same; the vertices without a fit have tried the degrees in turn."""
         for degree in self.degrees:
-            size, terms = fit_size(2, degree), num_monomials(2, degree) - 1
-            for centers in (self.degree == 0).nonzero()[:, 0].split(AT_ONCE):
-                index, count = balls(centers, size)
-                enough = count - 1 >= LEAST * terms
-                centers, index, count = centers[enough], index[enough], count[enough]
-                if len(centers) == 0:
-                    continue
-                keep = torch.arange(1, size) < count[:, None]
-                offset = balls.points[index[:, 1:]] - balls.points[centers, None]
-                frame = balls.frames[centers]
-                coords = offset @ frame
-                heights = (offset - coords @ frame.mT) * keep[..., None]
-                self.take(centers, index, centered_fit(coords, degree, keep), heights, degree)
+            sizes = list_candidates(2, [degree])
+            left = self.degree == 0
+            if degree == self.degrees[0]:
+                left &= self.reason == 1
+            for vertices in left.nonzero()[:, 0].split(AT_ONCE):
+                search = Search(balls, vertices, sizes)
+                for _, rows, index in search:
+                    self._try(balls, vertices[rows], index, degree)
+                    search.settle(rows[self.degree[vertices[rows]] > 0])
+                least, few = 1 + ceil(LEAST * (num_monomials(2, degree) - 1)), sizes[0].size
+                vertices = vertices[self.degree[vertices] == 0]
+                index, count = balls(vertices, few)
+                some = (count >= least) & (count < few)
+                keep = torch.arange(1, few) < count[some, None]
+                self._try(balls, vertices[some], index[some], degree, keep)
         return self
+
+    def _try(
+        self,
+        balls: GraphBalls,
+        vertices: Int[Tensor, " B"],
+        index: Int[Tensor, "B K"],
+        degree: int,
+        keep: Bool[Tensor, "B neighbors"] | None = None,
+    ) -> None:
+        if len(vertices) == 0:
+            return
+        here, frame = balls.points[vertices, None], balls.frames[vertices]
+        offset = balls.points[index[:, 1:]] - here
+        coords = offset @ frame
+        heights = offset - coords @ frame.mT
+        if keep is not None:
+            heights = heights * keep[..., None]
+        fit = centered_fit(coords, degree, keep)
+        middles = (balls.points[balls.longest[vertices]] - here) @ frame / 2
+        self.take(vertices, index, fit, heights, is_regular(fit, middles))
+
+
+def is_regular(fit: CenteredFit, middles: Float[Tensor, "B E d"]) -> Bool[Tensor, " B"]:
+    """Whether the neighbours determine a fit, and well in the middles of the edges, ℓ: `MAX_LEBESGUE`."""
+    return (fit.residual <= MAX_RESIDUAL) & (fit.lebesgue(middles) <= MAX_LEBESGUE)
 
 
 def fit_size(dim: int, degree: int) -> int:
@@ -106,4 +170,4 @@ def fit_size(dim: int, degree: int) -> int:
     >>> [fit_size(2, m) for m in (2, 4, 6)]
     [10, 24, 45]
     """
-    return ceil(SIZE_FACTORS["least_squares"][0] * num_monomials(dim, degree) - 1e-9)
+    return list_candidates(dim, [degree])[0].size

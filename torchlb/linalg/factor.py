@@ -11,8 +11,8 @@ from scipy import sparse
 from scipy.sparse.linalg import SuperLU, splu
 from torch import Tensor
 
-COLUMNS = 128
-"""Right-hand sides that cholespy takes at once on CUDA."""
+COLUMNS = {"cpu": 16, "cuda": 128}
+"""Right-hand sides that cholespy takes at once: on the CPU a fifth of the time is saved, on CUDA it takes no more."""
 SYMMETRY = 1e-12
 """Of the largest entry; cholespy reads one triangle alone and would not notice the other."""
 
@@ -56,12 +56,12 @@ class Factor:
 
     def solve(self, b: Float[Tensor, "N ..."]) -> Float[Tensor, "N ..."]:
         """A⁻¹b, (N,) or (N, C), in the type and on the device of b; without derivatives."""
-        right = b.detach().to(torch.float64).contiguous()
-        solver = self._solver(b.device)
+        solver, most = self._solver(b.device), COLUMNS.get(b.device.type, 1)
         if isinstance(solver, SuperLU):
-            return torch.from_numpy(solver.solve(right.cpu().numpy())).to(b)
-        if right.is_cuda and right.ndim == 2 and right.shape[1] > COLUMNS:
-            return torch.cat([self.solve(part) for part in b.split(COLUMNS, dim=1)], dim=1)
+            return torch.from_numpy(solver.solve(b.detach().double().cpu().numpy())).to(b)
+        if b.ndim > 1 and b.shape[1] > most:
+            return torch.cat([self.solve(part) for part in b.split(most, dim=1)], dim=1)
+        right = b.detach().to(torch.float64).contiguous()
         x = torch.empty_like(right)
         if right.numel():
             solver.solve(right, x)

@@ -32,7 +32,7 @@ def inverse(matrix: sparse.csr_array) -> Inverse:
 
 
 def lanczos(
-    stiffness: sparse.csr_array,
+    solve: Inverse,
     mass_matrix: sparse.csr_array,
     k: int,
     *,
@@ -48,7 +48,8 @@ def lanczos(
 
     Parameters
     ----------
-    stiffness, mass_matrix : K, positive semidefinite, and M, positive definite, (N, N).
+    solve : product with (K + shift M)⁻¹, K positive semidefinite, (N, N).
+    mass_matrix : M, positive definite.
     shift : small and positive, in the unit of λ.
     tolerance : bound on the residuals in the M-norm, relative to the eigenvalues 1/(λ + shift); errors of the
         eigenvalues are of the order of its square.
@@ -58,8 +59,7 @@ def lanczos(
     ------
     EigenbasisError : if all N vectors do not suffice, or `LONGEST` times those asked for.
     """
-    size, count = len(stiffness.diagonal()), k + more
-    solve = inverse(sparse.csr_array(stiffness + shift * mass_matrix))
+    size, count = len(mass_matrix.diagonal()), k + more
     generator = np.random.default_rng(0)
     first = 0 if null is None else 1
     basis, dual = (np.empty((min(4 * count + 4 * BLOCK, size), size)) for _ in range(2))  # V, MV

@@ -3,8 +3,8 @@
 A system is a K + b M with the rows and columns of Dirichlet points taken out. The weak pair is solved by conjugate
 gradients; the factor of the linear pair, which is spectrally close and 20 times sparser, preconditions them
 (`method.md`, section 10). Where rows of the fits have large weights, K is up to thirty times stiffer than K₁ at single
-points, in functions that live there: a smoothing step before and after the factor's solve then takes less than half the
-steps. Many times of one call share factors, those of powers of four. Factors are kept as long as the operator that they
+points, in functions that live there: smoothing before and after the factor's solve then takes a third of the steps.
+Many times of one call share factors, those of powers of four. Factors are kept as long as the operator that they
 belong to; a batch takes those of its shapes.
 """
 
@@ -26,18 +26,18 @@ from torch.utils.weak import WeakIdKeyDictionary
 from torchlb.linalg.conjugate_gradients import conjugate_gradients
 from torchlb.linalg.factor import cholesky, factorized
 from torchlb.linalg.sparse import multiply
+from torchlb.linalg.two_levels import two_levels
 from torchlb.nn.conduction import Conducting
 from torchlb.operator.batching import shapes_of
 from torchlb.operator.laplace_beltrami import LaplaceBeltrami
 
 KEPT = 8
 """Factors that are kept for each operator."""
-SMOOTHING = 1.1
-"""Of a damped Jacobi step, in units of the absolute row sums: below 2 the preconditioner is positive definite."""
 SINGULAR = 1e-6
 """Share of M₁ over the area that makes K₁ definite; constants, which it moves alone, are split off."""
 SPACING = 4.0
 """Between the times of shared factors: M + tK and its factor's matrix then differ by less than that."""
+TINY = 1e-300
 SHIFT = 1e-9
 """Of an inverted stencil that is singular, in units of its diagonal."""
 Operator = LaplaceBeltrami | Conducting
@@ -156,11 +156,15 @@ class PairSystem:
             keep = sparse.diags_array(free)
             matrix = keep @ matrix @ keep + sparse.diags_array((1 - free) * matrix.diagonal())
         self.factor = cholesky((matrix + matrix.T) / 2)
-        self.smoother = None  # the cotangent's pair is the linear one
+        self.cycle = None  # the cotangent's pair is the linear one
         if len(lb.linear_crow):
-            rows = torch.repeat_interleave(self.pattern[0].diff())
-            sums = torch.zeros_like(self.ones_mass).index_add(0, rows, self.values.abs()[:, None])
-            self.smoother = SMOOTHING / sums
+            values, self.unit = self.values, self.values.abs().max()
+            if self.free is not None:
+                rows = torch.repeat_interleave(self.pattern[0].diff())
+                values = values * self.free[rows, 0] * self.free[self.pattern[1], 0]
+            self.cycle, _ = two_levels(
+                *self.pattern, values / self.unit, lambda r: self.unit * self._coarse(r)
+            )
 
     def solve(
         self,
@@ -200,16 +204,15 @@ class PairSystem:
         return self._inside(mass + times * stiffness)
 
     def _precondition(self, r: Tensor) -> Tensor:
-        """Of a residual: smoothing, the factor's solve, smoothing, so that the whole is symmetric; all at time t."""
-        if self.smoother is None:
+        """Of a residual: the factor's solve between smoothing in the matrix of time t, in float32."""
+        if self.cycle is None:
             return self._coarse(r)
-        x = self._inside(self.smoother * r)
-        x = x + self._coarse(r - self._product(x, None))
-        return x + self._inside(self.smoother * (r - self._product(x, None)))
+        size = r.norm(dim=0).clamp_min(TINY)
+        return self.cycle((r / size).float()).double() * (size / self.unit)
 
     def _coarse(self, r: Tensor) -> Tensor:
         """The factor's solve, without the constants, which are large from rounding alone where K is singular."""
-        x = self._inside(self.factor.solve(r))
+        x = self._inside(self.factor.solve(r.double()))
         return x - self._mean(self.ones_mass, x) if self.singular else x
 
     def _inside(self, x: Tensor) -> Tensor:

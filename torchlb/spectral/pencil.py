@@ -2,9 +2,10 @@ r"""Eigenpairs of a symmetric weak pair K u = λ M u (`method.md`, section 10).
 
 Block Lanczos for the linear pair (K₁, M₁), whose factor is 20 times sparser than that of K; Rayleigh–Ritz in (K, M);
 then sweeps. In a sweep each eigenvector u is corrected by some steps of conjugate gradients for (K − λM)w = Ku − λMu on
-the complement of what is known, as in the Jacobi–Davidson method, and Rayleigh–Ritz on [U, W] follows. The steps are
-taken in float32, which costs no digits: what they give is a direction. Their preconditioner is a cycle of two levels,
-Chebyshev smoothing in K around a solve with a graph Laplacian on the edges of K₁.
+the complement of what is known, as in the Jacobi–Davidson method, and Rayleigh–Ritz follows: among all u − w first,
+which mostly is enough, then among the u and those w that are needed. The steps are taken in float32, which costs no
+digits: what they give is a direction. Their preconditioner is a cycle of two levels, Chebyshev smoothing in K around a
+solve with that factor.
 """
 
 from __future__ import annotations
@@ -22,7 +23,8 @@ from torch import Tensor
 from torchlb.errors import EigenbasisError, warn
 from torchlb.linalg.krylov import prefers_krylov
 from torchlb.linalg.lanczos import Inverse, inverse, lanczos
-from torchlb.linalg.sparse import multiply
+from torchlb.linalg.sparse import from_scipy
+from torchlb.linalg.two_levels import two_levels
 from torchlb.spectral.eigenbasis import Eigenbasis
 from torchlb.spectral.eigensolver import GAP
 
@@ -33,21 +35,18 @@ DENSE, SHARE = 600, 6
 GUARD = 16
 """Vectors carried beyond those wanted: they keep λ away from the rest of the spectrum."""
 SHIFT = 10.0
-"""Of the factors, over the area of a component: about half of its first eigenvalue, were it a disk."""
+"""Of the factor, over the area of a component: about half of its first eigenvalue, were it a disk."""
 START, EXACT = 3e-3, 1e-8
 """Residuals of Lanczos for the linear pair, whose distance from (K, M) is of that order, and for a pair alone."""
 STEPS, MOST_STEPS, SWEEPS = 4, 32, 20
 """Steps of conjugate gradients in the first sweep, doubled in the next ones up to a bound; bound on the sweeps."""
-ROUGH = 1e-2
-"""Median of the errors above which a sweep takes one step: it squares them at best, however many it takes."""
 SAFETY = 4.0
 """On the estimated errors, which the preconditioner makes too small where K is softer than it takes it for."""
 
-TINY, DEPENDENT, STIFFER = 1e-300, 1e-12, 1e3
-FIRST, SECOND = np.float32(160 / 41), np.float32(-128 / 41)
+TINY, DEPENDENT = 1e-300, 1e-12
 
 Sparse = sparse.csr_array
-Blocks = tuple[np.ndarray, np.ndarray, np.ndarray]  # U, KU, MU
+Blocks = tuple[np.ndarray, ...]  # U, KU, MU
 
 
 class _Part(NamedTuple):
@@ -56,7 +55,7 @@ class _Part(NamedTuple):
     points: np.ndarray
     stiffness: Sparse
     mass_matrix: Sparse
-    linear: tuple[Sparse, Sparse, Sparse] | None  # K₁, M₁, and what the preconditioner takes for K
+    linear: tuple[Sparse, Sparse] | None  # K₁, M₁
     conserving: bool  # no point is fixed, so that constants have the eigenvalue 0
 
 
@@ -112,26 +111,19 @@ def _parts(
     """
     joint = sparse.csr_array(abs(stiffness) + abs(mass_matrix))
     count, component = csgraph.connected_components(joint, directed=False)
-    levels = None
-    if linear is not None:
-        k1, m1 = (sparse.csr_array(x, dtype=np.float64) for x in linear)
-        levels = (k1, m1, _coarse(stiffness, k1))
-    pattern = joint if levels is None else sparse.csr_array(abs(levels[0]) + abs(levels[1]))
+    near = [] if linear is None else [sparse.csr_array(x, dtype=np.float64) for x in linear]
+    pattern = sparse.csr_array(abs(near[0]) + abs(near[1])) if near else joint
     order = csgraph.reverse_cuthill_mckee(pattern, symmetric_mode=True)
     parts = []
     for c in range(count):
         whole = order[component[order] == c]
         free = whole[~fixed[whole]]
         k, m, *own = (
-            sparse.csr_array(matrix[free][:, free])
-            for matrix in (stiffness, mass_matrix, *(levels or ()))
+            sparse.csr_array(matrix[free][:, free]) for matrix in (stiffness, mass_matrix, *near)
         )
         if len(free):
-            parts.append(
-                _Part(
-                    free, k, m, (own[0], own[1], own[2]) if own else None, len(free) == len(whole)
-                )
-            )
+            linear = (own[0], own[1]) if own else None
+            parts.append(_Part(free, k, m, linear, len(free) == len(whole)))
     return parts
 
 
@@ -148,18 +140,19 @@ def _pairs(part: _Part, k: int, tolerance: float) -> tuple[np.ndarray, ...]:
         values, u = linalg.eigh(*dense, subset_by_index=(0, count - 1))
         errors, mu = np.zeros(count), part.mass_matrix @ u
     else:
-        k1, m1, *_ = part.linear or (part.stiffness, part.mass_matrix)
+        k1, m1 = part.linear or (part.stiffness, part.mass_matrix)
         null, shift = _constant(m1) if zero else None, SHIFT / float(m1.sum())
         accuracy = EXACT if part.linear is None else START
+        solve = inverse(sparse.csr_array(k1 + shift * m1))
         values, u = lanczos(
-            k1, m1, k - zero, shift=shift, tolerance=accuracy, more=GUARD, null=null
+            solve, m1, k - zero, shift=shift, tolerance=accuracy, more=GUARD, null=null
         )
         if null is not None:
             values, u = np.append(0.0, values), np.column_stack([null, u])
         if part.linear is None:
             errors, mu = np.full(len(values), tolerance), part.mass_matrix @ u
         else:
-            swept = _swept(part, u, k, shift, tolerance)
+            swept = _swept(part, u, k, solve, tolerance)
             if swept is None:
                 warn(
                     f"eigenbasis: after {SWEEPS} sweeps some of {k} eigenvalues are not accurate to {tolerance:.1g}, "
@@ -188,59 +181,46 @@ def _closed(values: np.ndarray, k: int, tolerance: float) -> int:
     return int(gaps.argmax()) + 1
 
 
-def _coarse(stiffness: Sparse, linear: Sparse) -> Sparse:
-    """Graph Laplacian of the positive weights of K₁, each edge as much stiffer as the diagonal of K is at its ends.
-
-    Rows of the fits with large weights make K up to a thousand times stiffer than K₁ at single points.
-    """
-    edges = sparse.coo_array(linear)
-    row, col = edges.coords
-    ratio = np.sqrt(stiffness.diagonal() / np.maximum(linear.diagonal(), TINY)).clip(max=STIFFER)
-    weight = np.where(row == col, 0.0, np.maximum(-1.0 * edges.data, 0.0)) * ratio[row] * ratio[col]
-    weights = sparse.csr_array((weight, (row, col)), shape=stiffness.shape)
-    degrees = np.bincount(row, weight, len(ratio))
-    return sparse.csr_array(sparse.csr_array(sparse.diags_array(degrees)) - weights)
-
-
 def _swept(
-    part: _Part, start: np.ndarray, k: int, shift: float, tolerance: float
+    part: _Part, u: np.ndarray, k: int, solve: Inverse, tolerance: float
 ) -> tuple[np.ndarray, ...] | None:
     """Sweeps from the linear pair's eigenvectors until the first k eigenvalues are accurate; None if some never are."""
     stiffness, mass_matrix = part.stiffness, part.mass_matrix
     assert part.linear is not None
-    _, linear_mass, coarse = part.linear
-    cycle, product = _two_levels(stiffness, sparse.csr_array(coarse + shift * linear_mass))
-    single = linear_mass.astype(np.float32)
+    cycle, product = _two_levels(stiffness, solve)
+    linear_mass, single = (m.astype(np.float32) for m in (part.linear[1], mass_matrix))
 
     def shifted(p: np.ndarray, shifts: np.ndarray) -> np.ndarray:
-        return product(p) - (single @ p) * shifts
+        return product(p) - (linear_mass @ p) * shifts
 
-    count, zero = start.shape[1], int(part.conserving)
-    nothing = np.zeros((len(start), 0))
-    values, known = np.zeros(0), (nothing, nothing, nothing)
-    new = np.ascontiguousarray(start)
-    steps = STEPS
-    for _ in range(SWEEPS):
-        blocks = (new, stiffness @ new, mass_matrix @ new)
-        values, known = _ritz(values, known, blocks, count)
+    count, zero, steps = u.shape[1], int(part.conserving), STEPS
+    u = np.ascontiguousarray(u, dtype=np.float32)
+    values, known = _ritz((u, product(u), single @ u), count)
+    for sweep in range(SWEEPS + 1):
         u, ku, mu = known
-        residual = ku - mu * values
+        residual = ku - mu * values.astype(u.dtype)
         size = np.maximum(linalg.norm(residual, axis=0), TINY)
         r = (residual / size).astype(np.float32)
         z = cycle(r)
         errors = SAFETY * np.abs(_dots(r, z)) * size**2 / np.maximum(np.abs(values), TINY)
         errors[:zero] = 0.0
         keep = _closed(values, k, tolerance)
-        if errors[:keep].max() <= tolerance:
+        if sweep and errors[:keep].max() <= tolerance:
             return values, errors, u, mu
-        active = np.flatnonzero(errors[:keep] > tolerance)
+        active = np.flatnonzero(errors[:keep] > tolerance) if sweep else np.arange(count)
         small = (u.astype(np.float32), mu.astype(np.float32))
         right = (r[:, active], z[:, active], values[active].astype(np.float32))
-        rough = np.median(errors[:keep]) > ROUGH
-        new = _correction(shifted, cycle, small, right, 1 if rough else steps).astype(np.float64)
-        steps = steps if rough else min(2 * steps, MOST_STEPS)
-        new -= u @ (mu.T @ new)
-    if prefers_krylov(len(start)):
+        w = _correction(shifted, cycle, small, right, steps).astype(np.float64)
+        if sweep:
+            w -= u @ (mu.T @ w)
+        else:
+            w = u - w * size
+        new = (w, stiffness @ w, mass_matrix @ w)
+        if sweep:
+            new = tuple(np.column_stack(both) for both in zip(known, new, strict=True))
+        values, known = _ritz(new, count)
+        steps = min(2 * steps, MOST_STEPS)
+    if prefers_krylov(len(part.points)):
         raise EigenbasisError(
             f"eigenbasis: after {SWEEPS} sweeps the estimated relative error of some of {k} eigenvalues is above "
             f"{tolerance:.1g}; ask for a larger tolerance"
@@ -272,52 +252,26 @@ def _correction(
     return w
 
 
-def _two_levels(stiffness: Sparse, coarse: Sparse) -> tuple[Inverse, Inverse]:
-    """An approximate inverse of K, symmetric and definite, and the product with K, both in float32.
-
-    Smoothing is of degree 2 over the upper three quarters of the spectrum of D⁻¹K, D its absolute row sums.
-    """
-    solve = inverse(coarse)
-    crow, col = (
-        torch.from_numpy(x.astype(np.int64)) for x in (stiffness.indptr, stiffness.indices)
-    )
-    entries = torch.from_numpy(stiffness.data.astype(np.float32))
-    scale = (1 / np.asarray(abs(stiffness).sum(axis=1)).ravel()).astype(np.float32)[:, None]
-
-    def product(x: np.ndarray) -> np.ndarray:
-        return multiply(crow, col, entries, torch.from_numpy(x)).numpy()
-
-    def smooth(r: np.ndarray) -> np.ndarray:
-        # The residual polynomial is T₂((5 − 8x)/3) / T₂(5/3), 1 − x(a + bx) with these a and b.
-        p = scale * r
-        return FIRST * p + SECOND * (scale * product(p))
-
-    def cycle(r: np.ndarray) -> np.ndarray:
-        x = smooth(r)
-        x += solve(r - product(x))
-        return x + smooth(r - product(x))
-
-    return cycle, product
+def _two_levels(stiffness: Sparse, coarse: Inverse) -> list[Inverse]:
+    """An approximate inverse of K, around a coarse solve, and the product with K, both in float32."""
+    both = two_levels(*from_scipy(stiffness), lambda r: torch.from_numpy(coarse(r.numpy())))
+    return [lambda x, apply=apply: apply(torch.from_numpy(x)).numpy() for apply in both]
 
 
 def _dots(x: np.ndarray, y: np.ndarray) -> np.ndarray:
     return np.einsum("ij,ij->j", x, y)
 
 
-def _ritz(values: np.ndarray, known: Blocks, new: Blocks, count: int) -> tuple[np.ndarray, Blocks]:
-    """Rayleigh–Ritz on the span of Ritz vectors, with their values, and of new directions."""
-    u, (w, kw, mw) = known[0], new
-    corner_k, corner_m = u.T @ kw, u.T @ mw
-    a = np.block([[np.diag(values), corner_k], [corner_k.T, w.T @ kw]])
-    b = np.block([[np.eye(len(values)), corner_m], [corner_m.T, w.T @ mw]])
+def _ritz(space: Blocks, count: int) -> tuple[np.ndarray, Blocks]:
+    """Rayleigh–Ritz on the span of U, of (U, KU, MU): the smallest values, ascending, and the same of their vectors."""
+    a, b = ((space[0].T @ x).astype(np.float64) for x in space[1:])
     scale = 1 / np.sqrt(b.diagonal())
     squares, q = linalg.eigh(b * scale * scale[:, None])
-    q = scale[:, None] * (q / np.sqrt(np.maximum(squares, TINY)))[:, squares > DEPENDENT]
+    q = (scale[:, None] * q / np.sqrt(np.maximum(squares, TINY)))[:, squares > DEPENDENT]
     values, y = linalg.eigh(q.T @ a @ q)  # all of them, in less time than a part
-    values, y = values[:count], q @ y[:, :count]
-    top, bottom = y[: u.shape[1]], y[u.shape[1] :]
-    u, ku, mu = (x @ top + z @ bottom for x, z in zip(known, new, strict=True))
-    return np.asarray(values), (u, ku, mu)
+    y = (q @ y[:, :count]).astype(space[0].dtype)
+    u, ku, mu = (x @ y for x in space)
+    return values[:count], (u, ku, mu)
 
 
 def _merged(
