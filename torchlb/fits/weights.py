@@ -133,7 +133,7 @@ def _scaled_qr(
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Q, R of √ω V with its columns scaled to length one, and the lengths."""
     system = root[..., None] * values
-    scale = system.norm(dim=1).clamp_min(torch.finfo(values.dtype).tiny)
+    scale = system.square().sum(1).sqrt().clamp_min(torch.finfo(values.dtype).tiny)
     q, r = torch.linalg.qr(system / scale[:, None])
     return q, r, scale
 

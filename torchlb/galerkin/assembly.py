@@ -8,16 +8,24 @@ from scipy import sparse
 from torch import Tensor
 
 from torchlb.galerkin.elements import Element
-from torchlb.geometry.vectors import dot
 
 CHUNK = 2**14
 """Elements at a time: some 100 MB."""
 
 
-def metric(places: Float[Tensor, "T n 3"], shape: Element) -> Float[Tensor, "T Q 3"]:
+def metric(
+    places: Float[Tensor, "NX 3"], elements: Int[Tensor, "T n"], shape: Element
+) -> Float[Tensor, "T Q 3"]:
     """G = JᵀJ at the Gauss points of elements with nodes at `places`, as (g_ξξ, g_ξη, g_ηη), ℓ²."""
-    x, y = (torch.einsum("qn,tnc->tqc", slope, places) for slope in shape.gradients.unbind(-1))
-    return torch.stack([dot(x, x), dot(x, y), dot(y, y)], dim=-1)
+    slopes = torch.cat([*shape.gradients.unbind(-1)]).T.contiguous()  # (n, 2Q)
+    found = []
+    for nodes in elements.split(CHUNK):
+        xx = xy = yy = places.new_zeros(())
+        for coordinate in places.T.contiguous():
+            x, y = (coordinate[nodes] @ slopes).chunk(2, 1)
+            xx, xy, yy = xx + x * x, xy + x * y, yy + y * y
+        found.append(torch.stack([xx, xy, yy], -1))
+    return torch.cat(found)
 
 
 def flat_metric(lengths: Float[Tensor, "T 3"]) -> Float[Tensor, "T 3"]:

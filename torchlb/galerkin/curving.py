@@ -211,22 +211,28 @@ def _flattened(
 
     `stand` is where nodes are on flat triangles and on the surface; `whole`, which of those inside faces may be there.
     """
-    curved = curved.clone()
     sides = (points[nodes.faces[:, [1, 2, 0]]] - points[nodes.faces]).norm(dim=2)
     lengths = mollified(sides)
     plane, shape = flat_metric(lengths), triangle(nodes.degree)
     area = area_element(plane)
+    curved = curved.clone()
     curved[nodes.edge[area < FLAT * sides.amax(1).square()].flatten()] = False
     inside = len(lattice(nodes.degree)) - 3 * nodes.degree
+    g = plane[:, None].repeat(1, len(shape.weights), 1)
+    new = torch.ones(len(nodes.faces), dtype=torch.bool)  # triangles whose nodes have moved
     while True:
-        smooth = curved[nodes.edge].all(1) & whole.view(len(nodes.faces), inside).all(1)
+        kept = curved[nodes.edge]
+        smooth = kept.all(1) & whole.view(len(nodes.faces), inside).all(1)
         bent = _by_node(nodes, curved, smooth)
         places = torch.cat([points, torch.where(bent[:, None], stand[1], stand[0])])
-        straight = ~curved[nodes.edge].any(1)
-        bended = metric(places[nodes.elements], shape)
-        g = torch.where(straight[:, None, None], plane[:, None], bended)
-        stretch = area_element(g) / area[:, None]
-        bad = ((stretch < 1 / STRETCH) | (stretch > STRETCH)).any(1) & ~straight
-        if not bad.any():
+        some = kept.any(1)
+        g[new & ~some] = plane[new & ~some, None]
+        new &= some
+        g[new] = metric(places, nodes.elements[new], shape)
+        stretch = area_element(g[new]) / area[new, None]
+        bad = new.nonzero()[((stretch < 1 / STRETCH) | (stretch > STRETCH)).any(1), 0]
+        if len(bad) == 0:
             return places, curved, bent, g, lengths
+        before, curved = curved, curved.clone()
         curved[nodes.edge[bad].flatten()] = False
+        new = (before & ~curved)[nodes.edge].any(1)

@@ -9,6 +9,8 @@ pool, ordered by distance. A path across a crease is cut there, where the tangen
 from __future__ import annotations
 
 from functools import cached_property
+from math import ceil
+from typing import Any
 
 import numpy as np
 import torch
@@ -189,8 +191,31 @@ def longest_edges(
     return result
 
 
+class _Level:
+    """Balls of one size, of those points that have been asked for."""
+
+    def __init__(self, size: int, num_points: int) -> None:
+        self.size, self.held = size, 0
+        self.place = torch.full((num_points,), -1, dtype=torch.int32)
+        self.index = torch.empty(0, size, dtype=torch.int32)
+        self.count = torch.empty(0, dtype=torch.int32)
+
+    def add(self, centers: Tensor, index: Tensor, count: Tensor) -> None:
+        """Balls of further points."""
+        first, self.held = self.held, self.held + len(centers)
+        if self.held > len(self.count):  # double the room, up to that for all
+            room = min(max(2 * len(self.count), self.held), len(self.place))
+            for name in ("index", "count"):
+                old = getattr(self, name)
+                new = old.new_empty(room, *old.shape[1:])
+                new[:first] = old[:first]
+                setattr(self, name, new)
+        self.index[first : self.held], self.count[first : self.held] = index.int(), count.int()
+        self.place[centers] = torch.arange(first, self.held, dtype=torch.int32)
+
+
 class GraphBalls:
-    """The nearest points of a graph ball, for any chunk of centres.
+    """The nearest points of a graph ball, for any chunk of centres. What has been found is kept.
 
     Parameters
     ----------
@@ -198,7 +223,6 @@ class GraphBalls:
     graph : (N, N) symmetric adjacency, from `mesh_graph` or `nearest_graph`.
     frames : (N, n, d) tangent frames that decide admission.
     sides : (N, n) from `thin_sides`: also refused is a point on the other side of a thin shape. None if not known.
-    kept : balls of all points that are known already, (index, count); those of slightly other frames serve.
     """
 
     def __init__(
@@ -207,25 +231,26 @@ class GraphBalls:
         graph: sparse.csr_array,
         frames: Float[Tensor, "N n d"],
         sides: Float[Tensor, "N n"] | None = None,
-        kept: tuple[Int[Tensor, "N K"], Int[Tensor, " N"]] | None = None,
     ) -> None:
         self.points = points
         self.graph = graph
         self.frames = frames
         self.sides = sides
-        self.kept = kept
         self._planes = planes_of(frames)
+        self._kept: list[_Level] = []
+
+    def with_frames(
+        self, frames: Float[Tensor, "N n d"], sides: Float[Tensor, "N n"] | None
+    ) -> GraphBalls:
+        """The same balls for slightly other frames; those not found yet are admitted by the new ones."""
+        balls = GraphBalls(self.points, self.graph, frames, sides)
+        balls._kept = self._kept
+        return balls
 
     @cached_property
     def longest(self) -> Int[Tensor, "N edges"]:
         """The other ends of the longest `EDGES` edges of every point, see `longest_edges`."""
         return longest_edges(self.points, self.graph, EDGES)
-
-    def keep(self, size: int) -> None:
-        """Gather the balls of all points, up to `size`, once and for all."""
-        parts = torch.arange(len(self.points)).split(AT_ONCE)
-        index, count = zip(*(self(centers, size) for centers in parts), strict=True)
-        self.kept = torch.cat([part.int() for part in index]), torch.cat(count)
 
     def __call__(
         self, centers: Int[Tensor, " B"], size: int
@@ -237,9 +262,19 @@ class GraphBalls:
         index : (B, size), padded by the centre itself where the ball holds fewer.
         count : (B,), how many are real.
         """
-        if self.kept is not None and self.kept[0].shape[1] >= size:
-            index, count = self.kept
-            return index[centers, :size].long(), count[centers].clamp_max(size)
+        level = next((kept for kept in self._kept if kept.size >= size), None)
+        if level is None:
+            level = _Level(size, len(self.points))
+            self._kept.append(level)
+        missing = centers[level.place[centers] < 0]
+        if len(missing):
+            level.add(missing, *self._grown(missing, level.size))
+        place = level.place[centers]
+        return level.index[place, :size].long(), level.count[place].long().clamp_max(size)
+
+    def _grown(
+        self, centers: Int[Tensor, " B"], size: int
+    ) -> tuple[Int[Tensor, "B K"], Int[Tensor, " B"]]:
         local, others = self._reach(centers, size)
         offset = self.points.index_select(0, others) - self.points[centers[local]]
         square = dot(offset, offset)
@@ -265,27 +300,38 @@ class GraphBalls:
     def _reach(
         self, centers: Int[Tensor, " B"], size: int
     ) -> tuple[Int[Tensor, " P"], Int[Tensor, " P"]]:
-        """Pairs (row of `centers`, point) of the graph balls, sorted; they grow ring by ring until they are large."""
-        width, known = len(self.points), np.float32(2**20)
+        """Pairs (row of `centers`, point) of the graph balls, sorted; they grow ring by ring until they are large.
+
+        A round ball has about half as many rings as they have at most: what grows along a strip alone is none.
+        """
+        width, known, wanted = len(self.points), np.float32(2**20), BALL_SURPLUS * size
         active = np.arange(len(centers))  # rows that still grow: no others are looked at
+        total = np.ones(len(centers), dtype=int)
         start = np.ones(len(centers), np.float32), centers.numpy(), np.arange(len(centers) + 1)
-        frontier = visited = sparse.csr_array(start, shape=(len(centers), width))
+        frontier = recent = sparse.csr_array(start, shape=(len(centers), width))
         found = [(active, centers.numpy())]
-        while len(active):
-            ring = sparse.coo_array(frontier @ self.graph + visited * known)
+        for _ in range(ceil(wanted ** (1 / self.frames.shape[-1]))):
+            ring: Any = frontier @ self.graph + recent * known
+            row = np.arange(len(active)).repeat(np.diff(ring.indptr))
             new = ring.data < known
-            row, col = (end[new].astype(np.int64) for end in ring.coords)
-            good = self._admissible(
-                centers[torch.from_numpy(active[row])], torch.from_numpy(col)
-            ).numpy()
+            row, col = row[new], ring.indices[new].astype(np.int64)
+            rows = torch.from_numpy(active[row])
+            good = self._admissible(centers[rows], torch.from_numpy(col)).numpy()
             row, col = row[good], col[good]
             found.append((active[row], col))
-            ones = np.ones(len(row), np.float32)
-            frontier = sparse.csr_array((ones, (row, col)), shape=(len(active), width))
-            visited = sparse.csr_array(visited + frontier)
-            grows = np.diff(visited.indptr) < BALL_SURPLUS * size
-            grows &= np.diff(frontier.indptr) > 0
-            visited, frontier, active = visited[grows], frontier[grows], active[grows]
+            number = np.bincount(row, minlength=len(active))
+            entries = np.ones(len(row), np.float32), col, np.append(0, number.cumsum())
+            before, frontier = frontier, sparse.csr_array(entries, shape=(len(active), width))
+            total += number
+            grows = (total < wanted) & (number > 0)
+            if not grows.any():
+                break
+            if not grows.all():
+                active, total = active[grows], total[grows]
+                before, frontier = before[grows], frontier[grows]
+            recent = sparse.csr_array(
+                before + frontier
+            )  # neighbours are in this ring, the last, or the next
         where = tuple(np.concatenate(ends) for ends in zip(*found, strict=True))
         balls = sparse.csr_array((np.ones(len(where[0]), np.int8), where), (len(centers), width))
         balls.sort_indices()

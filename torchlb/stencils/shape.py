@@ -236,7 +236,6 @@ def _refined(
     )
     shared = candidates[0].size == fit_size(initial.shape[-1], degree)
     fits = fits if fits is not None and shared and degree == fits.degrees[0] else None
-    balls.keep(candidates[0].size)
     parts = torch.arange(len(points)).split(AT_ONCE)
     bar = tqdm(parts, "tangent frames", delay=2, disable=not progress, leave=False)
     found, order = zip(
@@ -245,7 +244,7 @@ def _refined(
     )
     frames = torch.cat(found)
     sides = _follow(balls.sides, frames)
-    return GraphBalls(points, balls.graph, frames, sides, balls.kept), torch.cat(order)
+    return balls.with_frames(frames, sides), torch.cat(order)
 
 
 def _oriented(
@@ -265,7 +264,7 @@ def _oriented(
         normals = righthanded if reference is None else _turned(righthanded, reference)
         hand = (normals * righthanded).sum(1)[:, None, None].sign()
         frames = torch.cat([hand * frames[..., :1], frames[..., 1:]], -1)
-    balls = GraphBalls(points, balls.graph, frames, balls.sides, balls.kept)
+    balls = balls.with_frames(frames, balls.sides)
     if condition is None:
         boundary, condition = None, Condition()
     return Shape(points, frames, normals, order, balls, areas, low_order, boundary, condition)
