@@ -189,10 +189,11 @@ def test_everything_in_a_ball_is_admissible():
 
 
 def test_short_rows_are_padded_by_their_centre():
-    """Components of 12 points among 40 asked for."""
+    """Components of 12 points among 40 asked for, 3 × 4 squares each."""
     points, frames = flat(torch.cat([square_grid(4)[:12], square_grid(4)[:12] + 100]))
-    graph = mesh_graph(torch.stack([torch.arange(11), torch.arange(1, 12)], 1), 24)
-    graph = graph + mesh_graph(torch.stack([torch.arange(12, 23), torch.arange(13, 24)], 1), 24)
+    distance = torch.cdist(points, points)
+    i, j = (distance < 1.01 * distance[distance > 0].min()).nonzero(as_tuple=True)
+    graph = mesh_graph(torch.stack([i, j], 1), 24)
     index, count = GraphBalls(points, graph, frames)(torch.tensor([0, 5, 20]), 40)
     assert index.shape == (3, 40)
     assert count.tolist() == [12, 12, 12]

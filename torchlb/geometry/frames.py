@@ -22,6 +22,7 @@ from torchlb.geometry.neighbors import (
     admissible_neighbors,
     planes_of,
 )
+from torchlb.geometry.vectors import dot
 from torchlb.geometry.vertex_fits import VertexFits, is_regular
 
 NO_NORMAL = 1e-12
@@ -112,7 +113,7 @@ def refine_frames(
         heights = offset - coords @ frame.mT
         gradient = fit.coefficients[:, : coords.shape[-1]]
         slope = gradient @ heights / fit.radius[:, None, None]  # (b, d, n), in the normal space
-        refined, _ = torch.linalg.qr(frame + slope.mT)
+        refined = orthonormalized(frame + slope.mT)
         regular = is_regular(fit, middles[rows])
         passed = regular & _cosine_bound(slope) & refined.isfinite().all(-1).all(-1)
         if fits is not None:
@@ -121,6 +122,20 @@ def refine_frames(
         order[rows[passed]] = candidates[number].degree
         search.settle(rows[passed])
     return frames, order
+
+
+def orthonormalized(frames: Float[Tensor, "*batch n d"]) -> Float[Tensor, "*batch n d"]:
+    """The columns made orthonormal in turn (Gram and Schmidt); they are far from dependent.
+
+    >>> orthonormalized(torch.tensor([[2.0, 1.0], [0.0, 3.0]])).tolist()
+    [[1.0, 0.0], [0.0, 1.0]]
+    """
+    found: list[Tensor] = []
+    for column in frames.unbind(-1):
+        for other in found:
+            column = column - dot(column, other)[..., None] * other
+        found.append(column / dot(column, column).sqrt()[..., None])
+    return torch.stack(found, -1)
 
 
 def _cosine_bound(slope: Float[Tensor, "B d n"]) -> Bool[Tensor, " B"]:
@@ -171,12 +186,18 @@ PROJECTIONS = {"tangent": _tangent_offsets, "normal": _normal_offsets}
 
 def complete_frames(normals: Float[Tensor, "N n"]) -> Float[Tensor, "N n d"]:
     """Orthonormal frames of the hyperplanes orthogonal to `normals` (of any length but zero)."""
-    basis, _ = torch.linalg.qr(normals[..., None], mode="complete")
-    return basis[..., 1:]
+    if normals.shape[1] != 3:
+        return torch.linalg.qr(normals[..., None], mode="complete")[0][..., 1:]
+    steep = normals[:, :1].abs() < normals[:, 2:].abs()
+    axis = torch.where(steep, normals.new_tensor([1.0, 0, 0]), normals.new_tensor([0, 0, 1.0]))
+    first = torch.linalg.cross(normals, axis)
+    return orthonormalized(torch.stack([first, torch.linalg.cross(normals, first)], -1))
 
 
 def normals_of_frames(frames: Float[Tensor, "N n d"]) -> Float[Tensor, "N n"]:
     """The unit normal of each frame with d = n − 1, on the side that makes [frame, normal] right-handed."""
+    if frames.shape[1] == 3:
+        return torch.linalg.cross(*frames.unbind(-1))
     basis, _ = torch.linalg.qr(frames, mode="complete")
     normal = basis[..., -1:]
     return (normal * torch.linalg.det(torch.cat([frames, normal], -1)).sign()[:, None, None])[

@@ -31,6 +31,7 @@ class Edges:
     keys : (E,), low · count + high of the two ends, ascending.
     of : (3F,), number of the edge that each half-edge lies on.
     uses : (E,), how many faces meet there.
+    order : (3F,), the half-edges by the number of their edge.
     """
 
     faces: Faces
@@ -38,6 +39,7 @@ class Edges:
     keys: Int[np.ndarray, " E"]
     of: Int[np.ndarray, " three_F"]
     uses: Int[np.ndarray, " E"]
+    order: Int[np.ndarray, " three_F"]
 
     @cached_property
     def ends(self) -> tuple[Int[np.ndarray, " three_F"], Int[np.ndarray, " three_F"]]:
@@ -52,9 +54,8 @@ class Edges:
     @cached_property
     def twins(self) -> tuple[Int[np.ndarray, " T"], Int[np.ndarray, " T"]]:
         """The two half-edges of every edge that has two faces."""
-        order = self.of.argsort(kind="stable")
         first = (np.cumsum(self.uses) - self.uses)[self.uses == 2]
-        return order[first], order[first + 1]
+        return self.order[first], self.order[first + 1]
 
     @cached_property
     def outer(self) -> Bool[np.ndarray, " N"]:
@@ -84,8 +85,13 @@ def edges_of(faces: Faces, count: int) -> Edges:
     """
     tail, head = np.roll(faces, -1, 1).ravel(), np.roll(faces, -2, 1).ravel()
     key = np.minimum(tail, head) * count + np.maximum(tail, head)
-    keys, of, uses = np.unique(key, return_inverse=True, return_counts=True)
-    return Edges(faces, count, keys, of.ravel(), uses)
+    order = key.argsort(kind="stable")
+    ascending = key[order]
+    first = np.flatnonzero(np.diff(ascending, prepend=-1))
+    uses = np.diff(first, append=len(key))
+    of = np.empty_like(order)
+    of[order] = np.arange(len(first)).repeat(uses)
+    return Edges(faces, count, ascending[first], of, uses, order)
 
 
 def components(i: np.ndarray, j: np.ndarray, count: int) -> Int[np.ndarray, " count"]:
