@@ -9,7 +9,15 @@ import trimesh
 
 from builders import stencil_of_cloud
 from torchlb import InputError, LaplaceBeltrami
-from torchlb.geometry.manifold import boundary_loops, edges_of, with_single_fans, wound_alike
+from torchlb.geometry.cocone import Tetrahedra
+from torchlb.geometry.manifold import (
+    boundary_loops,
+    edges_of,
+    facing_out,
+    with_single_fans,
+    wound_alike,
+)
+from torchlb.geometry.poles import Poles
 from torchlb.geometry.surface import cloud_surface
 from torchlb.surfaces import Ellipsoid, Hemisphere, Sphere, StarShaped, Torus, UnitDisk
 
@@ -178,6 +186,36 @@ def test_walls_of_cavities_face_into_them():
         [1],
         [1],
     ]
+
+
+@pytest.mark.parametrize("kind", ["points", "random_points"])
+@pytest.mark.parametrize("shape", [Sphere(), Torus(), Hemisphere()])
+def test_poles_tell_which_way_is_out(shape, kind):
+    """Of normals with random signs: the right side, or none at less than 1 %; open shapes as if they were closed."""
+    points = getattr(shape, kind)(1000)
+    sign = torch.randint(2, (1000, 1), generator=torch.Generator().manual_seed(0)).double() * 2 - 1
+    spacing = torch.cdist(points, points).fill_diagonal_(torch.inf).amin(1)
+    poles = Poles.of(Tetrahedra.of(points.numpy(), spacing.numpy()))
+    found = poles.outward(sign * shape.normals(points)) * sign[:, 0]
+    if shape.__class__ is Hemisphere:
+        found = found * found.mean().sign()  # out, or up
+    assert (found >= 0).all()
+    assert (found == 0).double().mean() < 0.01
+
+
+def test_a_part_of_a_patch_is_turned_if_its_normals_say_so():
+    """The cap of a sphere, around which the seam is short; not the faces at single wrong normals."""
+    points, faces = (x.numpy() for x in Sphere().mesh(1000))
+    cap = points[:, 2] > 0.6
+    wrong = np.random.default_rng(0).random(len(points)) < 0.05
+    outward = np.where((cap ^ wrong)[:, None], -points, points)
+    turned = facing_out(points, faces, outward, whole=False)
+    a, b, c = points[turned].swapaxes(0, 1)
+    out = (np.cross(b - a, c - a) * a).sum(1) > 0
+    corners = cap[turned].sum(1)
+    assert not out[corners == 3].any()
+    assert out[corners == 0].all()
+    assert np.array_equal(facing_out(points, faces[:, ::-1], outward), faces)
 
 
 def test_where_sheets_touch_is_said():

@@ -4,6 +4,7 @@
 neighbourhoods that a point tries. `frames`: tangent planes, refined by fits, and coordinates in them. `orientation`:
 which way is out, and the two sides of thin shapes. `vertex_fits`: one polynomial a vertex, of functions and of the
 surface. `boundary`: its points and conormals. A surface through a cloud of points (section 12), `surface`, is found in
-steps: `noise`, where the points belong; `cocone`, normals and triangles; `manifold`, which of these hang together;
-`gaps`, filled and closed; `stars`, where no sheet goes through. `vectors`: inner products of many short vectors.
+steps: `noise`, where the points belong; `cocone`, normals and triangles; `poles`, which way is out; `manifold`, which
+triangles hang together; `gaps`, filled and closed; `stars`, where no sheet goes through. `vectors`: inner products of
+many short vectors.
 """

@@ -7,7 +7,6 @@ tetrahedra beside it, comes close to the tangent planes of its corners: leaves t
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cached_property
 
 import numpy as np
 import torch
@@ -29,8 +28,6 @@ FOLD = 0.5
 """Cosine of the least angle between two triangles at an edge."""
 TILTED = 0.1
 """Least cosine between the normal of a triangle and those of its corners: walls between two rims have none."""
-LONG = 1.4
-"""A Voronoi cell that reaches so many times as far as along the normal has another one."""
 FAR = 1e6
 """Extents of the cloud at which its outer Voronoi cells end."""
 MOVED = 1e-5
@@ -132,6 +129,8 @@ class Tetrahedra:
     centers : (T, 3), ℓ, of the circumscribed spheres.
     triangles : (F, 3), each once.
     ends : centers of the spheres on its two sides, (F, 3) each; beyond the convex hull a point far away.
+    sides : numbers of the tetrahedra there, (F,) each; the triangles of the hull have numbers after them.
+    hull : (F,), which triangles are on the convex hull.
     """
 
     points: Float[np.ndarray, "N 3"]
@@ -139,6 +138,7 @@ class Tetrahedra:
     centers: Float[np.ndarray, "T 3"]
     triangles: Faces
     ends: tuple[Float[np.ndarray, "F 3"], Float[np.ndarray, "F 3"]]
+    sides: tuple[Int[np.ndarray, " F"], Int[np.ndarray, " F"]]
     hull: Bool[np.ndarray, " F"]
 
     @classmethod
@@ -173,31 +173,8 @@ class Tetrahedra:
         inside = a - moved[np.concatenate(apex)[hull]]
         away = np.sign((inside * normal).sum(1, keepdims=True)) * normal
         ends[1][hull] = ends[0][hull] + FAR * np.ptp(points, axis=0).max() * away
-        return cls(points, cells, centers, triangles, ends, hull)
-
-    @cached_property
-    def _rays(self) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """(point, offset to a corner of its Voronoi cell), of all; length of the longest and its number, (N,)."""
-        corners = self.points[self.cells]
-        sides = corners[:, 1:] - corners[:, :1]
-        solid = np.abs(np.linalg.det(sides)) > FLAT * np.linalg.norm(sides, axis=2).max(1) ** 3
-        outer = self.triangles[self.hull]
-        point = np.concatenate([self.cells[solid].ravel(), outer.ravel()])
-        ray = [self.centers[solid].repeat(4, 0), self.ends[1][self.hull].repeat(3, 0)]
-        ray = torch.from_numpy(np.concatenate(ray) - self.points[point])
-        point, length = torch.from_numpy(point), ray.norm(dim=1)
-        longest = length.new_zeros(len(self.points)).scatter_reduce(0, point, length, "amax")
-        at = (length == longest.index_select(0, point)).nonzero()[:, 0]
-        number = torch.full((len(longest),), len(ray) - 1).scatter_reduce(0, point[at], at, "amin")
-        return point, ray, longest, number
-
-    def corrected(self, normals: Float[Tensor, "N 3"]) -> Float[Tensor, "N 3"]:
-        """The normals, but for those along which the Voronoi cell is short: there the direction where it is longest."""
-        point, ray, longest, number = self._rays
-        along = dot(ray, normals.index_select(0, point)).abs()
-        along = torch.zeros_like(longest).scatter_reduce(0, point, along, "amax")
-        short = along * LONG < longest
-        return torch.where(short[:, None], ray[number] / longest[:, None], normals)
+        second[hull] = len(cells) + np.arange(hull.sum())
+        return cls(points, cells, centers, triangles, ends, (first, second), hull)
 
     def surface(self, cloud: Cloud) -> tuple[Faces, Faces]:
         """(triangles of the surface, best first; all small triangles)."""
@@ -251,25 +228,6 @@ def wings(
     along = along / np.maximum(np.linalg.norm(along, axis=-1, keepdims=True), TINY)
     out = out - (out * along).sum(-1, keepdims=True) * along
     return out / np.maximum(np.linalg.norm(out, axis=-1, keepdims=True), TINY)
-
-
-def corrected_normals(
-    points: Float[Tensor, "N 3"],
-    normals: Float[Tensor, "N 3"],
-    candidates: Int[Tensor, "N K"],
-    tetrahedra: Tetrahedra,
-    rounds: int = 3,
-) -> Float[Tensor, "N 3"]:
-    """The normals, refined again around those that the Voronoi cells contradict, which are replaced.
-
-    A cell is long across the surface. Where points lie on rings or other curves far apart, the planes through the
-    nearest of them are those of the curves, and neither their size nor their fit tells.
-    """
-    for _ in range(rounds):
-        before, normals = normals, tetrahedra.corrected(normals)
-        around = (normals != before).any(1)[candidates].any(1).nonzero()[:, 0]
-        normals = refined_normals(points, normals, candidates, around)
-    return tetrahedra.corrected(normals)
 
 
 def best_manifold(points: Float[np.ndarray, "N 3"], faces: Faces) -> Faces:

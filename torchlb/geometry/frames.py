@@ -124,11 +124,11 @@ def refine_frames(
     return frames, order
 
 
-def orthonormalized(frames: Float[Tensor, "*batch n d"]) -> Float[Tensor, "*batch n d"]:
+def orthonormalized(frames: Float[Tensor, "B n d"]) -> Float[Tensor, "B n d"]:
     """The columns made orthonormal in turn (Gram and Schmidt); they are far from dependent.
 
-    >>> orthonormalized(torch.tensor([[2.0, 1.0], [0.0, 3.0]])).tolist()
-    [[1.0, 0.0], [0.0, 1.0]]
+    >>> orthonormalized(torch.tensor([[[2.0, 1.0], [0.0, 3.0]]])).tolist()
+    [[[1.0, 0.0], [0.0, 1.0]]]
     """
     found: list[Tensor] = []
     for column in frames.unbind(-1):

@@ -14,10 +14,8 @@ from scipy import sparse
 from scipy.sparse import csgraph
 
 Faces = Int[np.ndarray, "_ 3"]
-LEAST_VOLUME = 1e-3
-"""Over area^{3/2}: patches with less under them are taken for flat."""
-SOME = 8
-"""Faces by which a patch is found inside of others."""
+VOTE = 100
+"""Of a corner whose normal is that of its face, and of an edge: flows are whole numbers."""
 CLOSED = 1000
 """A closed fan comes before an open one of up to so many triangles."""
 
@@ -199,60 +197,51 @@ def wound_alike(
     return np.where(flip[:, None], faces[:, ::-1], faces), at_seam
 
 
-def facing_out(points: Float[np.ndarray, "N 3"], faces: Faces) -> Faces:
-    """The faces of every patch turned to face out of the solid: up if the patch is flat.
+def facing_out(
+    points: Float[np.ndarray, "N 3"],
+    faces: Faces,
+    outward: Float[np.ndarray, "N 3"],
+    whole: bool = True,
+) -> Faces:
+    """The faces turned to the side of the outward normals at their corners: those of a patch all the same way.
 
-    A patch has volume under it, seen from the middle of its rim; one inside of larger ones, as often as their windings
-    around it say, is the wall of a cavity, which has volume above it.
+    Normals are zero where they are not known, and may be wrong at some points. If not `whole`, a part of a patch may be
+    turned by itself: that costs the edges around it, a face against the normals their cosines, and the least of it all
+    is a minimal cut. So a cavity whose wall the triangles have led into from the wrong side, such as a mouth between
+    lips that touch, faces out, too.
     """
     if len(faces) == 0:
         return faces
-    edges, patch = edges_of(faces, len(points)), patches(faces, len(points))
-    count = int(patch.max()) + 1
-    normals, middle = face_vectors(points, faces), points[faces].mean(1)
-    area = np.linalg.norm(normals, axis=1)
-    rim = edges.rim
-    on_rim = (points[edges.ends[0][rim]] + points[edges.ends[1][rim]]) / 2
-    open_ = np.bincount(patch[rim // 3], minlength=count)
-    totals = np.stack([np.bincount(patch, area * x, count) for x in middle.T], 1)
-    rims = np.stack([np.bincount(patch[rim // 3], x, count) for x in on_rim.T], 1)
-    size = np.bincount(patch, area, count)
-    mean = totals / np.maximum(size, np.finfo(float).tiny)[:, None]
-    center = np.where((open_ > 0)[:, None], rims / np.maximum(open_, 1)[:, None], mean)
-    volume = np.bincount(patch, ((middle - center[patch]) * normals).sum(1), count)
-    up = np.bincount(patch, normals[:, 2], count)
-    hollow = np.abs(volume) > LEAST_VOLUME * size**1.5
-    inward = np.where(hollow, volume, up) < 0
-    faces = np.where(inward[patch, None], faces[:, ::-1], faces)
-    cavity = _inside(points, faces, patch, size, hollow)
-    return np.where(cavity[patch, None], faces[:, ::-1], faces)
+    vectors, patch = face_vectors(points, faces), patches(faces, len(points))
+    length = np.maximum(np.linalg.norm(vectors, axis=1), np.finfo(float).tiny)
+    vote = (outward[faces].sum(1) * vectors).sum(1) / length
+    turned = (np.bincount(patch, vote) < 0)[patch]
+    vote = np.where(turned, -vote, vote)
+    if not whole and (vote < 0).any():
+        edges = edges_of(faces, len(points))
+        one, two = edges.twins
+        alike = edges.ends[0][one] != edges.ends[0][two]
+        turned = turned ^ _cut(one[alike] // 3, two[alike] // 3, vote)
+    return np.where(turned[:, None], faces[:, ::-1], faces)
 
 
-def _inside(
-    points: Float[np.ndarray, "N 3"],
-    faces: Faces,
-    patch: Int[np.ndarray, " F"],
-    size: Float[np.ndarray, " P"],
-    hollow: Bool[np.ndarray, " P"],
-) -> Bool[np.ndarray, " P"]:
-    """Which patches are inside of the solid that the larger ones bound."""
-    result = np.zeros_like(hollow)
-    order = np.flatnonzero(hollow)[np.argsort(-size[hollow], kind="stable")]
-    if len(order) < 2:
-        return result
-    import igl
-
-    members = [np.flatnonzero(patch == number) for number in order]
-    some = [rows[:: -(-len(rows) // SOME)] for rows in members]
-    seen = np.concatenate([points[faces[rows]].mean(1) for rows in some])
-    first = np.cumsum([0, *map(len, some)])
-    winding = np.zeros(len(seen))
-    for k, number in enumerate(order):
-        result[number] = np.median(winding[first[k] : first[k + 1]]) > 0.5
-        own = faces[members[k]]
-        around = np.asarray(igl.winding_number(points, own, seen))
-        winding += -around if result[number] else around
-    return result
+def _cut(
+    i: Int[np.ndarray, " P"], j: Int[np.ndarray, " P"], vote: Float[np.ndarray, " F"]
+) -> Bool[np.ndarray, " F"]:
+    """Which of the nodes are to be turned: those with negative votes, unless more pairs than votes speak against it."""
+    count = len(vote)
+    kept, back = np.full(count, count), np.full(count, count + 1)  # source and sink
+    node, votes = np.arange(count), np.rint(VOTE * vote).astype(np.int32)
+    ends = np.concatenate([i, j, kept, node]), np.concatenate([j, i, node, back])
+    pairs = np.full(2 * len(i), VOTE, dtype=np.int32)
+    capacity = np.concatenate([pairs, np.maximum(votes, 0), np.maximum(-votes, 0)])
+    graph = sparse.csr_array((capacity, ends), shape=(count + 2, count + 2))
+    left = graph - csgraph.maximum_flow(graph, count, count + 1).flow
+    left = sparse.csr_array((left > 0).T)
+    found = csgraph.breadth_first_order(left, count + 1, return_predecessors=False)
+    turned = np.zeros(count + 2, dtype=bool)
+    turned[found] = True
+    return turned[:count]
 
 
 def boundary_loops(faces: Faces, count: int) -> list[list[int]]:

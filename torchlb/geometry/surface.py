@@ -13,13 +13,7 @@ from scipy.spatial import Delaunay
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from torchlb.geometry.cocone import (
-    Cloud,
-    Tetrahedra,
-    best_manifold,
-    corrected_normals,
-    refined_normals,
-)
+from torchlb.geometry.cocone import Cloud, Tetrahedra, best_manifold, refined_normals
 from torchlb.geometry.frames import cloud_frames, vertex_normals
 from torchlb.geometry.gaps import closed, filled, with_left_points
 from torchlb.geometry.manifold import (
@@ -33,6 +27,7 @@ from torchlb.geometry.manifold import (
 )
 from torchlb.geometry.neighbors import admissible, mesh_graph, nearest_neighbors
 from torchlb.geometry.noise import denoised
+from torchlb.geometry.poles import Poles, corrected_normals
 from torchlb.geometry.stars import gaps_between, pieces_of, stars_in_gaps
 
 NEAREST = 24
@@ -148,23 +143,30 @@ def cloud_surface(
     if planar is None:
         nearest = np.linalg.norm(places[near[:, 1]] - places, axis=1)
         tetrahedra = Tetrahedra.of(places, nearest)
+        outward = normals
         if given is None:
-            normals = corrected_normals(points, normals, candidates, tetrahedra)
+            poles = Poles.of(tetrahedra)
+            normals = corrected_normals(points, normals, candidates, poles)
+            outward = normals * poles.outward(normals)[:, None]
         cloud = Cloud(places, normals.numpy(), near, reach, rim)
         found, pool = tetrahedra.surface(cloud)
     else:
         cloud = Cloud(places, normals.numpy(), near, reach, rim)
         found = pool = cloud.small(planar)
+        outward = normals
+        if given is None:  # all up
+            outward = normals * (normals @ normals[0]).sign()[:, None] * normals[0, 2].sign()
+    outward = outward.numpy()
     faces, seam = wound_alike(places, _clean(best_manifold(places, found), count))
-    faces = facing_out(places, _clean(faces[~seam], count) if seam.any() else faces)
+    faces = facing_out(places, _clean(faces[~seam], count) if seam.any() else faces, outward)
     cloud = _oriented(cloud, faces)
     bare, faces = faces, _without_gaps(cloud, faces, pool)
     pairs = _kin(cloud)
     faces, done = closed(cloud, faces, _at_gaps(faces, pairs, count))
     faces = with_left_points(cloud, faces)
     if faces is not bare:
-        faces = facing_out(places, wound_alike(places, faces)[0])
-        cloud = _oriented(cloud, faces)
+        faces = facing_out(places, wound_alike(places, faces)[0], outward)
+    cloud = _oriented(cloud, facing_out(places, faces, outward, whole=False))
     stars = stars_in_gaps(cloud, faces, pairs)
     loops = boundary_loops(faces, count)
     pieces = pieces_of(np.concatenate([faces, stars]), count)

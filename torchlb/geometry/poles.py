@@ -1,0 +1,136 @@
+"""The poles of a point, by which a cloud tells where its inside is (`method.md`, section 12).
+
+The Voronoi cell of a point is long across the surface. Its corners, centres of the Delaunay spheres through the point,
+that are farthest up and down the normal are its two *poles* (Amenta and Bern), and lie on two sides of the surface.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from torchlb.geometry.cocone import FLAT, TINY, Tetrahedra, refined_normals
+from torchlb.geometry.manifold import edges_of, spanning_pairs, two_orientations
+from torchlb.geometry.vectors import dot
+
+LONG = 1.4
+"""A Voronoi cell that reaches so many times as far as along the normal has another one."""
+ENCLOSED = 0.9
+"""Share of the convex hull that lies on one side of a surface, from which on that is its outside."""
+
+
+@dataclass(frozen=True)
+class Poles:
+    """The corners of the Voronoi cells.
+
+    Attributes
+    ----------
+    tetrahedra : their centres are the corners; beyond the convex hull, the far ends of its triangles are.
+    point, ball : (R,), a point, and the number of a sphere through it: of a tetrahedron, or of a triangle after them.
+    ray : (R, 3), ℓ, from the point to the centre.
+    """
+
+    tetrahedra: Tetrahedra
+    point: Int[Tensor, " R"]
+    ball: Int[Tensor, " R"]
+    ray: Float[Tensor, "R 3"]
+
+    @classmethod
+    def of(cls, tetrahedra: Tetrahedra) -> Poles:
+        """Those of all points, but for flat tetrahedra."""
+        points, cells, hull = tetrahedra.points, tetrahedra.cells, tetrahedra.hull
+        corners = points[cells]
+        edges = corners[:, 1:] - corners[:, :1]
+        longest = np.linalg.norm(edges, axis=2).max(1)
+        solid = np.flatnonzero(np.abs(np.linalg.det(edges)) > FLAT * longest**3)
+        outer = tetrahedra.triangles[hull]
+        point = np.concatenate([cells[solid].ravel(), outer.ravel()])
+        ball = np.concatenate([solid.repeat(4), tetrahedra.sides[1][hull].repeat(3)])
+        center = [tetrahedra.centers[solid].repeat(4, 0), tetrahedra.ends[1][hull].repeat(3, 0)]
+        ray = np.concatenate(center) - points[point]
+        return cls(tetrahedra, *(torch.from_numpy(x) for x in (point, ball, ray)))
+
+    def farthest(self, value: Float[Tensor, " R"]) -> Int[Tensor, " N"]:
+        """Of every point the number of the ray with the largest value."""
+        count = len(self.tetrahedra.points)
+        most = value.new_full((count,), -torch.inf).scatter_reduce(0, self.point, value, "amax")
+        at = (value == most.index_select(0, self.point)).nonzero()[:, 0]
+        last = torch.full((count,), len(value) - 1)
+        return last.scatter_reduce(0, self.point[at], at, "amin")
+
+    def corrected(self, normals: Float[Tensor, "N 3"]) -> Float[Tensor, "N 3"]:
+        """The normals, but for those along which the Voronoi cell is short: there the direction where it is longest."""
+        length = dot(self.ray, self.ray).sqrt()
+        along = dot(self.ray, normals.index_select(0, self.point)).abs()
+        first, other = self.farthest(length), self.farthest(along)
+        short = along[other] * LONG < length[first]
+        return torch.where(short[:, None], self.ray[first] / length[first, None], normals)
+
+    def outward(self, normals: Float[Tensor, "N 3"]) -> Float[Tensor, " N"]:
+        """1 or −1 where a normal points out of the solid or into it, 0 where that cannot be told.
+
+        The two poles of a point lie on two sides, the surer the straighter they are opposed; two spheres that share a
+        triangle lie on one side, the surer the deeper they intersect. The surest of these that close no circle decide.
+        """
+        rise = dot(self.ray, normals.index_select(0, self.point))
+        up, down = self.farthest(rise), self.farthest(-rise)
+        opposed = -_cosine(self.ray[up], self.ray[down]).numpy()
+        one, two, sure = self._touching()
+        ends = torch.stack([self.ball[up], self.ball[down]]).numpy()
+        i, j = np.concatenate([one, ends[0]]), np.concatenate([two, ends[1]])
+        order = np.argsort(-np.concatenate([sure, opposed]), kind="stable")
+        order = order[i[order] != j[order]]
+        first = len(self.tetrahedra.cells)
+        count = first + int(self.tetrahedra.hull.sum())
+        chosen = order[spanning_pairs(i[order], j[order], count)]
+        own, other = two_orientations(i[chosen], j[chosen], chosen >= len(one), count)
+        side = np.where(own > other, 1.0, -1.0)
+        sign = torch.from_numpy(np.where(side[ends[0]] == side[ends[1]], 0.0, side[ends[0]]))
+        around = side[first:].mean()
+        if abs(around) < 2 * ENCLOSED - 1:  # an open surface faces up
+            around = float((sign * normals[:, -1]).sum())
+        return sign if around >= 0 else -sign
+
+    def _touching(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Spheres that share a triangle, or an edge of the convex hull; and the cosine of their radii there."""
+        tetrahedra = self.tetrahedra
+        apex, outer = tetrahedra.points[tetrahedra.triangles[:, 0]], tetrahedra.hull
+        radii = [torch.from_numpy(end - apex) for end in tetrahedra.ends]
+        away = torch.from_numpy(tetrahedra.ends[1][outer] - tetrahedra.ends[0][outer])
+        left, right = (
+            half // 3
+            for half in edges_of(tetrahedra.triangles[outer], len(tetrahedra.points)).twins
+        )
+        number = tetrahedra.sides[1][outer]
+        return (
+            np.concatenate([tetrahedra.sides[0], number[left]]),
+            np.concatenate([tetrahedra.sides[1], number[right]]),
+            torch.cat([_cosine(*radii), _cosine(away[left], away[right])]).numpy(),
+        )
+
+
+def _cosine(a: Float[Tensor, "B 3"], b: Float[Tensor, "B 3"]) -> Float[Tensor, " B"]:
+    return dot(a, b) / (dot(a, a) * dot(b, b)).sqrt().clamp_min(TINY)
+
+
+def corrected_normals(
+    points: Float[Tensor, "N 3"],
+    normals: Float[Tensor, "N 3"],
+    candidates: Int[Tensor, "N K"],
+    poles: Poles,
+    rounds: int = 3,
+) -> Float[Tensor, "N 3"]:
+    """The normals, refined again around those that the Voronoi cells contradict, which are replaced.
+
+    A cell is long across the surface. Where points lie on rings or other curves far apart, the planes through the
+    nearest of them are those of the curves, and neither their size nor their fit tells.
+    """
+    for _ in range(rounds):
+        before, normals = normals, poles.corrected(normals)
+        around = (normals != before).any(1)[candidates].any(1).nonzero()[:, 0]
+        normals = refined_normals(points, normals, candidates, around)
+    return poles.corrected(normals)
