@@ -79,6 +79,22 @@ def monomial_derivatives(
     return factor.to(coords) * lower[..., place.to(coords.device)]
 
 
+def derivative_coefficients(
+    coefficients: Float[Tensor, "*batch M"], dim: int, degree: int
+) -> Float[Tensor, "*batch d L"]:
+    """Coefficients of the derivatives ∂_c of polynomials without constant, those of the constant first.
+
+    >>> derivative_coefficients(torch.tensor([1.0, 2.0, 3.0, 4.0, 5.0]), 2, 2).tolist()
+    [[1.0, 6.0, 4.0], [2.0, 4.0, 10.0]]
+    """
+    factor, place = _lowered(dim, degree)
+    shape = *coefficients.shape[:-1], dim, num_monomials(dim, degree - 1)
+    result = coefficients.new_zeros(shape)
+    for c in range(dim):
+        result[..., c, :].index_add_(-1, place[:, c], factor[:, c].to(coefficients) * coefficients)
+    return result
+
+
 @lru_cache(maxsize=64)
 def _lowered(dim: int, degree: int) -> tuple[Float[Tensor, "M d"], Int[Tensor, "M d"]]:
     """∂_c y^α = α_c y^(α − e_c): α_c, and the place of α − e_c among the constant and the monomials."""

@@ -9,7 +9,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from torchlb.fits.polynomials import monomial_derivatives, monomials
+from torchlb.fits.polynomials import derivative_coefficients, monomials, num_monomials
 from torchlb.galerkin.assembly import area_element, flat_metric, metric
 from torchlb.galerkin.elements import EDGES, lattice, triangle
 from torchlb.galerkin.nodes import Nodes
@@ -172,16 +172,19 @@ def _heights(
     if top == 0:
         return start.new_zeros(len(start)), torch.zeros(len(start), dtype=torch.bool)
     radius, t = fits.radius[vertex, None], start.new_zeros(len(vertex))
-    terms = monomials(start[:1, :2], top).shape[1]
-    heights = torch.einsum("vmn,vn->vm", fits.heights[:, :terms], surface.normals)[vertex]
-    direction = along[ends.node]
+    terms = num_monomials(2, top) - 1
+    heights = torch.einsum("vmn,vn->vm", fits.heights[:, :terms], surface.normals)
+    slopes = derivative_coefficients(heights, 2, top)[vertex]
+    heights, direction = heights[vertex], along[ends.node]
     turn = (direction[:, None] @ frame)[:, 0] / radius
     offset = start[ends.node] - surface.points[vertex]
     for _ in range(NEWTON_STEPS):
         p = offset + t[:, None] * direction
         y = (p[:, None] @ frame)[:, 0] / radius
-        value = dot(p, normal) - dot(monomials(y, top), heights)
-        slope = torch.einsum("vmd,vm->vd", monomial_derivatives(y, top), heights)
+        powers = monomials(y, top)
+        value = dot(p, normal) - dot(powers, heights)
+        lower = powers[:, None, : slopes.shape[2] - 1]
+        slope = slopes[..., 0] + dot(lower, slopes[..., 1:])
         t = t - value / (dot(direction, normal) - dot(slope, turn))
     t = torch.where(t.isfinite() & (fits.degree[vertex] > 0), t, torch.inf)
     size = _sizes(surface.points, nodes)

@@ -192,18 +192,22 @@ def stored(pair: Any, rim: Any = None) -> SparsePair:
     """Exactly symmetric, with rows of K that sum to zero, as real parts on one pattern."""
     pair = sparse.csr_array(pair)
     pair.sort_indices()
-    other = sparse.csr_array(pair.T)
-    other.sort_indices()
+    other: Any = sparse.csr_array(pair.T)  # sorted as it comes
+    values = np.empty((2, len(pair.data)))
+    for to, mine, theirs in zip(
+        values, (pair.data.real, pair.data.imag), (other.data.real, other.data.imag), strict=True
+    ):
+        np.multiply(mine + theirs, 0.5, out=to)
+    count = len(pair.indptr) - 1
+    row = np.arange(count, dtype=np.int32).repeat(np.diff(pair.indptr))
+    values[0, row == pair.indices] -= np.bincount(row, values[0], count)
+    values = torch.from_numpy(values)
     crow, col = (torch.from_numpy(part.astype(np.int64)) for part in (pair.indptr, pair.indices))
-    data = torch.from_numpy((pair.data + other.data) / 2)
-    values = torch.stack([data.real, data.imag])
-    count = len(crow) - 1
-    row = torch.arange(count).repeat_interleave(crow.diff())
-    values[0, row == col] -= torch.zeros(count).to(values).index_add(0, row, values[0])
     if rim is not None:
         line: Any = sparse.coo_array((rim + rim.T) / 2)
         i, j = (torch.from_numpy(part.astype(np.int64)) for part in line.coords)
         extra = torch.zeros_like(values[:1])
-        extra[0, torch.searchsorted(row * count + col, i * count + j)] = torch.from_numpy(line.data)
+        keys = torch.from_numpy(row.astype(np.int64)) * count + col
+        extra[0, torch.searchsorted(keys, i * count + j)] = torch.from_numpy(line.data)
         values = torch.cat([values, extra])
     return SparsePair(crow, col, values)
