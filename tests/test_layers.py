@@ -95,14 +95,14 @@ def features(lb, channels=CHANNELS):
 
 @every_layer
 def test_a_batch_of_eight_shapes_gives_what_they_give_one_by_one(eight, name):
-    """To 5e-6 of the largest value, in float32 where diagonals are up to 1,600; gradients of the parameters too."""
+    """To 2e-5 of the largest value, in float32 where diagonals are up to 1,600; gradients of the parameters too."""
     layer = layer_of(name)
     x = [features(lb) for lb in eight]
     alone = [layer(f, lb) for f, lb in zip(x, eight, strict=True)]
     expected = torch.stack(alone) if name == "classifier" else torch.cat(alone)
     batch = LaplaceBeltrami.batch(eight)
     together = layer(torch.cat(x), batch)
-    assert (together - expected).abs().max() <= 5e-6 * expected.abs().max()
+    assert (together - expected).abs().max() <= 2e-5 * expected.abs().max()
     parameters = list(layer.parameters())
     ours, theirs = (torch.autograd.grad(y.square().sum(), parameters) for y in (together, expected))
     for a, b in zip(ours, theirs, strict=True):

@@ -34,11 +34,14 @@ class MeshLowOrder:
     def areas(self) -> Float[Tensor, " N"]:
         """A third of the triangles around each vertex, ℓ²; robust_laplacian's where some have next to none."""
         corners = pad(self.vertices, (0, 3 - self.vertices.shape[1]))[self.faces]
-        sides = corners[:, 1:] - corners[:, :1]
+        sides = corners - corners.roll(1, 1)
         area = torch.linalg.cross(sides[:, 0], sides[:, 1]).norm(dim=1) / 2
-        thirds = torch.zeros_like(self.vertices[:, 0])
-        thirds.index_add_(0, self.faces.reshape(-1), (area / 3).repeat_interleave(3))
-        return thirds if (thirds > LEAST_AREA * thirds.mean()).all() else self._robust[1]
+        thirds, longest = torch.zeros(2, len(self.vertices), dtype=self.vertices.dtype)
+        flat = self.faces.reshape(-1)
+        thirds.index_add_(0, flat, (area / 3).repeat_interleave(3))
+        square = sides.square().sum(2).amax(1)
+        longest.scatter_reduce_(0, flat, square.repeat_interleave(3), "amax")
+        return thirds if (thirds > LEAST_AREA * longest).all() else self._robust[1]
 
     def rows(self, centers: Int[Tensor, " B"]) -> sparse.csr_array:
         """Rows (B, N) of Δ, 1/ℓ²."""
