@@ -3,7 +3,7 @@ r"""Eigenpairs of a symmetric weak pair K u = λ M u (`method.md`, section 10).
 Block Lanczos for the linear pair (K₁, M₁), whose factor is 20 times sparser than that of K; Rayleigh–Ritz in (K, M);
 then sweeps. In a sweep each eigenvector u is corrected by some steps of conjugate gradients for (K − λM)w = Ku − λMu on
 the complement of what is known, as in the Jacobi–Davidson method, and Rayleigh–Ritz follows: among all u − w first,
-which mostly is enough, then among the u and those w that are needed. The steps are taken in float32, which costs no
+which mostly is enough, then among the u and those w that are needed, and at once where an error is large. The steps are taken in float32, which costs no
 digits: what they give is a direction. Their preconditioner is a cycle of two levels, Chebyshev smoothing in K around a
 solve with that factor.
 """
@@ -39,7 +39,9 @@ SHIFT = 10.0
 START, EXACT = 3e-3, 1e-8
 """Residuals of Lanczos for the linear pair, whose distance from (K, M) is of that order, and for a pair alone."""
 STEPS, MOST_STEPS, SWEEPS = 4, 32, 20
-"""Steps of conjugate gradients in the first sweep, doubled in the next ones up to a bound; bound on the sweeps."""
+"""Steps of conjugate gradients in a sweep, doubled in the next ones up to a bound; bound on the sweeps."""
+ROUGH = 0.5
+"""Estimated error above which vectors are no start for more than one step, and are kept beside what it gives."""
 SAFETY = 4.0
 """On the estimated errors, which the preconditioner makes too small where K is softer than it takes it for."""
 
@@ -207,19 +209,20 @@ def _swept(
         keep = _closed(values, k, tolerance)
         if sweep and errors[:keep].max() <= tolerance:
             return values, errors, u, mu
+        rough = errors[:keep].max() > ROUGH
         active = np.flatnonzero(errors[:keep] > tolerance) if sweep else np.arange(count)
         small = (u.astype(np.float32), mu.astype(np.float32))
         right = (r[:, active], z[:, active], values[active].astype(np.float32))
-        w = _correction(shifted, cycle, small, right, steps).astype(np.float64)
-        if sweep:
+        w = _correction(shifted, cycle, small, right, 1 if rough else steps).astype(np.float64)
+        if beside := rough or sweep > 0:
             w -= u @ (mu.T @ w)
         else:
             w = u - w * size
         new = (w, stiffness @ w, mass_matrix @ w)
-        if sweep:
+        if beside:
             new = tuple(np.column_stack(both) for both in zip(known, new, strict=True))
         values, known = _ritz(new, count)
-        steps = min(2 * steps, MOST_STEPS)
+        steps = steps if rough else min(2 * steps, MOST_STEPS)
     if prefers_krylov(len(part.points)):
         raise EigenbasisError(
             f"eigenbasis: after {SWEEPS} sweeps the estimated relative error of some of {k} eigenvalues is above "
