@@ -190,9 +190,8 @@ def _rim_mass(mesh: CurvedMesh) -> sparse.csr_array:
 
 def stored(pair: Any, rim: Any = None) -> SparsePair:
     """Exactly symmetric, with rows of K that sum to zero, as real parts on one pattern."""
-    pair = sparse.csr_array(pair)
-    pair.sort_indices()
-    other: Any = sparse.csr_array(pair.T)  # sorted as it comes
+    other: Any = sparse.csr_array(sparse.csr_array(pair).T)  # sorted as it comes
+    pair = sparse.csr_array(other.T)
     values = np.empty((2, len(pair.data)))
     for to, mine, theirs in zip(
         values, (pair.data.real, pair.data.imag), (other.data.real, other.data.imag), strict=True

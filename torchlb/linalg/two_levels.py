@@ -38,10 +38,10 @@ def two_levels(
     >>> cycle(product(torch.ones(2, 1))).T.round(decimals=2)
     tensor([[0.95, 0.95]])
     """
-    values, crow, col = values.detach().float(), crow.int(), col.int()
-    row = torch.repeat_interleave(crow.diff())
-    sums = values.new_zeros(len(crow) - 1, 1).index_add_(0, row, values.abs()[:, None])
-    scale = torch.where(sums > 0, 1 / sums, 0.0)
+    values = values.detach().float()
+    sums = torch.segment_reduce(values.abs(), "sum", offsets=crow.long())
+    crow, col = crow.int(), col.int()
+    scale = torch.where(sums > 0, 1 / sums, 0.0)[:, None]
 
     def product(x: Tensor) -> Tensor:
         return multiply(crow, col, values, x)

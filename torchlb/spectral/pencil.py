@@ -121,7 +121,8 @@ def _parts(
         whole = order[component[order] == c]
         free = whole[~fixed[whole]]
         k, m, *own = (
-            sparse.csr_array(matrix[free][:, free]) for matrix in (stiffness, mass_matrix, *near)
+            sparse.csr_array(matrix[free][:, free].T)  # symmetric, and so its columns ascend
+            for matrix in (stiffness, mass_matrix, *near)
         )
         if len(free):
             linear = (own[0], own[1]) if own else None
