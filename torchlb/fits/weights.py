@@ -51,6 +51,11 @@ class Weights:
         """The given stencils."""
         return Weights(*(getattr(self, f.name)[rows] for f in fields(Weights)))
 
+    def updated(self, rows: Tensor, part: Weights) -> Weights:
+        """The same with other stencils in these rows."""
+        names = [f.name for f in fields(Weights)]
+        return Weights(*(getattr(self, n).index_put((rows,), getattr(part, n)) for n in names))
+
     @staticmethod
     def stack(parts: Sequence[Weights]) -> Weights:
         """Batches of stencils of one size, one after the other."""
@@ -311,13 +316,18 @@ def positive_weights(
     """
     keep = torch.ones(coords.shape[:2], dtype=torch.bool)
     weights = least_squares_weights(coords, degree, None, flux, share, heights)
-    first = weights.height_residual
+    first, rows = weights.height_residual, torch.arange(len(coords))
     for _ in range(coords.shape[1]):
-        others = weights.laplacian[:, 1:]
+        last = weights[rows]
+        others = last.laplacian[:, 1:]
         rounding = 1e-12 * others.abs().amax(1, keepdim=True)
-        negative = keep & (others < -rounding) & (weights.residual <= MAX_RESIDUAL)[:, None]
-        if not negative.any():
+        negative = keep[rows] & (others < -rounding) & (last.residual <= MAX_RESIDUAL)[:, None]
+        some = negative.any(1)
+        if not some.any():
             break
-        keep &= ~negative
-        weights = least_squares_weights(coords, degree, keep, flux, share)
+        rows = rows[some]
+        keep[rows] &= ~negative[some]
+        conormals = None if flux is None else flux[rows]
+        again = least_squares_weights(coords[rows], degree, keep[rows], conormals, share)
+        weights = weights.updated(rows, again)
     return replace(weights, height_residual=first)

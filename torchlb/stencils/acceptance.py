@@ -45,6 +45,11 @@ class Acceptance:
     on_mesh: bool
     projection: str
 
+    @staticmethod
+    def too_wide_at_boundary(candidate: Candidate) -> bool:
+        """Whether no stencil with boundary points may be as wide as that."""
+        return candidate.degree > 2 and candidate.factor > WIDEST_AT_BOUNDARY
+
     def judge(
         self, weights: Weights, candidate: Candidate, touching: Bool[Tensor, " B"]
     ) -> tuple[Int[Tensor, " B"], Bool[Tensor, " B"]]:
@@ -54,9 +59,7 @@ class Acceptance:
         """
         inside = reference(self.dim, candidate.degree, candidate.rule)
         edge = reference(self.dim, candidate.degree, one_sided=True) if touching.any() else inside
-        too_wide = candidate.degree > 2 and candidate.factor > WIDEST_AT_BOUNDARY
-        one_sided = max(edge.growth, FACTOR * inside.growth)
-        at_edge = 0.0 if too_wide else FACTOR_AT_BOUNDARY * one_sided
+        at_edge = FACTOR_AT_BOUNDARY * max(edge.growth, FACTOR * inside.growth)
         max_growth = torch.where(touching, at_edge, FACTOR * inside.growth)
         max_ratio = FACTOR * torch.where(touching, edge.off_diagonal_ratio, 1.0)
         resolved, resolvable = self._resolved(candidate)
