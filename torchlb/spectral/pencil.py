@@ -3,9 +3,9 @@ r"""Eigenpairs of a symmetric weak pair K u = λ M u (`method.md`, section 10).
 Block Lanczos for the linear pair (K₁, M₁), whose factor is 20 times sparser than that of K; Rayleigh–Ritz in (K, M);
 then sweeps. In a sweep each eigenvector u is corrected by some steps of conjugate gradients for (K − λM)w = Ku − λMu on
 the complement of what is known, as in the Jacobi–Davidson method, and Rayleigh–Ritz follows: among all u − w first,
-which mostly is enough, then among the u and those w that are needed, and at once where an error is large. The steps are taken in float32, which costs no
-digits: what they give is a direction. Their preconditioner is a cycle of two levels, Chebyshev smoothing in K around a
-solve with that factor.
+which mostly is enough, then among the u and those w that are needed, and at once where an error is large. The steps are
+taken in float32, which costs no digits: what they give is a direction. Their preconditioner is a cycle of two levels,
+Chebyshev smoothing in K around a solve with that factor.
 """
 
 from __future__ import annotations
