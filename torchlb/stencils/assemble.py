@@ -63,6 +63,8 @@ class Stencils:
             holds = self._holds_boundary(index)
             if self.acceptance.too_wide_at_boundary(candidate):
                 tried, index, holds = tried[~holds], index[~holds], holds[~holds]
+                if len(tried) == 0:
+                    continue
             with_data = holds & (self.shape.condition.share is not None)
             weights = self._weights(centers[tried], index, candidate, with_data)
             failure, rejected = self.acceptance.judge(weights, candidate, holds)
