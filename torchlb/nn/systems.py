@@ -37,6 +37,9 @@ SINGULAR = 1e-6
 """Share of M₁ over the area that makes K₁ definite; constants, which it moves alone, are split off."""
 SPACING = 4.0
 """Between the times of shared factors: M + tK and its factor's matrix then differ by less than that."""
+SINGLE, STIFFEST = 1e-5, 1e5
+"""A tolerance from which on steps are taken in float32, unless the entries of tK are so large beside the area: what is
+rounded there would show."""
 TINY = 1e-300
 SHIFT = 1e-9
 """Of an inverted stencil that is singular, in units of its diagonal."""
@@ -126,14 +129,17 @@ class PairSystem:
         stiffness, mass = (v.detach().double() for v in lb.weak_values[:2])
         crow, col, linear = lb.linear_pair
         self.pattern = lb.weak_crow, lb.weak_col
-        self.values = stiffness if t is None else mass + t * stiffness
+        values = stiffness if t is None else mass + t * stiffness
         self.stiffness, self.mass, self.singular = stiffness, mass, t is None
+        self.unit = values.abs().max()
+        self.values = values / self.unit
         self.free = None if lb.fixed is None else (~lb.fixed).double()[:, None]
         self.components = _Components(lb)
         self.ones_mass = multiply(*self.pattern, mass, torch.ones_like(lb.mass.double())[:, None])
         self.one = torch.ones_like(self.ones_mass)
         self.area = self.components.sums(self.one, self.ones_mass)
         self.steps = 0
+        self.soft = not self.singular and bool(values.abs().sum() <= STIFFEST * mass.sum())
         n = lb.num_points
         first, second = (
             sparse.csr_array(
@@ -158,13 +164,11 @@ class PairSystem:
         self.factor = cholesky((matrix + matrix.T) / 2)
         self.cycle = None  # the cotangent's pair is the linear one
         if len(lb.linear_crow):
-            values, self.unit = self.values, self.values.abs().max()
+            values = self.values
             if self.free is not None:
                 rows = torch.repeat_interleave(self.pattern[0].diff())
                 values = values * self.free[rows, 0] * self.free[self.pattern[1], 0]
-            self.cycle, _ = two_levels(
-                *self.pattern, values / self.unit, lambda r: self.unit * self._coarse(r)
-            )
+            self.cycle, _ = two_levels(*self.pattern, values, self._coarse)
 
     def solve(
         self,
@@ -184,12 +188,14 @@ class PairSystem:
         if tolerance is None:
             x = self._inside(self.factor.solve(right))
         else:
+            size = right.norm(dim=0).clamp_min(TINY)
             x, self.steps = conjugate_gradients(
                 lambda x: self._product(x, times),
-                right,
+                (right / size).to(torch.float32 if self.soft and tolerance >= SINGLE else b.dtype),
                 self._precondition,
                 tolerance=tolerance,
             )
+            x = x.double() * (size / self.unit)
         shift = -self._mean(self.ones_mass, x)
         return x.add_(shift if self.singular else shift + mean)
 
@@ -199,24 +205,21 @@ class PairSystem:
 
     def _product(self, x: Tensor, times: Tensor | None) -> Tensor:
         if times is None:
-            return self._inside(multiply(*self.pattern, self.values, x))
-        stiffness, mass = (multiply(*self.pattern, v, x) for v in (self.stiffness, self.mass))
-        return self._inside(mass + times * stiffness)
+            return self._inside(multiply(*self.pattern, self.values.to(x), x))
+        stiffness, mass = (multiply(*self.pattern, v.to(x), x) for v in (self.stiffness, self.mass))
+        return self._inside((mass + times.to(x) * stiffness) / self.unit)
 
     def _precondition(self, r: Tensor) -> Tensor:
         """Of a residual: the factor's solve between smoothing in the matrix of time t, in float32."""
-        if self.cycle is None:
-            return self._coarse(r)
-        size = r.norm(dim=0).clamp_min(TINY)
-        return self.cycle((r / size).float()).double() * (size / self.unit)
+        return self._coarse(r) if self.cycle is None else self.cycle(r.float()).to(r)
 
     def _coarse(self, r: Tensor) -> Tensor:
         """The factor's solve, without the constants, which are large from rounding alone where K is singular."""
-        x = self._inside(self.factor.solve(r.double()))
-        return x - self._mean(self.ones_mass, x) if self.singular else x
+        x = self.unit * self._inside(self.factor.solve(r.double()))
+        return (x - self._mean(self.ones_mass, x) if self.singular else x).to(r)
 
     def _inside(self, x: Tensor) -> Tensor:
-        return x if self.free is None else x * self.free
+        return x if self.free is None else x * self.free.to(x)
 
 
 class StencilSystem:
