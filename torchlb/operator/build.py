@@ -44,6 +44,8 @@ MANY = 0.5
 """Share of low-order rows from which on a warning names them."""
 DOUBTFUL = 0.1
 """Share of the points that do not resolve the surface of a cloud from which on a warning names them."""
+OUTLYING = 5.0
+"""Times the spacing of its neighbours that an outlier, in no triangle of the surface, is away from all of them."""
 TOUCHING = 0.005
 """Share of the points at which sheets of a cloud touch from which on a warning says where."""
 REMEDY = "do the points lie on a manifold of dimension {}? If not, pass its dimension as `dim`; else add points"
@@ -187,17 +189,35 @@ def _warn_of_doubts(surface: CloudSurface, fits: VertexFits) -> None:
     doubtful = fits.reason == REASONS.index("points do not resolve the surface")
     doubtful |= ~torch.isin(torch.arange(len(doubtful)), surface.faces)
     if float(doubtful.double().mean()) >= DOUBTFUL:
-        index = doubtful.nonzero()[:, 0]
-        names = ", ".join(map(str, index[:8].tolist())) + (", …" if len(index) > 8 else "")
         warn(
-            f"points: at {len(index)} of {len(doubtful)} the cloud is too coarse or noisy for the surface through it "
-            f"to be trusted ({names}); add points there, or give the mesh if there is one"
+            f"points: at {int(doubtful.sum())} of {len(doubtful)} the cloud is too coarse or noisy for the surface "
+            f"through it to be trusted ({_names(doubtful)}); add points there, or give the mesh if there is one"
+        )
+    outlying = _outlying(surface)
+    if outlying.any():
+        warn(
+            f"points: {int(outlying.sum())} lie {OUTLYING:g} spacings and more away from all others "
+            f"({_names(outlying)}), joined to the surface by triangles that add to its area; remove them if they are "
+            "outliers"
         )
     if surface.summary.contacts >= TOUCHING * len(doubtful):
         warn(
             f"points: {surface.summary.contact}; the surface may join what only touches there, or cut it. Add points "
             "there, or give the mesh if there is one"
         )
+
+
+def _names(mask: Bool[Tensor, " N"]) -> str:
+    index = mask.nonzero()[:, 0].tolist()
+    return ", ".join(map(str, index[:8])) + (", …" if len(index) > 8 else "")
+
+
+def _outlying(surface: CloudSurface) -> Bool[Tensor, " N"]:
+    """Points in no triangle of the surface that are far from their nearest ones, as those are spaced."""
+    nearest = surface.neighbors[:, 1]
+    gap = (surface.points[nearest] - surface.points).norm(dim=1)
+    far = gap > OUTLYING * gap[nearest]
+    return far & ~torch.isin(torch.arange(len(far)), surface.faces)
 
 
 def build_mesh(
