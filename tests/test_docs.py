@@ -91,6 +91,9 @@ TRIGGERS = {
     "the cloud is too": lambda: LaplaceBeltrami.from_points(
         Sphere().points(800) + 0.06 * torch.randn(800, 3, generator=torch.manual_seed(0)).double()
     ),
+    "lie 5 spacings": lambda: LaplaceBeltrami.from_points(
+        torch.cat([Sphere().points(600), torch.tensor([[9.0, 0.0, 0.0]]).double()])
+    ),
     "all … lie on": lambda: LaplaceBeltrami.from_points(VERTICES[:1] * torch.arange(9.0)[:, None]),
     "num_neighbors:": lambda: LaplaceBeltrami.from_points(VERTICES, num_neighbors=4),
     "NOT STABLE": unstable,
