@@ -5,6 +5,7 @@ from __future__ import annotations
 import sys
 import warnings
 from pathlib import Path
+from typing import Any
 
 __all__ = [
     "CacheWarning",
@@ -16,6 +17,7 @@ __all__ = [
     "StabilityWarning",
     "StencilError",
     "TorchlbError",
+    "first_few",
     "warn",
 ]
 HERE = str(Path(__file__).parent)
@@ -55,6 +57,11 @@ class StabilityWarning(UserWarning):
 
 class CacheWarning(UserWarning):
     """A file of a cache was damaged, outdated, or could not be written; the message names it."""
+
+
+def first_few(index: Any, limit: int = 8) -> str:
+    """The first of an array of indices, for a message."""
+    return ", ".join(map(str, index[:limit].tolist())) + (", …" if len(index) > limit else "")
 
 
 def warn(message: str, category: type[Warning] = UserWarning) -> None:

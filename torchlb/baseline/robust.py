@@ -12,7 +12,7 @@ from scipy import sparse
 from scipy.sparse import csgraph
 from torch import Tensor
 
-from torchlb.errors import warn
+from torchlb.errors import first_few, warn
 from torchlb.geometry.neighbors import mesh_graph
 from torchlb.linalg.sparse import with_diagonal
 
@@ -42,7 +42,7 @@ def robust_rows(
     tiny = np.flatnonzero(area < least)
     if len(tiny):
         warn(
-            f"{len(tiny)} points ({', '.join(map(str, tiny[:8]))}{', …' if len(tiny) > 8 else ''}) have next to no "
+            f"{len(tiny)} points ({first_few(tiny)}) have next to no "
             f"area, their triangles are degenerate; {LEAST_AREA:g} of the mean is taken, so that rows stay finite"
         )
     area = np.maximum(area, least) * unit**2

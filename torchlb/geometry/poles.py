@@ -7,6 +7,7 @@ that are farthest up and down the normal are its two *poles* (Amenta and Bern), 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 import torch
@@ -62,13 +63,19 @@ class Poles:
         last = torch.full((count,), len(value) - 1)
         return last.scatter_reduce(0, self.point[at], at, "amin")
 
+    @cached_property
+    def _longest(self) -> tuple[Float[Tensor, "N 3"], Float[Tensor, " N"]]:
+        """The longest ray of every point, and its length."""
+        length = dot(self.ray, self.ray).sqrt()
+        first = self.farthest(length)
+        return self.ray[first], length[first]
+
     def corrected(self, normals: Float[Tensor, "N 3"]) -> Float[Tensor, "N 3"]:
         """The normals, but for those along which the Voronoi cell is short: there the direction where it is longest."""
-        length = dot(self.ray, self.ray).sqrt()
         along = dot(self.ray, normals.index_select(0, self.point)).abs()
-        first, other = self.farthest(length), self.farthest(along)
-        short = along[other] * LONG < length[first]
-        return torch.where(short[:, None], self.ray[first] / length[first, None], normals)
+        longest, length = self._longest
+        short = along[self.farthest(along)] * LONG < length
+        return torch.where(short[:, None], longest / length[:, None], normals)
 
     def outward(self, normals: Float[Tensor, "N 3"]) -> Float[Tensor, " N"]:
         """1 or −1 where a normal points out of the solid or into it, 0 where that cannot be told.

@@ -38,8 +38,8 @@ SINGULAR = 1e-6
 SPACING = 4.0
 """Between the times of shared factors: M + tK and its factor's matrix then differ by less than that."""
 SINGLE, STIFFEST = 1e-5, 1e5
-"""A tolerance from which on steps are taken in float32, unless the entries of tK are so large beside the area: what is
-rounded there would show."""
+"""A tolerance from which on steps are taken in float32, unless the entries of M + tK sum to more than so many times the
+area: what is rounded there would show."""
 TINY = 1e-300
 SHIFT = 1e-9
 """Of an inverted stencil that is singular, in units of its diagonal."""

@@ -11,7 +11,7 @@ from jaxtyping import Bool, Float, Int
 from scipy.spatial import KDTree
 from torch import Tensor
 
-from torchlb.errors import InputError, warn
+from torchlb.errors import InputError, first_few, warn
 from torchlb.fits.polynomials import num_monomials
 from torchlb.operator.cleaning import (
     ArrayLike,
@@ -31,12 +31,6 @@ ON_LINE = 1e-9
 """Spread of a cloud across its longest direction over that along it, below which it is a line."""
 FLAT = 1e-14
 """Squared sine of the angles of triangles that have no area."""
-
-
-def _some(index: Tensor, limit: int = 8) -> str:
-    """The first few of a list of indices."""
-    names = ", ".join(str(i) for i in index[:limit].tolist())
-    return names + (", …" if len(index) > limit else "")
 
 
 def check_points(points: ArrayLike, what: str = "points") -> Float[Tensor, "N n"]:
@@ -63,7 +57,7 @@ def check_points(points: ArrayLike, what: str = "points") -> Float[Tensor, "N n"
     bad = (~points.isfinite()).any(1).nonzero()[:, 0]
     if len(bad):
         raise InputError(
-            f"{what}: {len(bad)} are NaN or infinite ({_some(bad)}); remove or repair them"
+            f"{what}: {len(bad)} are NaN or infinite ({first_few(bad)}); remove or repair them"
         )
     return points
 
@@ -86,8 +80,8 @@ def check_distinct(points: Float[Tensor, "N n"]) -> None:
     if len(bad):
         pair = sorted((int(bad[0]), int(other[bad[0]])))
         raise InputError(
-            f"points: {len(bad)} points share a place with another, such as {pair[0]}, {pair[1]} (all: {_some(bad)}); "
-            "remove duplicates with points, kept = torchlb.clean_points(points)"
+            f"points: {len(bad)} points share a place with another, such as {pair[0]}, {pair[1]} (all: "
+            f"{first_few(bad)}); remove duplicates with points, kept = torchlb.clean_points(points)"
         )
     _warn_of_rounding(points, spacing)
 
@@ -167,7 +161,7 @@ def mended_faces(vertices: Float[Tensor, "N n"], faces: Int[Tensor, "F v"]) -> I
     if not first.all():
         again = (~first).nonzero()[:, 0]
         warn(
-            f"faces: {len(again)} have the corners of an earlier one ({_some(again)}) and are left out; "
+            f"faces: {len(again)} have the corners of an earlier one ({first_few(again)}) and are left out; "
             "torchlb.clean_mesh(vertices, faces) removes them"
         )
         faces = faces[first]
@@ -175,16 +169,16 @@ def mended_faces(vertices: Float[Tensor, "N n"], faces: Int[Tensor, "F v"]) -> I
     if turned.any():
         wrong = turned.nonzero()[:, 0]
         warn(
-            f"faces: {len(wrong)} are wound against their neighbours ({_some(wrong)}) and are turned round, so that "
-            "the normals agree; torchlb.clean_mesh(vertices, faces) does it in the mesh"
+            f"faces: {len(wrong)} are wound against their neighbours ({first_few(wrong)}) and are turned round, so "
+            "that the normals agree; torchlb.clean_mesh(vertices, faces) does it in the mesh"
         )
         faces = torch.where(turned[:, None], faces.flip(1), faces)
     spacing, _, bad = coincident(vertices)
     _warn_of_rounding(vertices, spacing)
     if len(bad):
         warn(
-            f"vertices: {len(bad)} share a place with another ({_some(bad)}), so the mesh is cut open along them; if "
-            "it should not be, merge them first, for example with trimesh.Trimesh(vertices, faces).merge_vertices()"
+            f"vertices: {len(bad)} share a place with another ({first_few(bad)}), so the mesh is cut open along them; "
+            "if it should not be, merge them first, for example with trimesh.Trimesh(vertices, faces).merge_vertices()"
         )
     return faces
 
@@ -207,7 +201,7 @@ def check_faces(faces: ArrayLike, num_points: int) -> Int[Tensor, "F v"]:
     bad = ((faces < 0) | (faces >= num_points)).any(1).nonzero()[:, 0]
     if len(bad):
         raise InputError(
-            f"faces: {len(bad)} of them ({_some(bad)}) have indices outside 0 … {num_points - 1}: "
+            f"faces: {len(bad)} of them ({first_few(bad)}) have indices outside 0 … {num_points - 1}: "
             f"face {int(bad[0])} is {faces[bad[0]].tolist()}"
         )
     used = torch.zeros(num_points, dtype=torch.bool)
@@ -215,7 +209,7 @@ def check_faces(faces: ArrayLike, num_points: int) -> Int[Tensor, "F v"]:
     lost = (~used).nonzero()[:, 0]
     if len(lost):
         raise InputError(
-            f"faces: {len(lost)} vertices ({_some(lost)}) belong to no face with distinct corners; drop them with "
+            f"faces: {len(lost)} vertices ({first_few(lost)}) belong to no face with distinct corners; drop them with "
             "vertices, faces, kept = torchlb.clean_mesh(vertices, faces)"
         )
     return proper_faces(faces)
@@ -232,7 +226,7 @@ def check_normals(normals: ArrayLike, points: Float[Tensor, "N n"]) -> Float[Ten
     bad = (length == 0).nonzero()[:, 0]
     if len(bad):
         raise InputError(
-            f"normals: {len(bad)} are zero ({_some(bad)}); leave `normals` out to have them estimated"
+            f"normals: {len(bad)} are zero ({first_few(bad)}); leave `normals` out to have them estimated"
         )
     return normals / length[:, None]
 

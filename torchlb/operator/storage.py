@@ -12,7 +12,7 @@ import torch
 from scipy import sparse
 from torch import Tensor, nn
 
-from torchlb.errors import InputError, warn
+from torchlb.errors import InputError, first_few, warn
 from torchlb.geometry.surface import SurfaceSummary
 from torchlb.linalg.sparse import to_scipy, transpose_pattern
 from torchlb.linalg.spectral_bounds import Bounds, spectral_bounds
@@ -267,10 +267,10 @@ class OperatorStorage(nn.Module):
         distance = (theirs - ours).abs().amax(1)
         moved = (~(distance <= most)).nonzero()[:, 0]
         if len(moved):
-            names = ", ".join(map(str, moved[:8].tolist())) + (", …" if len(moved) > 8 else "")
             raise InputError(
-                f"points: {len(moved)} of {len(points)} are not where they were when the operator was built ({names}; "
-                f"by up to {float(distance.amax()):.3g}); build it again after scaling, turning or deforming a shape"
+                f"points: {len(moved)} of {len(points)} are not where they were when the operator was built "
+                f"({first_few(moved)}; by up to {float(distance.amax()):.3g}); build it again after scaling, turning "
+                "or deforming a shape"
             )
 
     def get_extra_state(self) -> dict[str, Any]:

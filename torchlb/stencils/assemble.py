@@ -15,7 +15,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 from tqdm import tqdm
 
-from torchlb.errors import StencilError
+from torchlb.errors import StencilError, first_few
 from torchlb.fits.rules import WEIGHT_RULES
 from torchlb.fits.weights import MAX_RESIDUAL, Weights, least_squares_weights, positive_weights
 from torchlb.geometry.candidates import Candidate, Search, stencil_candidates
@@ -154,10 +154,10 @@ class Stencils:
         rows = matrix_rows(matrix, self.shape.points, self.shape.frames, centers)
         bad = centers[~rows.off_diagonal_ratio.isfinite()]
         if len(bad):
-            names = ", ".join(map(str, bad[:8].tolist())) + (", …" if len(bad) > 8 else "")
             raise StencilError(
                 f"{len(bad)} points have neither a stencil after {len(self.candidates)} tries nor a low-order row: "
-                f"{names}. Nothing admissible lies around them; remove them, or merge them with their neighbours"
+                f"{first_few(bad)}. Nothing admissible lies around them; remove them, or merge them with their "
+                "neighbours"
             )
         return replace(rows, candidate=torch.full_like(centers, len(self.candidates)))
 

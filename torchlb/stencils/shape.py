@@ -9,7 +9,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 from tqdm import tqdm
 
-from torchlb.errors import InputError
+from torchlb.errors import InputError, first_few
 from torchlb.geometry.boundary import Boundary, boundary_of_cloud, boundary_of_mesh, detect_boundary
 from torchlb.geometry.candidates import list_candidates
 from torchlb.geometry.frames import (
@@ -195,10 +195,9 @@ def _part(boundary: Boundary | None, mask: Bool[Tensor, " N"]) -> Boundary | Non
     """The boundary of a mesh where the mask is set; InputError if points of it lie inside."""
     astray = (mask if boundary is None else mask & ~boundary.mask).nonzero()[:, 0]
     if len(astray):
-        names = ", ".join(map(str, astray[:8].tolist())) + (", …" if len(astray) > 8 else "")
         raise InputError(
-            f"boundary: expected points of the mesh's own boundary, got {len(astray)} inside ({names}); leave them "
-            "out of the mask, or leave `boundary` out to take all of the boundary"
+            f"boundary: expected points of the mesh's own boundary, got {len(astray)} inside ({first_few(astray)}); "
+            "leave them out of the mask, or leave `boundary` out to take all of the boundary"
         )
     if boundary is None or not mask.any():
         return None
