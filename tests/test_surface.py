@@ -123,6 +123,13 @@ def test_spheres_apart_stay_apart_and_an_outlier_is_joined():
     assert values[1] > 0
 
 
+def test_outliers_that_hold_most_of_the_area_are_named():
+    points, generator = Torus().points(1000), torch.Generator().manual_seed(3)
+    far = 20 * torch.randn(10, 3, generator=generator).double()
+    with pytest.warns(UserWarning, match=r"at 10 of 1010 .* too coarse or noisy .* \(.*1001, "):
+        LaplaceBeltrami.from_points(torch.cat([points, far]))
+
+
 @pytest.mark.parametrize("size", [20, 24, 30])
 def test_rings_far_apart_are_one_tube(size):
     """A capsule by rings up to six spacings apart: closed, of its area but for the chords, facing out."""

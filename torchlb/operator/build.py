@@ -12,7 +12,7 @@ from torch import Tensor
 from torch.nn.functional import pad
 
 from torchlb.baseline.cotangent import cotangent_laplacian
-from torchlb.errors import InputError, warn
+from torchlb.errors import InputError, first_few, warn
 from torchlb.fits.rules import WeightsName
 from torchlb.galerkin.flips import flipped
 from torchlb.galerkin.pair import ELEMENTS, SparsePair, WeakPair, mesh_pair
@@ -43,7 +43,8 @@ from torchlb.stencils.shape import Shape, cloud_shape, mesh_shape, surface_shape
 MANY = 0.5
 """Share of low-order rows from which on a warning names them."""
 DOUBTFUL = 0.1
-"""Share of the points that do not resolve the surface of a cloud from which on a warning names them."""
+"""Share of the points that do not resolve the surface of a cloud, or of the area that those without a fit hold, from
+which on a warning names them."""
 OUTLYING = 5.0
 """Times the spacing of its neighbours that an outlier, in no triangle of the surface, is away from all of them."""
 TOUCHING = 0.005
@@ -178,46 +179,39 @@ def _build_on_surface(
         pair = mesh_pair(places, surface.faces, fits, degree, surface.stars)
         assert pair.mass is not None
         shape = replace(shape, areas=pair.mass)
-        _warn_of_doubts(surface, fits)
+        _warn_of_doubts(surface, fits, pair.mass)
     built = _finished(shape, "points", options, REMEDY.format(2), settings["progress"], pair)
     shape = replace(built.shape, points=points)
     return replace(built, shape=shape, faces=surface.faces, surface=surface.summary)
 
 
-def _warn_of_doubts(surface: CloudSurface, fits: VertexFits) -> None:
-    """Warnings that name points where a cloud does not resolve its surface, if they are many."""
-    doubtful = fits.reason == REASONS.index("points do not resolve the surface")
-    doubtful |= ~torch.isin(torch.arange(len(doubtful)), surface.faces)
-    if float(doubtful.double().mean()) >= DOUBTFUL:
+def _warn_of_doubts(surface: CloudSurface, fits: VertexFits, mass: Float[Tensor, " N"]) -> None:
+    """Warnings that name points where a cloud does not resolve its surface, if they are many or hold much of it."""
+    apart = ~torch.isin(torch.arange(len(surface.points)), surface.faces)
+    doubtful = (fits.reason == REASONS.index("points do not resolve the surface")) | apart
+    flat = (fits.degree == 0) | apart
+    large = float(mass[flat].sum() / mass.sum()) >= DOUBTFUL
+    doubtful |= flat & large
+    if large or float(doubtful.double().mean()) >= DOUBTFUL:
+        index = doubtful.nonzero()[:, 0]
         warn(
-            f"points: at {int(doubtful.sum())} of {len(doubtful)} the cloud is too coarse or noisy for the surface "
-            f"through it to be trusted ({_names(doubtful)}); add points there, or give the mesh if there is one"
+            f"points: at {len(index)} of {len(doubtful)} the cloud is too coarse or noisy for the surface through it "
+            f"to be trusted ({first_few(index)}); add points there, remove outliers, or give the mesh if there is one"
         )
-    outlying = _outlying(surface)
-    if outlying.any():
+    nearest = surface.neighbors[:, 1]
+    gap = (surface.points[nearest] - surface.points).norm(dim=1)
+    outlying = (apart & (gap > OUTLYING * gap[nearest])).nonzero()[:, 0]
+    if len(outlying):
         warn(
-            f"points: {int(outlying.sum())} lie {OUTLYING:g} spacings and more away from all others "
-            f"({_names(outlying)}), joined to the surface by triangles that add to its area; remove them if they are "
-            "outliers"
+            f"points: {len(outlying)} lie {OUTLYING:g} spacings and more away from all others "
+            f"({first_few(outlying)}), joined to the surface by triangles that add to its area; remove them if they "
+            "are outliers"
         )
     if surface.summary.contacts >= TOUCHING * len(doubtful):
         warn(
             f"points: {surface.summary.contact}; the surface may join what only touches there, or cut it. Add points "
             "there, or give the mesh if there is one"
         )
-
-
-def _names(mask: Bool[Tensor, " N"]) -> str:
-    index = mask.nonzero()[:, 0].tolist()
-    return ", ".join(map(str, index[:8])) + (", …" if len(index) > 8 else "")
-
-
-def _outlying(surface: CloudSurface) -> Bool[Tensor, " N"]:
-    """Points in no triangle of the surface that are far from their nearest ones, as those are spaced."""
-    nearest = surface.neighbors[:, 1]
-    gap = (surface.points[nearest] - surface.points).norm(dim=1)
-    far = gap > OUTLYING * gap[nearest]
-    return far & ~torch.isin(torch.arange(len(far)), surface.faces)
 
 
 def build_mesh(
