@@ -216,7 +216,7 @@ def test_a_batch_searches_nothing(monkeypatch):
     """The spectral bounds come with the data, and a batch joins them."""
     batch = Batch.from_data_list([LaplaceBeltramiTransform(order=1, k=4)(d) for d in DATA])
     expected = LaplaceBeltrami.batch([direct(i) for i in range(3)]).spectral_bounds
-    monkeypatch.setattr("torchlb.operator.storage.spectral_bounds", None)
+    monkeypatch.setattr(LaplaceBeltrami, "_flow_bounds", None)
     lb = to_operator(batch)
     assert lb.spectral_bounds == expected
     Diffusion(2, k=4)(torch.randn(batch.num_nodes, 2), lb.float())

@@ -1,4 +1,4 @@
-"""Where the spectrum of a stable operator lies: an ellipse in the left half plane that touches 0."""
+"""Where the spectrum of a stable operator lies: an interval, or an ellipse in the left half plane, that touches 0."""
 
 from __future__ import annotations
 
@@ -15,6 +15,8 @@ THINNEST, THICKEST, WIDER = 0.02, 0.9, 1.2
 """Shares b/a of the ellipses that are tried, and the factor between two of them at least."""
 MARGIN, MARGIN_OF_HEIGHT = 1.02, 1.1
 """On R and on b, so that series longer than a trial stay bounded, too."""
+PRODUCTS, FLOOR = 20, 1e-6
+"""Products with |K| towards its first eigenvector, which bring its bound to within 25 %; least share of an entry."""
 
 
 class Bounds(NamedTuple):
@@ -39,6 +41,24 @@ def join_bounds(bounds: Sequence[Bounds]) -> Bounds:
     heights = [b and b * (radius / r) ** 0.5 for r, b in bounds]
     known = [b for b in heights if b is not None]
     return Bounds(radius, max(known) if len(known) == len(heights) else None)
+
+
+def interval_bounds(stiffness: sparse.csr_array, mass: Float[np.ndarray, " N"]) -> Bounds:
+    """Of −D⁻¹K, K positive semidefinite and D the diagonal mass: R = max_i (|K|x)_i / (D x)_i bounds it for any x > 0.
+
+    So say Collatz and Wielandt of |K|, whose spectral radius is not below that of K.
+
+    >>> path = sparse.csr_array([[1.0, -1.0], [-1.0, 1.0]])
+    >>> interval_bounds(path, np.ones(2))
+    Bounds(radius=2.0, height=0.0)
+    """
+    size, x, radius = abs(stiffness), np.ones(len(mass)), np.inf
+    for _ in range(PRODUCTS):
+        y = size @ x / mass
+        radius = min(radius, float((y / x).max(initial=0.0)))
+        x = np.sqrt(x) * np.sqrt(y)  # the mean keeps it from turning in circles
+        x = np.maximum(x / (x.max(initial=0.0) or 1.0), FLOOR)
+    return Bounds(radius, 0.0)
 
 
 def spectral_bounds(matrix: sparse.csr_array, mass: Float[np.ndarray, " N"]) -> Bounds:

@@ -7,15 +7,13 @@ from dataclasses import asdict
 from math import isnan
 from typing import Any, TypeVar
 
-import numpy as np
 import torch
-from scipy import sparse
 from torch import Tensor, nn
 
 from torchlb.errors import InputError, first_few, warn
 from torchlb.geometry.surface import SurfaceSummary
 from torchlb.linalg.sparse import to_scipy, transpose_pattern
-from torchlb.linalg.spectral_bounds import Bounds, spectral_bounds
+from torchlb.linalg.spectral_bounds import Bounds, interval_bounds, spectral_bounds
 from torchlb.spectral.eigenbasis import Eigenbasis
 from torchlb.stability.certificate import Certificate
 
@@ -199,21 +197,20 @@ class OperatorStorage(nn.Module):
     def bounds(self) -> Tensor:
         """`spectral_bounds` as a float64 tensor (2,) on the CPU, NaN for no height, which compiled code can take."""
         if self._bounds is None:  # of a bare stencil, or from an older torchlb
-            self.set_bounds(spectral_bounds(*self._flow_matrix()))
+            self.set_bounds(self._flow_bounds())
         assert self._bounds is not None
         return self._bounds
 
-    def _flow_matrix(self) -> tuple[sparse.csr_array, np.ndarray]:
-        """The matrix that Chebyshev series expand, and its inner product: Δ, or −D⁻¹K₁ beside a weak pair."""
-        shape = (self.num_points, self.num_points)
+    def _flow_bounds(self) -> Bounds:
+        """Of the matrix that Chebyshev series expand: Δ, or −D⁻¹K₁ beside a weak pair."""
         if len(self.weak_crow) == 0:
-            matrix = to_scipy(self.crow, self.col, self.values.double(), shape)
-            return matrix, self.mass.detach().cpu().double().numpy()
+            matrix = to_scipy(self.crow, self.col, self.values.double(), self.shape)
+            return spectral_bounds(matrix, self.mass.detach().cpu().double().numpy())
         pair = "linear" if len(self.linear_crow) else "weak"
         crow, col, values = (getattr(self, f"{pair}_{part}") for part in ("crow", "col", "values"))
-        stiffness, mass = (to_scipy(crow, col, v.double(), shape) for v in values[:2])
+        stiffness, mass = (to_scipy(crow, col, v.double(), self.shape) for v in values[:2])
         lumped: Any = mass.sum(axis=1)
-        return sparse.csr_array(sparse.diags_array(-1 / lumped) @ stiffness), lumped
+        return interval_bounds(stiffness, lumped)
 
     def set_bounds(self, bounds: Bounds | None) -> None:
         """Hold what is known of the spectrum; it is neither rounded nor moved with the buffers."""

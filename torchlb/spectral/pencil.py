@@ -38,7 +38,7 @@ SHIFT = 10.0
 """Of the factor, over the area of a component: about half of its first eigenvalue, were it a disk."""
 START, EXACT = 3e-3, 1e-8
 """Residuals of Lanczos for the linear pair, whose distance from (K, M) is of that order, and for a pair alone."""
-STEPS, MOST_STEPS, SWEEPS = 4, 32, 20
+STEPS, MOST_STEPS, SWEEPS = 3, 24, 20
 """Steps of conjugate gradients in a sweep, doubled in the next ones up to a bound; bound on the sweeps."""
 ROUGH = 0.5
 """Estimated error above which vectors are no start for more than one step, and are kept beside what it gives."""
