@@ -159,11 +159,18 @@ def test_rings_far_apart_are_one_tube(size):
 
 
 def test_circles_of_latitude_are_one_sphere():
-    """A quarter of the points on rings much closer in them than to the next one; four on a circle everywhere."""
+    """A quarter of the points on rings much closer in them than to the next one; four on a circle everywhere.
+
+    In any order: of 30 points on the circle around a pole, one layer of triangles is taken.
+    """
     polar = torch.pi * (torch.arange(30).double() + 0.5) / 30
     angle = 2 * torch.pi * torch.arange(30).double() / 30
     polar, angle = (t.flatten() for t in torch.meshgrid(polar, angle, indexing="ij"))
     points = torch.stack([polar.sin() * angle.cos(), polar.sin() * angle.sin(), polar.cos()], 1)
+    for seed in (40, 85, 101):
+        order = torch.randperm(len(points), generator=torch.Generator().manual_seed(seed))
+        found = cloud_surface(points[order])
+        assert (len(found.faces), found.summary.boundary_loops) == (2 * len(points) - 4, 0)
     lb = LaplaceBeltrami.from_points(points)
     assert len(lb.faces) == 2 * len(points) - 4
     assert (edges_of(lb.faces.numpy(), len(points)).uses == 2).all()
@@ -203,8 +210,9 @@ def test_poles_tell_which_way_is_out(shape, kind):
     points = getattr(shape, kind)(1000)
     sign = torch.randint(2, (1000, 1), generator=torch.Generator().manual_seed(0)).double() * 2 - 1
     spacing = torch.cdist(points, points).fill_diagonal_(torch.inf).amin(1)
-    poles = Poles.of(Tetrahedra.of(points.numpy(), spacing.numpy()))
-    found = poles.outward(sign * shape.normals(points)) * sign[:, 0]
+    normals = shape.normals(points)
+    poles = Poles.of(Tetrahedra.of(points.numpy(), normals.numpy(), spacing.numpy()))
+    found = poles.outward(sign * normals) * sign[:, 0]
     if shape.__class__ is Hemisphere:
         found = found * found.mean().sign()  # out, or up
     assert (found >= 0).all()

@@ -142,7 +142,7 @@ def cloud_surface(
     planar = _planar_triangles(places)
     if planar is None:
         nearest = np.linalg.norm(places[near[:, 1]] - places, axis=1)
-        tetrahedra = Tetrahedra.of(places, nearest)
+        tetrahedra = Tetrahedra.of(places, normals.numpy(), nearest)
         outward = normals
         if given is None:
             poles = Poles.of(tetrahedra)
