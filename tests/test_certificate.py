@@ -144,8 +144,13 @@ def test_parts_of_a_mesh_may_be_of_two_scales(condition):
 
 @pytest.mark.parametrize("scale", [2.0**-10, 2.0**-20], ids=["1e-3", "1e-6"])
 def test_components_of_two_scales_are_judged_each_by_its_own(scale):
-    """A sphere of most of the points, as it is and smaller by a power of two: the same rounds, bit for bit."""
-    sphere, torus = Sphere().random_points(700), Torus().random_points(500) + 9
+    """A sphere of most of the points, as it is and smaller by a power of two: the same rounds, bit for bit.
+
+    What the certificate lowers depends on the order in which points are stored. Three quarters of them, beside the rest
+    along x alone, come apart at a median of the k-d tree, whatever their scale: the order is the same.
+    """
+    sphere = Sphere().random_points(750)
+    torus = Torus().random_points(250) + torch.tensor([9.0, 0.0, 0.0], dtype=torch.float64)
 
     def build(factor):
         return stencil_of_cloud(torch.cat([factor * sphere, torus]), order=3)
@@ -156,8 +161,8 @@ def test_components_of_two_scales_are_judged_each_by_its_own(scale):
     assert largest_of_s(lb) <= 1e-11
     assert lb.certificate.rounds == unscaled.certificate.rounds > 0
     assert torch.equal(lb.report.order, unscaled.report.order)
-    torch.testing.assert_close(lb.mass[:700] / scale**2, unscaled.mass[:700], rtol=1e-12, atol=0)
-    torch.testing.assert_close(lb.mass[700:], unscaled.mass[700:], rtol=1e-12, atol=0)
+    torch.testing.assert_close(lb.mass[:750] / scale**2, unscaled.mass[:750], rtol=1e-12, atol=0)
+    torch.testing.assert_close(lb.mass[750:], unscaled.mass[750:], rtol=1e-12, atol=0)
 
 
 def test_a_surface_of_many_scales_is_stable_on_all_of_them():

@@ -4,6 +4,9 @@ from __future__ import annotations
 
 import sys
 import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
+from contextvars import ContextVar
 from pathlib import Path
 from typing import Any
 
@@ -59,9 +62,29 @@ class CacheWarning(UserWarning):
     """A file of a cache was damaged, outdated, or could not be written; the message names it."""
 
 
+_GIVEN: ContextVar[Any] = ContextVar("given", default=None)
+
+
+@contextmanager
+def renumbered(given: Any) -> Iterator[None]:
+    """Within it messages name points by the numbers `given` to them by the user, (N,)."""
+    token = _GIVEN.set(given)
+    try:
+        yield
+    finally:
+        _GIVEN.reset(token)
+
+
+def as_given(index: Any) -> Any:
+    """The user's numbers of points."""
+    given = _GIVEN.get()
+    return index if given is None else given[index]
+
+
 def first_few(index: Any, limit: int = 8) -> str:
     """The first of an array of indices, for a message."""
-    return ", ".join(map(str, index[:limit].tolist())) + (", …" if len(index) > limit else "")
+    names = sorted(as_given(index).tolist())[:limit]
+    return ", ".join(map(str, names)) + (", …" if len(index) > limit else "")
 
 
 def warn(message: str, category: type[Warning] = UserWarning) -> None:

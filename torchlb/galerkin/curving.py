@@ -10,7 +10,7 @@ from torch import Tensor
 from torch.nn.functional import normalize
 
 from torchlb.fits.polynomials import derivative_coefficients, monomials, num_monomials
-from torchlb.galerkin.assembly import area_element, flat_metric, metric
+from torchlb.galerkin.assembly import CHUNK, area_element, flat_metric, metric
 from torchlb.galerkin.elements import EDGES, lattice, triangle
 from torchlb.galerkin.nodes import Nodes
 from torchlb.galerkin.rim import RimCurves, rim_curves
@@ -65,7 +65,6 @@ class CurvedMesh:
     places : (N + X, 3), ℓ.
     curved : (E,), which edges are.
     bent : (X,), which nodes stand on the surface instead of on a flat triangle.
-    metric : (F, Q, 3), at the Gauss points; of flat triangles from mollified lengths.
     lengths : (F, 3), mollified.
     rim : numbers of the boundary edges; and the curves over them.
     """
@@ -74,14 +73,16 @@ class CurvedMesh:
     places: Float[Tensor, "NX 3"]
     curved: Bool[Tensor, " E"]
     bent: Bool[Tensor, " X"]
-    metric: Float[Tensor, "F Q 3"]
     lengths: Float[Tensor, "F 3"]
     rim: Int[Tensor, " G"]
     curves: RimCurves
 
 
-def curve(surface: Surface, nodes: Nodes) -> CurvedMesh:
-    """Stand the nodes on the fits where these agree, and flatten what they would distort."""
+def curve(surface: Surface, nodes: Nodes) -> tuple[CurvedMesh, Float[Tensor, "F Q 3"]]:
+    """Stand the nodes on the fits where these agree, and flatten what they would distort.
+
+    With it comes the metric at the Gauss points, of flat triangles from mollified lengths.
+    """
     points, fits = surface.points, surface.fits
     rim = (nodes.uses == 1).nonzero()[:, 0]
     degree = max(int(fits.degree.max()), 2)
@@ -98,8 +99,9 @@ def curve(surface: Surface, nodes: Nodes) -> CurvedMesh:
     opposed = surface.normals[nodes.edges].sum(1).norm(dim=1) <= 1
     curved &= ~opposed & (nodes.uses <= 2)
     standing = start + height[:, None] * along
-    found = _flattened(points, nodes, (flat, standing), curved, whole)
-    return CurvedMesh(nodes, *found, rim, curves)
+    stand = flat, standing
+    places, curved, bent, g, lengths = _flattened(points, nodes, stand, curved, whole)
+    return CurvedMesh(nodes, places, curved, bent, lengths, rim, curves), g
 
 
 def node_ends(nodes: Nodes) -> Ends:
@@ -167,17 +169,36 @@ def _heights(
     surface: Surface, nodes: Nodes, ends: Ends, start: Tensor, along: Tensor
 ) -> tuple[Float[Tensor, " X"], Bool[Tensor, " X"]]:
     """t of every node, where the line start + tν meets the graphs of its vertices' fits; and whether they agree."""
-    fits, vertex = surface.fits, ends.vertex
-    top, frame, normal = int(fits.degree.max()), surface.frames[vertex], surface.normals[vertex]
-    if top == 0:
-        return start.new_zeros(len(start)), torch.zeros(len(start), dtype=torch.bool)
-    radius, t = fits.radius[vertex, None], start.new_zeros(len(vertex))
+    size = _sizes(surface.points, nodes)
+    if not surface.fits.degree.any():
+        return torch.zeros_like(size), torch.zeros_like(size, dtype=torch.bool)
+    pairs = zip(ends.node.split(CHUNK), ends.vertex.split(CHUNK), strict=True)
+    t = torch.cat([_met(surface, node, vertex, start, along) for node, vertex in pairs])
+    least = torch.full_like(size, torch.inf).scatter_reduce(0, ends.node, t, "amin")
+    most = torch.full_like(size, -torch.inf).scatter_reduce(0, ends.node, t, "amax")
+    sound = (most - least <= AGREE * size) & (
+        torch.maximum(most.abs(), least.abs()) <= STEEP * size
+    )
+    mean = torch.zeros_like(size).index_add(0, ends.node, ends.share * t.nan_to_num(0, 0, 0))
+    return mean, sound
+
+
+def _met(
+    surface: Surface,
+    node: Int[Tensor, " E"],
+    vertex: Int[Tensor, " E"],
+    start: Tensor,
+    along: Tensor,
+) -> Float[Tensor, " E"]:
+    """t where the lines of the nodes meet the graphs of the vertices' fits, by Newton's method; ∞ where they do not."""
+    fits, frame, normal = surface.fits, surface.frames[vertex], surface.normals[vertex]
+    top, radius = int(fits.degree.max()), fits.radius[vertex, None]
     terms = num_monomials(2, top) - 1
-    heights = torch.einsum("vmn,vn->vm", fits.heights[:, :terms], surface.normals)
-    slopes = derivative_coefficients(heights, 2, top)[vertex]
-    heights, direction = heights[vertex], along[ends.node]
+    heights = (fits.heights[vertex, :terms] @ normal[..., None])[..., 0]
+    slopes = derivative_coefficients(heights, 2, top)
+    direction = along[node]
     turn = (direction[:, None] @ frame)[:, 0] / radius
-    offset = start[ends.node] - surface.points[vertex]
+    offset, t = start[node] - surface.points[vertex], torch.zeros_like(radius[:, 0])
     for _ in range(NEWTON_STEPS):
         p = offset + t[:, None] * direction
         y = (p[:, None] @ frame)[:, 0] / radius
@@ -186,15 +207,7 @@ def _heights(
         lower = powers[:, None, : slopes.shape[2] - 1]
         slope = slopes[..., 0] + dot(lower, slopes[..., 1:])
         t = t - value / (dot(direction, normal) - dot(slope, turn))
-    t = torch.where(t.isfinite() & (fits.degree[vertex] > 0), t, torch.inf)
-    size = _sizes(surface.points, nodes)
-    least = torch.full_like(size, torch.inf).scatter_reduce(0, ends.node, t, "amin")
-    most = torch.full_like(size, -torch.inf).scatter_reduce(0, ends.node, t, "amax")
-    sound = (most - least <= AGREE * size) & (
-        torch.maximum(most.abs(), least.abs()) <= STEEP * size
-    )
-    mean = torch.zeros_like(size).index_add(0, ends.node, ends.share * t.nan_to_num(0, 0, 0))
-    return mean, sound
+    return torch.where(t.isfinite() & (fits.degree[vertex] > 0), t, torch.inf)
 
 
 def mollified(sides: Float[Tensor, "F 3"]) -> Float[Tensor, "F 3"]:
@@ -210,7 +223,7 @@ def _flattened(
     curved: Bool[Tensor, " E"],
     whole: Bool[Tensor, " I"],
 ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
-    """The first fields of `CurvedMesh`: edges around triangles that would be distorted are flat, until none is.
+    """Places, curved edges, bent nodes, metric, lengths: edges around distorted triangles are flat, until none is.
 
     `stand` is where nodes are on flat triangles and on the surface; `whole`, which of those inside faces may be there.
     """
@@ -230,12 +243,12 @@ def _flattened(
         places = torch.cat([points, torch.where(bent[:, None], stand[1], stand[0])])
         some = kept.any(1)
         g[new & ~some] = plane[new & ~some, None]
-        new &= some
-        g[new] = metric(places, nodes.elements[new], shape)
-        stretch = area_element(g[new]) / area[new, None]
-        bad = new.nonzero()[((stretch < 1 / STRETCH) | (stretch > STRETCH)).any(1), 0]
-        if len(bad) == 0:
-            return places, curved, bent, g, lengths
         before, curved = curved, curved.clone()
-        curved[nodes.edge[bad].flatten()] = False
+        for part in (new & some).nonzero()[:, 0].split(CHUNK):
+            g[part] = metric(places, nodes.elements[part], shape)
+            stretch = area_element(g[part]) / area[part, None]
+            bad = ((stretch < 1 / STRETCH) | (stretch > STRETCH)).any(1)
+            curved[nodes.edge[part[bad]].flatten()] = False
+        if torch.equal(before, curved):
+            return places, curved, bent, g, lengths
         new = (before & ~curved)[nodes.edge].any(1)

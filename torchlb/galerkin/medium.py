@@ -12,11 +12,12 @@ from scipy import sparse
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from torchlb.galerkin.assembly import CHUNK, area_element, assemble, flat_metric
+from torchlb.galerkin.assembly import CHUNK, area_element, element_matrices, flat_metric, summed
 from torchlb.galerkin.curving import Surface, curve
 from torchlb.galerkin.elements import Element, triangle
 from torchlb.galerkin.nodes import lagrange_nodes
 from torchlb.galerkin.prolongation import prolongation
+from torchlb.geometry.numbering import Numbering
 
 
 @dataclass(frozen=True)
@@ -43,9 +44,9 @@ class Medium:
     @classmethod
     def curved(cls, surface: Surface, faces: Int[Tensor, "F 3"], degree: int) -> Medium:
         """That of `weak_pair` with elements of degree r ≥ 2."""
-        mesh = curve(surface, lagrange_nodes(faces, len(surface.points), degree))
+        mesh, metric = curve(surface, lagrange_nodes(faces, len(surface.points), degree))
         p = prolongation(surface, mesh)
-        return cls(faces, mesh.lengths, p, mesh.nodes.elements, mesh.metric, triangle(degree))
+        return cls(faces, mesh.lengths, p, mesh.nodes.elements, metric, triangle(degree))
 
     @classmethod
     def linear(cls, points: Float[Tensor, "N n"], faces: Int[Tensor, "F 3"]) -> Medium:
@@ -55,6 +56,14 @@ class Medium:
         metric = flat_metric(lengths)[:, None].expand(-1, len(element.weights), 3)
         same: Any = sparse.eye_array(len(points), format="csr")
         return cls(faces, lengths, same, faces, metric, element)
+
+    def restored(self, numbering: Numbering, order: Int[Tensor, " F"]) -> Medium:
+        """With the user's numbers of the points, and their order of the faces."""
+        back, p, given = order.argsort(), self.prolongation, numbering.given.numpy()
+        p = sparse.csr_array((p.data, given[p.indices], p.indptr), shape=p.shape)
+        faces = numbering.given[self.faces[back]]
+        lengths, nodes, metric = (t[back] for t in (self.lengths, self.nodes, self.metric))
+        return Medium(faces, lengths, p, nodes, metric, self.element)
 
     def at_gauss_points(self, conductivity: Tensor) -> Float[Tensor, "F Q"]:
         """κ there, differentiable: that of each face, or of the vertices (N,), whose logarithm is prolonged.
@@ -69,17 +78,17 @@ class Medium:
     def stiffness(self, conductivity: Float[Tensor, "F Q"]) -> sparse.csr_array:
         """PᵀK_FE(κ)P; symmetric and positive semidefinite for every κ > 0, rows sum to zero."""
         p = self.prolongation
-        elements = assemble(self.metric, self.nodes, self.element, p.shape[0], conductivity)
-        return sparse.csr_array(p.T @ (elements.real @ p))
+        blocks = element_matrices(self.metric, self.element, conductivity)
+        elements = summed(blocks.real, self.nodes, p.shape[0])
+        return sparse.csr_array(p.T @ (elements @ p))
 
     def coarse_stiffness(self, conductivity: Float[Tensor, "F Q"]) -> sparse.csr_array:
         """K₁(κ) of linear elements on flat triangles, with the mean of κ on each: it preconditions."""
         shape, share = triangle(1), self.element.weights / self.element.weights.sum()
         mean = (conductivity @ share)[:, None].expand(-1, len(shape.weights))
         metric = flat_metric(self.lengths)[:, None].expand(-1, len(shape.weights), 3)
-        return sparse.csr_array(
-            assemble(metric, self.faces, shape, self.prolongation.shape[1], mean).real
-        )
+        blocks = element_matrices(metric, shape, mean).real
+        return summed(blocks, self.faces, self.prolongation.shape[1])
 
     def sensitivity(self, w: Float[Tensor, "N C"], u: Float[Tensor, "N C"]) -> Float[Tensor, "F Q"]:
         """∂/∂κ of Σ_c w_cᵀK(κ)u_c at the Gauss points: weights times ∇w·∇u."""

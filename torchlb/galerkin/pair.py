@@ -13,14 +13,17 @@ from scipy import sparse
 from torch import Tensor
 from torch.nn.functional import pad
 
-from torchlb.galerkin.assembly import assemble, assemble_mass, flat_metric
+from torchlb.galerkin.assembly import assemble_mass, element_matrices, flat_metric, summed
 from torchlb.galerkin.curving import CurvedMesh, Surface, curve, mollified
 from torchlb.galerkin.elements import segment, triangle
 from torchlb.galerkin.nodes import lagrange_nodes
 from torchlb.galerkin.prolongation import prolongation
 from torchlb.geometry.frames import normals_of_frames, vertex_normals
+from torchlb.geometry.numbering import Numbering
 from torchlb.geometry.vertex_fits import VertexFits
 
+ROWS = 2**13
+"""Rows of a product at a time."""
 SMALLEST = 0.1
 """Share of its linear mass that the mass of a vertex has at least."""
 
@@ -76,12 +79,13 @@ def mesh_pair(
     fits: VertexFits,
     degree: int,
     stars: Int[Tensor, "S 3"] | None = None,
+    numbering: Numbering | None = None,
 ) -> WeakPair:
     """The pair of a mesh in the plane or in space, from the fits of its vertices, with elements of degree r.
 
-    A third of the flat triangles `stars` is added.
+    A third of the flat triangles `stars` is added. The matrices have the user's numbers where there is a numbering.
     """
-    return weak_pair(fitted_surface(points, faces, fits), faces, degree, stars)
+    return weak_pair(fitted_surface(points, faces, fits), faces, degree, stars, numbering)
 
 
 def fitted_surface(
@@ -102,39 +106,61 @@ def weak_pair(
     faces: Int[Tensor, "F 3"],
     degree: int,
     stars: Int[Tensor, "S 3"] | None = None,
+    numbering: Numbering | None = None,
 ) -> WeakPair:
     """The pair of a mesh with elements of degree r; r = 1 is the cotangent's, with its full mass.
 
-    Symmetric, K1 = 0, K ≥ 0, M > 0 whatever the fits are: rows of P sum to one, and it has full column rank.
+    Symmetric, K1 = 0, K ≥ 0, M > 0 whatever the fits are: rows of P sum to one, and it has full column rank. What is
+    large is let go as soon as it was used.
     """
     count = len(surface.points)
-    mesh = curve(surface, lagrange_nodes(faces, count, max(degree, 2)))
+    mesh, metric = curve(surface, lagrange_nodes(faces, count, max(degree, 2)))
     linear = _linear(mesh.lengths, faces, count)
     if degree == 1:
-        return WeakPair(stored(linear), mass=torch.from_numpy(_row_sums(linear)))
-    shape, nodes = triangle(degree), mesh.nodes
+        return WeakPair(stored(sparse.triu(linear)), mass=torch.from_numpy(_row_sums(linear)))
+    blocks = element_matrices(metric, triangle(degree))
+    del metric
     p = prolongation(surface, mesh)
-    elements = assemble(mesh.metric, nodes.elements, shape, len(mesh.places))
-    pair = sparse.csr_array(p.T) @ (elements @ p)
+    elements = summed(blocks, mesh.nodes.elements, len(mesh.places))
+    del blocks
     mass = positive_mass(p, _row_sums(elements), mesh, linear)
+    rim = None if len(mesh.rim) == 0 else p.T @ (_rim_mass(mesh) @ p)
+    ends = mesh.nodes.edges, mesh.nodes.edges[mesh.curved]
+    edges = [torch.bincount(e.flatten(), minlength=count) for e in ends]
+    del mesh
+    upper = [upper_product(p, elements), sparse.triu(linear)]
+    del p, elements
     if stars is not None and len(stars):
         extra = _star_pair(surface.points, stars)
-        pair, linear, mass = pair + extra, linear + extra, mass + _row_sums(extra)
-    rim = None if len(mesh.rim) == 0 else p.T @ (_rim_mass(mesh) @ p)
-    ends = nodes.edges.flatten()
-    edges = [torch.bincount(e, minlength=count) for e in (ends, nodes.edges[mesh.curved].flatten())]
-    return WeakPair(
-        stored(pair, rim),
-        stored(linear),
-        torch.from_numpy(mass),
-        torch.stack([surface.fits.degree, surface.fits.reason, *edges]),
+        upper = [part + sparse.triu(extra) for part in upper]
+        mass = mass + _row_sums(extra)
+    near = stored(upper.pop(), None, numbering)
+    pair = stored(upper.pop(), rim, numbering)
+    counts = torch.stack([surface.fits.degree, surface.fits.reason, *edges])
+    return WeakPair(pair, near, torch.from_numpy(mass), counts)
+
+
+def upper_product(p: Any, matrix: sparse.csr_array) -> sparse.csr_array:
+    """Upper triangle of PᵀAP for a symmetric A, a few rows at a time: neither the rest nor AP is ever held."""
+    left: Any = sparse.csr_array(p.T)
+    count, indices, data, length = p.shape[1], [], [], []
+    for first in range(0, count, ROWS):
+        part = (left[first : first + ROWS] @ matrix) @ p
+        row = np.arange(part.shape[0], dtype=np.int32).repeat(np.diff(part.indptr))
+        upper = part.indices >= first + row
+        indices.append(part.indices[upper])
+        data.append(part.data[upper])
+        length.append(np.bincount(row[upper], minlength=part.shape[0]))
+    indptr = np.concatenate([[0], np.cumsum(np.concatenate(length))])
+    return sparse.csr_array(
+        (np.concatenate(data), np.concatenate(indices), indptr), shape=(count, count)
     )
 
 
 def _linear(lengths: Tensor, faces: Tensor, count: int) -> sparse.csr_array:
     """Linear elements on flat triangles."""
-    flat = flat_metric(lengths)[:, None]
-    return assemble(flat.expand(-1, len(triangle(1).weights), 3), faces, triangle(1), count)
+    flat = flat_metric(lengths)[:, None].expand(-1, len(triangle(1).weights), 3)
+    return summed(element_matrices(flat, triangle(1)), faces, count)
 
 
 def _star_pair(points: Tensor, stars: Int[Tensor, "S 3"]) -> sparse.csr_array:
@@ -156,6 +182,9 @@ def positive_mass(
     """
     nodes, count = mesh.nodes, p.shape[1]
     least = SMALLEST * _row_sums(linear)
+    mass = p.T @ weights
+    if (mass >= least).all():
+        return mass
     shares = (np.repeat(np.arange(len(nodes.shares)), 3) + count, nodes.corners.numpy().ravel())
     straight = sparse.csr_array((nodes.shares.numpy().ravel(), shares), shape=p.shape)
     entries = sparse.coo_array(p)
@@ -188,25 +217,46 @@ def _rim_mass(mesh: CurvedMesh) -> sparse.csr_array:
     return assemble_mass(speed, elements, shape, len(mesh.places))
 
 
-def stored(pair: Any, rim: Any = None) -> SparsePair:
-    """Exactly symmetric, with rows of K that sum to zero, as real parts on one pattern."""
-    other: Any = sparse.csr_array(sparse.csr_array(pair).T)  # sorted as it comes
-    pair = sparse.csr_array(other.T)
-    values = np.empty((2, len(pair.data)))
-    for to, mine, theirs in zip(
-        values, (pair.data.real, pair.data.imag), (other.data.real, other.data.imag), strict=True
-    ):
-        np.multiply(mine + theirs, 0.5, out=to)
-    count = len(pair.indptr) - 1
-    row = np.arange(count, dtype=np.int32).repeat(np.diff(pair.indptr))
-    values[0, row == pair.indices] -= np.bincount(row, values[0], count)
-    values = torch.from_numpy(values)
-    crow, col = (torch.from_numpy(part.astype(np.int64)) for part in (pair.indptr, pair.indices))
+def stored(upper: Any, rim: Any = None, numbering: Numbering | None = None) -> SparsePair:
+    """Of the upper triangles K + iM: exactly symmetric, rows of K sum to zero, as real parts on one pattern.
+
+    From a numbering back to the user's, if there is one; `rim` is the mass of the boundary, whole.
+    """
+    upper = sparse.coo_array(upper)
+    count, (row, col) = upper.shape[0], upper.coords
+    given = None if numbering is None else numbering.given.int().numpy()
+    if given is not None:
+        row, col = given[row], given[col]
+        row, col = np.minimum(row, col), np.maximum(row, col)
+    lower: Any = sparse.coo_array((upper.data, (col, row)), shape=upper.shape)
+    lower.has_canonical_format = True  # but for its order, which the transposes bring about
+    upper = sparse.csr_array(sparse.csr_array(lower).T)
+    lower = sparse.csr_array(upper.T)
+    crow = np.concatenate([[0], np.cumsum(np.diff(lower.indptr) + np.diff(upper.indptr) - 1)])
+    col, values = np.empty(crow[-1], dtype=np.int64), np.empty((2, crow[-1]))
+
+    def fill(part: Any, start: np.ndarray) -> None:
+        shift = start - part.indptr[:-1]
+        for first in range(0, count, ROWS):
+            ends = part.indptr[first : first + ROWS + 1]
+            entry = slice(ends[0], ends[-1])
+            place = np.arange(ends[0], ends[-1])
+            place += shift[first : first + ROWS].repeat(np.diff(ends))
+            col[place], data = part.indices[entry], part.data[entry]
+            values[0, place], values[1, place] = data.real, data.imag
+
+    fill(lower, crow[:-1])
+    del lower
+    fill(upper, crow[1:] - np.diff(upper.indptr))  # both have the diagonal
+    del upper
+    row = np.arange(count, dtype=np.int32).repeat(np.diff(crow))
+    values[0, row == col] -= np.bincount(row, values[0], count)
+    crow, col, row, values = (torch.from_numpy(part) for part in (crow, col, row, values))
     if rim is not None:
         line: Any = sparse.coo_array((rim + rim.T) / 2)
-        i, j = (torch.from_numpy(part.astype(np.int64)) for part in line.coords)
+        i, j = (ends if given is None else given[ends] for ends in line.coords)
         extra = torch.zeros_like(values[:1])
-        keys = torch.from_numpy(row.astype(np.int64)) * count + col
-        extra[0, torch.searchsorted(keys, i * count + j)] = torch.from_numpy(line.data)
+        wanted = torch.from_numpy(i.astype(np.int64) * count + j)
+        extra[0, torch.searchsorted(row.long() * count + col, wanted)] = torch.from_numpy(line.data)
         values = torch.cat([values, extra])
     return SparsePair(crow, col, values)

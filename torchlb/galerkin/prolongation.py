@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 import torch
-from jaxtyping import Int
+from jaxtyping import Bool, Float, Int
 from scipy import sparse
 from torch import Tensor
 
@@ -22,31 +22,68 @@ def prolongation(surface: Surface, mesh: CurvedMesh) -> sparse.csr_array:
 
     Identity rows at the vertices, linear ones at flat nodes, and those of the boundary's own curves along it.
     """
-    nodes, count = mesh.nodes, len(surface.points)
-    ends = node_ends(nodes)
-    first = torch.arange(count)
-    flat = ~mesh.bent[ends.node]
-    of_rim = _rim_entries(mesh)
-    by_fit = mesh.bent.clone()
+    count, ends = len(surface.points), node_ends(mesh.nodes)
+    row, col, value, by_fit = _without_fits(surface, mesh, ends)
+    rows = torch.cat([row, count + ends.node[by_fit]])
+    length = torch.cat([torch.ones_like(row), surface.fits.size[ends.vertex[by_fit]]])
+    indptr, start = _places(rows, length, len(mesh.places))
+    total = int(indptr[-1])
+    indices, data = torch.empty(total, dtype=torch.int32), value.new_empty(total)
+    alone, first = start[: len(row)], torch.zeros_like(ends.node)
+    indices[alone], data[alone] = col.int(), value
+    first[by_fit] = start[len(row) :]
+    _fill(indices, data, first, surface, mesh, ends, by_fit)
+    shape = len(mesh.places), count
+    p = sparse.csr_array((data.numpy(), indices.numpy(), indptr.numpy()), shape=shape)
+    p.sum_duplicates()
+    p.data, p.indices = p.data.copy(), p.indices.copy()  # without the room of the duplicates
+    return p
+
+
+def _without_fits(
+    surface: Surface, mesh: CurvedMesh, ends: Ends
+) -> tuple[Tensor, Tensor, Tensor, Bool[Tensor, " E"]]:
+    """(row, column, value) of the vertices, of flat nodes and of those along the boundary; and which ends are left."""
+    vertices = torch.arange(len(surface.points))
+    of_rim, flat, by_fit = _rim_entries(mesh), ~mesh.bent[ends.node], mesh.bent.clone()
     by_fit[of_rim[0]] = False
-    rows, cols, values = [first], [first], [surface.points.new_ones(count)]
+    entries = [(vertices, vertices, surface.points.new_ones(len(vertices)))]
     for node, vertex, weight in (of_rim, (ends.node[flat], ends.vertex[flat], ends.share[flat])):
-        rows.append(count + node)
-        cols.append(vertex)
-        values.append(weight)
-    for block, part, own in _of_fits(surface.fits.blocks, ends, by_fit[ends.node], count):
+        entries.append((len(vertices) + node, vertex, weight))
+    row, col, value = (torch.cat(parts) for parts in zip(*entries, strict=True))
+    return row, col, value, by_fit[ends.node]
+
+
+def _fill(
+    indices: Int[Tensor, " nnz"],
+    data: Float[Tensor, " nnz"],
+    first: Int[Tensor, " E"],
+    surface: Surface,
+    mesh: CurvedMesh,
+    ends: Ends,
+    by_fit: Bool[Tensor, " E"],
+) -> None:
+    """The entries that come from fits, of each end from its `first` on; the fits are gone thereafter."""
+    count = len(surface.points)
+    for block, part, own in _of_fits(surface.fits.hand_over(), ends, by_fit, count):
         used, vertex = own >= 0, block.vertices[part]
-        node = count + ends.node[own]
-        offset = mesh.places[node] - surface.points[vertex, None]
+        offset = mesh.places[count + ends.node[own]] - surface.points[vertex, None]
         y = offset @ surface.frames[vertex] / surface.fits.radius[vertex, None, None]
-        row = cardinal(block.coefficients[part], y, block.degree) * ends.share[own][..., None]
-        index = block.points[part, None].expand_as(row)
-        rows.append(node[used].repeat_interleave(row.shape[2]))
-        cols.append(index[used].flatten())
-        values.append(row[used].flatten())
-    where = torch.cat(rows).int().numpy(), torch.cat(cols).int().numpy()
-    shape = (len(mesh.places), count)
-    return sparse.csr_array((torch.cat(values).numpy(), where), shape=shape)
+        weights = cardinal(block.coefficients[part], y, block.degree) * ends.share[own][..., None]
+        place = first[own[used]][:, None] + torch.arange(weights.shape[2])
+        indices[place] = block.points[part].int()[used.nonzero()[:, 0]]
+        data[place] = weights[used]
+
+
+def _places(
+    row: Int[Tensor, " E"], length: Int[Tensor, " E"], num_rows: int
+) -> tuple[Int[Tensor, " rows_plus_1"], Int[Tensor, " E"]]:
+    """Row pointers of so many entries in the given rows, and where each lot of them starts."""
+    total = torch.zeros(num_rows + 1, dtype=torch.int64).index_add_(0, row + 1, length)
+    order = row.argsort(stable=True)
+    start = torch.empty_like(row)
+    start[order] = length[order].cumsum(0) - length[order]
+    return total.cumsum(0), start
 
 
 def _of_fits(

@@ -46,6 +46,37 @@ class Fits(NamedTuple):
     coefficients: Float[Tensor, "b M neighbors"]
 
 
+class _Pile:
+    """Room for fits of one degree and size, of which only what is filled takes memory.
+
+    In one piece each: thousands of arrays that stay, between those that come and go, would scatter the memory.
+    """
+
+    def __init__(self, degree: int, room: int, size: int, terms: int, like: Tensor) -> None:
+        self.degree, self.filled = degree, 0
+        self.vertices = torch.empty(room, dtype=torch.int64)
+        self.points = torch.empty(room, size, dtype=torch.int64)
+        self.coefficients = like.new_empty(room, terms, size - 1)
+
+    def add(
+        self,
+        vertices: Int[Tensor, " b"],
+        points: Int[Tensor, "b K"],
+        coefficients: Float[Tensor, "b M neighbors"],
+    ) -> None:
+        """Fill the next places."""
+        part = slice(self.filled, self.filled + len(vertices))
+        self.vertices[part], self.points[part] = vertices, points
+        self.coefficients[part] = coefficients
+        self.filled = part.stop
+
+    @property
+    def fits(self) -> Fits:
+        """What is there."""
+        n = self.filled
+        return Fits(self.vertices[:n], self.degree, self.points[:n], self.coefficients[:n])
+
+
 class VertexFits:
     """Fits of the highest degree that passes at each vertex.
 
@@ -63,6 +94,7 @@ class VertexFits:
     degree : (N,), m of each fit; 0 where none passed, which leaves the vertex flat.
     heights : (N, M − 1, n), ℓ: of the surface over the tangent plane, as vectors; zero beyond a fit's own monomials.
     radius : (N,), ℓ.
+    size : (N,), number of points of each fit, the vertex among them.
     reason : (N,), why the first degree was not reached, a place in `REASONS`.
     """
 
@@ -72,27 +104,14 @@ class VertexFits:
         self.degree = torch.zeros(count, dtype=torch.int64)
         self.heights = points.new_zeros(count, terms, points.shape[1])
         self.radius = points.new_ones(count)
-        self.reason = torch.ones(count, dtype=torch.int64)
-        self._blocks: list[Fits] = []
+        self.size = torch.zeros_like(self.degree)
+        self.reason = torch.ones_like(self.degree)
+        self._piles: dict[tuple[int, int], _Pile] = {}
 
-    @property
-    def blocks(self) -> list[Fits]:
-        """The fits, those of one degree and size together."""
-        kinds: dict[tuple[int, int], list[Fits]] = {}
-        for block in self._blocks:
-            kinds.setdefault((block.degree, block.points.shape[1]), []).append(block)
-        self._blocks = [
-            Fits(
-                torch.cat([b.vertices for b in alike]),
-                degree,
-                torch.cat([b.points for b in alike]),
-                torch.cat([b.coefficients for b in alike]),
-            )
-            if len(alike) > 1
-            else alike[0]
-            for (degree, _), alike in kinds.items()
-        ]
-        return self._blocks
+    def hand_over(self) -> list[Fits]:
+        """The fits, those of one degree and size together; being large, they are not kept."""
+        piles, self._piles = self._piles, {}
+        return [pile.fits for pile in piles.values()]
 
     def take(
         self,
@@ -112,11 +131,14 @@ class VertexFits:
         good &= self.degree[vertices] == 0
         if not good.any():
             return
-        kept, coefficients = vertices[good], fit.coefficients[good]
-        self.degree[kept] = degree
+        kept, coefficients, kind = vertices[good], fit.coefficients[good], (degree, index.shape[1])
+        if kind not in self._piles:
+            room = int((self.degree == 0).sum())
+            self._piles[kind] = _Pile(degree, room, index.shape[1], terms, coefficients)
+        self._piles[kind].add(kept, index[good], coefficients)
+        self.degree[kept], self.size[kept] = kind
         self.heights[kept, :terms] = coefficients @ heights[good]
         self.radius[kept] = fit.radius[good]
-        self._blocks.append(Fits(kept, degree, index[good], coefficients))
 
     def complete(self, balls: GraphBalls) -> VertexFits:
         """The same; the vertices without a fit have tried the degrees in turn."""

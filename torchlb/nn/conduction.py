@@ -90,10 +90,11 @@ def conducting(lb: LaplaceBeltrami, conductivity: Tensor) -> Conducting:
         raise InputError(f"conductivity: expected finite, positive values, got {kappa.min():.3g}")
     at_gauss_points = medium.at_gauss_points(kappa)
     mass = _mass(lb, lb.weak_crow, lb.weak_col, lb.weak_values)
-    pair = stored(medium.stiffness(at_gauss_points) + 1j * mass)
+    pair = stored(sparse.triu(medium.stiffness(at_gauss_points) + 1j * mass))
     linear = pair
     if len(lb.linear_crow):
-        linear = stored(medium.coarse_stiffness(at_gauss_points) + 1j * _mass(lb, *lb.linear_pair))
+        coarse = medium.coarse_stiffness(at_gauss_points)
+        linear = stored(sparse.triu(coarse + 1j * _mass(lb, *lb.linear_pair)))
     (crow, col, values), near = (
         [t.to(lb.device) for t in (part.crow, part.col, part.values)] for part in (pair, linear)
     )

@@ -12,12 +12,13 @@ from torch import Tensor
 from torch.nn.functional import pad
 
 from torchlb.baseline.cotangent import cotangent_laplacian
-from torchlb.errors import InputError, first_few, warn
+from torchlb.errors import InputError, first_few, renumbered, warn
 from torchlb.fits.rules import WeightsName
 from torchlb.galerkin.flips import flipped
 from torchlb.galerkin.pair import ELEMENTS, SparsePair, WeakPair, mesh_pair
 from torchlb.geometry.boundary import boundary_faces
 from torchlb.geometry.frames import Projection
+from torchlb.geometry.numbering import Numbering
 from torchlb.geometry.surface import CloudSurface, SurfaceSummary, cloud_surface
 from torchlb.geometry.vertex_fits import REASONS, VertexFits
 from torchlb.operator.checks import (
@@ -109,16 +110,47 @@ class Options:
 
 @dataclass(frozen=True)
 class AssembledOperator:
-    """A finished operator; `shape.areas` is its mass; without what was not asked for or cannot be there."""
+    """A finished operator, in the user's numbers; None for what was not asked for or cannot be there."""
 
     rows: Rows
-    shape: Shape
-    source: str
-    options: dict[str, Any]
-    certificate: Certificate | None
+    points: Float[Tensor, "N n"]
+    frames: Float[Tensor, "N n d"]
+    normals: Float[Tensor, "N n"] | None
+    normal_order: Int[Tensor, " N"]
+    mass: Float[Tensor, " N"]
+    on_boundary: Bool[Tensor, " N"] | None
     pair: WeakPair | None
     faces: Int[Tensor, "F v"]
+    source: str
+    options: dict[str, Any]
+    certificate: Certificate | None = None
     surface: SurfaceSummary | None = None
+
+    @classmethod
+    def of(
+        cls,
+        rows: Rows,
+        shape: Shape,
+        pair: WeakPair | None,
+        faces: Int[Tensor, "F v"],
+        source: str,
+        options: dict[str, Any],
+        certificate: Certificate | None = None,
+    ) -> AssembledOperator:
+        """That of a shape."""
+        mask = None if shape.boundary is None else shape.boundary.mask
+        of_shape = shape.points, shape.frames, shape.normals, shape.normal_order, shape.areas, mask
+        return cls(rows, *of_shape, pair, faces, source, options, certificate)
+
+    def restored(self, numbering: Numbering) -> AssembledOperator:
+        """From a numbering to the user's; all but the matrices of the pair and the faces, which have that."""
+        names = "points", "frames", "normals", "normal_order", "mass", "on_boundary"
+        tensors = {name: getattr(self, name) for name in names}
+        values = {name: numbering.restored(t) for name, t in tensors.items() if t is not None}
+        pair = self.pair
+        if pair is not None and pair.fits is not None:
+            pair = replace(pair, fits=pair.fits[:, numbering.here])
+        return replace(self, **values, rows=self.rows.restored(numbering), pair=pair)
 
 
 def build_cloud(
@@ -147,13 +179,24 @@ def build_cloud(
             raise InputError(f"normals: only hypersurfaces have them, not dim={d} in R^{ambient}")
         normals = check_normals(normals, points)
     progress = progress and sys.stderr.isatty()
+    on_surface = d == 2 and ambient <= 3 and len(points) > 3
+    if on_surface:
+        check_spread(points)
+    numbering = Numbering.along_tree(points)
+    here = numbering.sorted(points)
+    if isinstance(where, Tensor):
+        where = numbering.sorted(where)
     settings = {"num_neighbors": options.num_neighbors, "condition": options.held}
-    settings |= {"normals": normals, "progress": progress}
-    if d == 2 and ambient <= 3 and len(points) > 3:
-        return _build_on_surface(points, options, where, settings)
-    options = options.settled(triangles=False)
-    shape = cloud_shape(points, d, options.q, boundary=where, **settings)
-    return _finished(shape, "points", options, REMEDY.format(d), progress)
+    settings |= {"normals": None if normals is None else numbering.sorted(normals)}
+    settings |= {"progress": progress}
+    with renumbered(numbering.given):
+        if on_surface:
+            built = _build_on_surface(here, options, where, settings, numbering)
+        else:
+            options = options.settled(triangles=False)
+            shape = cloud_shape(here, d, options.q, boundary=where, **settings)
+            built = _finished(shape, "points", options, REMEDY.format(d), progress)
+    return replace(built.restored(numbering), points=points)
 
 
 def _build_on_surface(
@@ -161,9 +204,9 @@ def _build_on_surface(
     options: Options,
     boundary: Bool[Tensor, " N"] | str | None,
     settings: dict[str, Any],
+    numbering: Numbering,
 ) -> AssembledOperator:
     """Operator on a cloud in R² or R³, by the surface through it."""
-    check_spread(points)
     ambient, where = points.shape[1], None if isinstance(boundary, str) else boundary
     space = pad(points, (0, 3 - ambient))
     surface = cloud_surface(space, normals=settings["normals"], boundary=where)
@@ -176,13 +219,12 @@ def _build_on_surface(
     )
     pair, fits = None, shape.fits
     if fits is not None:
-        pair = mesh_pair(places, surface.faces, fits, degree, surface.stars)
+        pair = mesh_pair(places, surface.faces, fits, degree, surface.stars, numbering)
         assert pair.mass is not None
         shape = replace(shape, areas=pair.mass)
         _warn_of_doubts(surface, fits, pair.mass)
     built = _finished(shape, "points", options, REMEDY.format(2), settings["progress"], pair)
-    shape = replace(built.shape, points=points)
-    return replace(built, shape=shape, faces=surface.faces, surface=surface.summary)
+    return replace(built, faces=numbering.given[surface.faces], surface=surface.summary)
 
 
 def _warn_of_doubts(surface: CloudSurface, fits: VertexFits, mass: Float[Tensor, " N"]) -> None:
@@ -230,8 +272,6 @@ def build_mesh(
     corners = given = mended_faces(vertices, corners)
     options = options.settled(corners.shape[1] == 3 and vertices.shape[1] <= 3)
     degree, degrees = options.elements
-    if options.weak_form:  # for the stencil, too: who is whose neighbour, and the first normals
-        corners = flipped(pad(vertices, (0, 3 - vertices.shape[1])), corners)
     if isinstance(boundary, str) and boundary in CONDITIONS:
         raise InputError(
             f"boundary: expected where the condition holds, a mask of the vertices, got {boundary!r}; what holds there "
@@ -239,23 +279,29 @@ def build_mesh(
         )
     where = check_boundary(boundary, len(vertices))
     progress = progress and sys.stderr.isatty()
-    shape = mesh_shape(
-        vertices,
-        corners,
-        options.q,
-        num_neighbors=options.num_neighbors,
-        boundary=None if isinstance(where, str) else where,
-        condition=options.held,
-        fit_degrees=degrees,
-        progress=progress,
-    )
-    pair = None
-    if shape.fits is not None:
-        pair = mesh_pair(vertices, corners, shape.fits, degree)
-        assert pair.mass is not None
-        shape = replace(shape, areas=pair.mass)
-    remedy = "a finer mesh, or one without noise, has better ones"
-    return replace(_finished(shape, "mesh", options, remedy, progress, pair), faces=given)
+    numbering = Numbering.along_tree(vertices)
+    here, (corners, _) = numbering.sorted(vertices), numbering.faces(corners)
+    if options.weak_form:  # for the stencil, too: who is whose neighbour, and the first normals
+        corners = flipped(pad(here, (0, 3 - here.shape[1])), corners)
+    with renumbered(numbering.given):
+        shape = mesh_shape(
+            here,
+            corners,
+            options.q,
+            num_neighbors=options.num_neighbors,
+            boundary=numbering.sorted(where) if isinstance(where, Tensor) else None,
+            condition=options.held,
+            fit_degrees=degrees,
+            progress=progress,
+        )
+        pair = None
+        if shape.fits is not None:
+            pair = mesh_pair(here, corners, shape.fits, degree, numbering=numbering)
+            assert pair.mass is not None
+            shape = replace(shape, areas=pair.mass)
+        remedy = "a finer mesh, or one without noise, has better ones"
+        built = _finished(shape, "mesh", options, remedy, progress, pair)
+    return replace(built.restored(numbering), points=vertices, faces=given)
 
 
 def build_cotangent(vertices: ArrayLike, faces: ArrayLike) -> AssembledOperator:
@@ -281,7 +327,7 @@ def build_cotangent(vertices: ArrayLike, faces: ArrayLike) -> AssembledOperator:
         share = torch.zeros_like(mass).index_add(0, rim.flatten(), length.repeat_interleave(2) / 2)
         weak.append(share[row] * diagonal)
     pair = WeakPair(SparsePair(rows.crow, rows.col, torch.stack(weak)))
-    return AssembledOperator(rows, shape, "cotangent", {}, None, pair, corners)
+    return AssembledOperator.of(rows, shape, pair, corners, "cotangent", {})
 
 
 def _finished(
@@ -323,4 +369,4 @@ def _finished(
         low_rows = "have only low-order rows for Δf and ∇f, of first order at best"
         warn(f"{share:.0%} of the points {low_rows}; at most of them: {reason}")
     faces = torch.zeros(0, shape.frames.shape[-1] + 1, dtype=torch.int64)
-    return AssembledOperator(rows, shape, source, asdict(options), certificate, pair, faces)
+    return AssembledOperator.of(rows, shape, pair, faces, source, asdict(options), certificate)

@@ -211,18 +211,17 @@ class LaplaceBeltrami(StencilFace, WeakFace):
     @classmethod
     def _from_assembled(cls, built: build.AssembledOperator, given: ArrayLike) -> LaplaceBeltrami:
         """Store what was built, in the floating type of the input."""
-        rows, shape = built.rows, built.shape
-        points = shape.points
-        report = {**vars(rows), "num_neighbors": rows.length, "normal_order": shape.normal_order}
+        rows, points = built.rows, built.points
+        report = {**vars(rows), "num_neighbors": rows.length, "normal_order": built.normal_order}
         buffers = {f"report_{n}": report[n] for n in REPORT_FIELDS if n not in FIT_FIELDS} | {
             "crow": rows.crow,
             "col": rows.col,
             "values": rows.laplacian,
             "gradient_values": rows.gradient.T.contiguous(),
-            "mass": shape.areas,
+            "mass": built.mass,
             "points": points,
-            "frames": shape.frames,
-            "normals": points[:0] if shape.normals is None else shape.normals,
+            "frames": built.frames,
+            "normals": points[:0] if built.normals is None else built.normals,
             "faces": built.faces,
         }
         fits = None if built.pair is None else built.pair.fits
@@ -230,8 +229,8 @@ class LaplaceBeltrami(StencilFace, WeakFace):
         buffers |= {f"report_{name}": t for name, t in zip(FIT_FIELDS, fits, strict=True)}
         if built.pair is not None:
             buffers |= built.pair.buffers
-        if shape.boundary is not None and shape.boundary.mask.any():
-            buffers["on_boundary"] = shape.boundary.mask
+        if built.on_boundary is not None and built.on_boundary.any():
+            buffers["on_boundary"] = built.on_boundary
         lb = cls.from_buffers(buffers, {"source": built.source, "options": built.options})
         lb.certificate, lb.surface = built.certificate, built.surface
         if (

@@ -11,6 +11,7 @@ from torchlb.errors import InputError
 from torchlb.galerkin.flips import flipped
 from torchlb.galerkin.medium import Medium
 from torchlb.galerkin.pair import fitted_surface
+from torchlb.geometry.numbering import Numbering
 from torchlb.operator.build import Options
 from torchlb.operator.laplace_beltrami import LaplaceBeltrami
 from torchlb.stencils.shape import mesh_shape
@@ -42,6 +43,9 @@ def _made(lb: LaplaceBeltrami) -> Medium:
         return Medium.linear(points, faces)
     options = Options(**lb.options)
     degree, degrees = options.elements
+    numbering = Numbering.along_tree(points)  # as in the operator, whose fits break ties by it
+    points = numbering.sorted(points)
+    faces, order = numbering.faces(faces)
     faces = flipped(pad(points, (0, 3 - points.shape[1])), faces)
     shape = mesh_shape(
         points,
@@ -54,4 +58,5 @@ def _made(lb: LaplaceBeltrami) -> Medium:
         progress=False,
     )
     assert shape.fits is not None
-    return Medium.curved(fitted_surface(points, faces, shape.fits), faces, degree)
+    medium = Medium.curved(fitted_surface(points, faces, shape.fits), faces, degree)
+    return medium.restored(numbering, order)

@@ -17,7 +17,7 @@ from scipy.sparse import csgraph
 from torch import Tensor
 from tqdm import tqdm
 
-from torchlb.errors import StabilityWarning, warn
+from torchlb.errors import StabilityWarning, as_given, warn
 from torchlb.linalg.krylov import prefers_krylov
 from torchlb.linalg.sparse import to_scipy
 from torchlb.stability.certificate import Certificate, check_certificate
@@ -105,7 +105,7 @@ def certify(
     result = replace(result, **counts)
     if not result.holds:
         worst = (mass / areas).argsort() if feed.shape[1] == 0 else (-feed.max(1)).argsort()
-        names = ", ".join(map(str, worst[:8].tolist()))
+        names = ", ".join(map(str, as_given(worst[:8]).tolist()))
         stopped = ", where rounds end" if rounds == schedule.most else ""
         warn(
             f"{result}{stopped}; the worst points: {names}. Lower `order`, or repair the surface there.",

@@ -5,7 +5,9 @@ from __future__ import annotations
 from collections.abc import Iterable
 from dataclasses import dataclass, fields
 from enum import IntEnum
+from typing import Any
 
+import numpy as np
 import torch
 from jaxtyping import Float, Int
 from scipy import sparse
@@ -13,6 +15,7 @@ from torch import Tensor
 
 from torchlb.fits.rules import WEIGHT_RULES
 from torchlb.fits.weights import Weights
+from torchlb.geometry.numbering import Numbering
 from torchlb.linalg.sparse import from_scipy
 
 
@@ -81,6 +84,21 @@ class Rows:
         return Rows(
             *(getattr(self, f.name)[entry if f.name in ENTRIES else rows] for f in fields(Rows))
         )
+
+    def restored(self, numbering: Numbering) -> Rows:
+        """All rows, with the user's numbers."""
+        count, given = len(self.length), numbering.given.int().numpy()
+        number = np.arange(len(self.col), dtype=np.int32)
+        parts = number, given[self.col.numpy()], self.crow.numpy()
+        turned: Any = sparse.csr_array(sparse.csr_array(parts, shape=(count, count)).T)
+        turned.indices = given[turned.indices]
+        whole: Any = sparse.csr_array(turned.T)  # sorted as it comes
+        entry = torch.from_numpy(whole.data)
+        values = {
+            f.name: getattr(self, f.name)[entry if f.name in ENTRIES else numbering.here]
+            for f in fields(Rows)
+        }
+        return Rows(**values | {"col": torch.from_numpy(whole.indices).long()})
 
     @staticmethod
     def stack(blocks: Iterable[Rows]) -> Rows:

@@ -1,0 +1,76 @@
+"""Points are built in the order of a k-d tree: neither results nor messages show it."""
+
+import pytest
+import torch
+
+from torchlb import LaplaceBeltrami
+from torchlb.errors import InputError, first_few, renumbered
+from torchlb.geometry.numbering import Numbering
+from torchlb.linalg.sparse import to_scipy
+from torchlb.stencils.rows import matrix_rows
+from torchlb.surfaces import Sphere, UnitDisk
+
+
+def test_near_points_are_near_in_the_order_of_the_tree():
+    """The mean step from one point to the next: 0.52 for points at random in a unit square, a few spacings then."""
+    points = torch.rand(2000, 2, dtype=torch.float64)
+    numbering = Numbering.along_tree(points)
+    along = numbering.sorted(points).diff(dim=0).norm(dim=1)
+    assert along.mean() < 0.1 * points.diff(dim=0).norm(dim=1).mean()
+    assert numbering.restored(numbering.sorted(points)).equal(points)
+
+
+def test_faces_keep_their_corners():
+    vertices, faces = Sphere().mesh(300)
+    numbering = Numbering.along_tree(vertices)
+    found, order = numbering.faces(faces)
+    assert numbering.given[found].equal(faces[order])
+    assert (found.amin(1).diff() >= 0).all()
+
+
+def test_rows_are_restored_with_ascending_columns():
+    vertices, faces = Sphere().mesh(200)
+    lb = LaplaceBeltrami.from_mesh(vertices, faces)
+    rows = matrix_rows(
+        to_scipy(lb.crow, lb.col, lb.values, lb.shape), vertices, lb.frames, torch.arange(200)
+    )
+    numbering = Numbering(order := torch.randperm(200), order.argsort())
+    found = rows.restored(numbering)
+    dense = to_scipy(found.crow, found.col, found.laplacian, lb.shape).toarray()
+    given = order.numpy()
+    expected = to_scipy(lb.crow, lb.col, lb.values, lb.shape).toarray()
+    assert (dense[given][:, given] == expected).all()
+    row = torch.arange(200).repeat_interleave(found.length)
+    assert ((row * 200 + found.col).diff() > 0).all()
+
+
+def test_every_tensor_has_the_users_numbers():
+    """Where rows, frames, masses and both pairs belong to the point that they are stored for."""
+    vertices, faces = UnitDisk().mesh(500)
+    shuffle = torch.randperm(500)
+    lb = LaplaceBeltrami.from_mesh(vertices[shuffle], shuffle.argsort()[faces])
+    x = lb.points[:, :2]
+    inside = x.norm(dim=1) < 0.6
+    assert lb(x.square())[inside].allclose(torch.full((1,), 2.0).double(), atol=1e-8)
+    assert (lb.boundary == (x.norm(dim=1) > 1 - 1e-9)).all()
+    assert lb.mass.sum() == pytest.approx(lb.mass_matrix.to_dense().sum().item(), rel=1e-12)
+    flux = lb.stiffness @ x  # ∫ ∇x·∇φ is that of the boundary alone
+    assert flux[inside].abs().max() < 1e-10
+    length = lb.boundary_mass.to_dense().sum(1)
+    assert (length[~lb.boundary].abs() < 1e-12).all()
+    assert length[lb.boundary].sum() == pytest.approx(2 * torch.pi, rel=1e-4)
+
+
+def test_messages_name_points_as_the_user_does():
+    with renumbered(torch.tensor([7, 5, 3])):
+        assert first_few(torch.tensor([0, 2])) == "3, 7"
+    assert first_few(torch.tensor([0, 2])) == "0, 2"
+
+
+def test_a_mask_with_points_inside_names_them():
+    vertices, faces = UnitDisk().mesh(400)
+    mask = vertices.norm(dim=1) > 1 - 1e-9
+    astray = int((~mask).nonzero()[7])
+    mask[astray] = True
+    with pytest.raises(InputError, match=rf"got 1 inside \({astray}\)"):
+        LaplaceBeltrami.from_mesh(vertices, faces, boundary=mask)
