@@ -115,12 +115,13 @@ def weak_pair(
     """
     count = len(surface.points)
     mesh, metric = curve(surface, lagrange_nodes(faces, count, max(degree, 2)))
+    del surface.fits.heights
     linear = _linear(mesh.lengths, faces, count)
     if degree == 1:
         return WeakPair(stored(sparse.triu(linear)), mass=torch.from_numpy(_row_sums(linear)))
+    p = prolongation(surface, mesh)
     blocks = element_matrices(metric, triangle(degree))
     del metric
-    p = prolongation(surface, mesh)
     elements = summed(blocks, mesh.nodes.elements, len(mesh.places))
     del blocks
     mass = positive_mass(p, _row_sums(elements), mesh, linear)
@@ -143,18 +144,21 @@ def weak_pair(
 def upper_product(p: Any, matrix: sparse.csr_array) -> sparse.csr_array:
     """Upper triangle of PᵀAP for a symmetric A, a few rows at a time: neither the rest nor AP is ever held."""
     left: Any = sparse.csr_array(p.T)
-    count, indices, data, length = p.shape[1], [], [], []
+    count, filled, length = p.shape[1], 0, []
+    indices, data = np.empty(0, dtype=np.int32), np.empty(0, dtype=matrix.dtype)
     for first in range(0, count, ROWS):
-        part = (left[first : first + ROWS] @ matrix) @ p
+        half = left[first : first + ROWS] @ matrix
+        met = np.flatnonzero(np.bincount(half.indices, minlength=p.shape[0]))
+        part = half[:, met] @ p[met]  # of the type of A: of P only what is met is converted
         row = np.arange(part.shape[0], dtype=np.int32).repeat(np.diff(part.indptr))
         upper = part.indices >= first + row
-        indices.append(part.indices[upper])
-        data.append(part.data[upper])
         length.append(np.bincount(row[upper], minlength=part.shape[0]))
+        start, filled = filled, filled + int(length[-1].sum())
+        for whole, piece in ((indices, part.indices), (data, part.data)):
+            whole.resize(filled, refcheck=False)  # where it is: pieces would be held twice
+            whole[start:] = piece[upper]
     indptr = np.concatenate([[0], np.cumsum(np.concatenate(length))])
-    return sparse.csr_array(
-        (np.concatenate(data), np.concatenate(indices), indptr), shape=(count, count)
-    )
+    return sparse.csr_array((data, indices, indptr), shape=(count, count))
 
 
 def _linear(lengths: Tensor, faces: Tensor, count: int) -> sparse.csr_array:
@@ -231,32 +235,32 @@ def stored(upper: Any, rim: Any = None, numbering: Numbering | None = None) -> S
     lower: Any = sparse.coo_array((upper.data, (col, row)), shape=upper.shape)
     lower.has_canonical_format = True  # but for its order, which the transposes bring about
     upper = sparse.csr_array(sparse.csr_array(lower).T)
-    lower = sparse.csr_array(upper.T)
-    crow = np.concatenate([[0], np.cumsum(np.diff(lower.indptr) + np.diff(upper.indptr) - 1)])
+    del lower, row, col
+    before = np.bincount(upper.indices, minlength=count) - 1  # of each row, left of the diagonal
+    crow = np.concatenate([[0], np.cumsum(before + np.diff(upper.indptr))])
+    free, diagonal = crow[:-1].copy(), crow[:-1] + before
     col, values = np.empty(crow[-1], dtype=np.int64), np.empty((2, crow[-1]))
 
-    def fill(part: Any, start: np.ndarray) -> None:
-        shift = start - part.indptr[:-1]
-        for first in range(0, count, ROWS):
-            ends = part.indptr[first : first + ROWS + 1]
-            entry = slice(ends[0], ends[-1])
-            place = np.arange(ends[0], ends[-1])
-            place += shift[first : first + ROWS].repeat(np.diff(ends))
-            col[place], data = part.indices[entry], part.data[entry]
-            values[0, place], values[1, place] = data.real, data.imag
+    def put(part: Any, start: np.ndarray, shift: int) -> None:
+        place = np.arange(len(part.data)) + (start - part.indptr[:-1]).repeat(np.diff(part.indptr))
+        col[place] = part.indices + shift
+        values[0, place], values[1, place] = part.data.real, part.data.imag
 
-    fill(lower, crow[:-1])
-    del lower
-    fill(upper, crow[1:] - np.diff(upper.indptr))  # both have the diagonal
+    for first in range(0, count, ROWS):
+        part = upper[first : first + ROWS]
+        mirrored = sparse.csr_array(part.T)
+        put(part, diagonal[first : first + ROWS], 0)
+        put(mirrored, free, first)
+        free += np.diff(mirrored.indptr)
     del upper
-    row = np.arange(count, dtype=np.int32).repeat(np.diff(crow))
-    values[0, row == col] -= np.bincount(row, values[0], count)
-    crow, col, row, values = (torch.from_numpy(part) for part in (crow, col, row, values))
+    values[0, diagonal] -= np.add.reduceat(values[0], crow[:-1])
+    crow, col, values = (torch.from_numpy(part) for part in (crow, col, values))
     if rim is not None:
         line: Any = sparse.coo_array((rim + rim.T) / 2)
         i, j = (ends if given is None else given[ends] for ends in line.coords)
         extra = torch.zeros_like(values[:1])
+        place = torch.arange(count).repeat_interleave(crow.diff()) * count + col
         wanted = torch.from_numpy(i.astype(np.int64) * count + j)
-        extra[0, torch.searchsorted(row.long() * count + col, wanted)] = torch.from_numpy(line.data)
+        extra[0, torch.searchsorted(place, wanted)] = torch.from_numpy(line.data)
         values = torch.cat([values, extra])
     return SparsePair(crow, col, values)
