@@ -278,6 +278,20 @@ def test_a_plane_is_a_plane_in_space():
     assert (flat.stiffness.to_dense() - space.stiffness.to_dense()).abs().max() < 1e-9
 
 
+def test_blocks_of_any_size_make_the_same_pair(monkeypatch):
+    """Of a hemisphere of one block, and of many with a rest, in all that is done a few at a time."""
+    vertices, faces = Hemisphere().mesh(500)
+    whole = LaplaceBeltrami.from_mesh(vertices, faces)
+    for name in ("galerkin.pair.ROWS", "galerkin.prolongation.AT_ONCE", "stencils.shape.AT_ONCE"):
+        monkeypatch.setattr(f"torchlb.{name}", 70)
+    for module in ("assembly", "curving"):
+        monkeypatch.setattr(f"torchlb.galerkin.{module}.CHUNK", 70)
+    parts = LaplaceBeltrami.from_mesh(vertices, faces)
+    assert whole.weak_col.equal(parts.weak_col)
+    for one, two in zip(whole.weak_values, parts.weak_values, strict=True):
+        assert (one - two).abs().max() < 1e-12 * one.abs().max()
+
+
 def test_report_of_the_pair():
     """All edges of a resolved sphere are curved, its fits of degree 4; the numbers are in the printed report."""
     report = LaplaceBeltrami.from_mesh(*Sphere().mesh(500)).report
