@@ -9,6 +9,7 @@ import torch
 from scipy import special
 
 from builders import stencil_of_cloud, stencil_of_mesh
+from torchlb import LaplaceBeltrami
 from torchlb.geometry.boundary import boundary_of_mesh
 from torchlb.geometry.frames import mesh_frames
 from torchlb.linalg.sparse import to_scipy
@@ -190,6 +191,26 @@ def test_curved_boundaries(shape, condition, order):
         values, abscissa = spectrum(lb, 2)
         assert abscissa <= 1e-10 * lb.values.abs().max()
         assert abs(values[int(condition == "neumann")] / exact - 1) < 0.02
+
+
+@pytest.mark.parametrize(("condition", "bound"), [("neumann", 0.05), ("dirichlet", 0.25)])
+@pytest.mark.parametrize("order", [1, 3, 5])
+def test_a_cylinder_of_rows_has_its_gradient_and_curvature_at_its_ends(order, condition, bound):
+    """Four or five rows of points do not determine a polynomial of degree 4 or 6 across them without the condition."""
+    u, z = torch.meshgrid(
+        torch.arange(60).double() * math.tau / 60, torch.linspace(0, 2, 20).double(), indexing="ij"
+    )
+    points = torch.stack([u.cos(), u.sin(), z], -1).view(-1, 3)
+    index = torch.arange(1200).view(60, 20)
+    a, b = index[:, :-1], index.roll(-1, 0)[:, :-1]
+    faces = torch.cat([torch.stack([a, b, b + 1], -1), torch.stack([a, b + 1, a + 1], -1)])
+    lb = LaplaceBeltrami.from_mesh(points, faces.view(-1, 3), order=order, condition=condition)
+    slope = lb.gradient(points[:, 2])
+    torch.testing.assert_close(
+        slope, torch.tensor([[0, 0, 1.0]]).double().expand(1200, 3), atol=2e-3, rtol=0
+    )
+    bend = torch.tensor([-1.0, -1, 0], dtype=torch.float64) * points
+    torch.testing.assert_close(lb.mean_curvature_normal(), bend, atol=bound, rtol=0)
 
 
 def test_conormals_of_disk_and_hemisphere():

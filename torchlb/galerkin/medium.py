@@ -10,7 +10,6 @@ import torch
 from jaxtyping import Float, Int
 from scipy import sparse
 from torch import Tensor
-from torch.autograd.function import once_differentiable
 
 from torchlb.galerkin.assembly import CHUNK, area_element, element_matrices, flat_metric, summed
 from torchlb.galerkin.curving import Surface, curve
@@ -18,6 +17,7 @@ from torchlb.galerkin.elements import Element, triangle
 from torchlb.galerkin.nodes import lagrange_nodes
 from torchlb.galerkin.prolongation import prolongation
 from torchlb.geometry.numbering import Numbering
+from torchlb.linalg.once import once_differentiable
 
 
 @dataclass(frozen=True)

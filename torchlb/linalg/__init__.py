@@ -4,5 +4,5 @@
 eigenpairs of a symmetric pencil. `conjugate_gradients`: solves with many right-hand sides. `two_levels`: their
 preconditioner. `krylov`: null vectors and negative directions of matrices too large to factor, by multigrid, GMRES and
 conjugate gradients. `spectral_bounds`: where the spectrum of an operator lies. `exponential`: e^{tL}x by Chebyshev
-series or by a contour integral, with derivatives.
+series or by a contour integral, with derivatives. `once`: an error for second derivatives, where there are none.
 """

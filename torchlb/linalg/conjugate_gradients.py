@@ -28,7 +28,7 @@ def conjugate_gradients(
 
     Raises
     ------
-    DiffusionError : where that is not reached in `max_steps`.
+    DiffusionError : where that is not reached in `max_steps`, and for a b that is not finite.
 
     >>> a = torch.tensor([[2.0, 1.0], [1.0, 3.0]])
     >>> x, steps = conjugate_gradients(lambda v: a @ v, torch.tensor([[3.0], [4.0]]), lambda r: r, tolerance=1e-5)
@@ -38,6 +38,8 @@ def conjugate_gradients(
     x, r = torch.zeros_like(b), b
     z = precondition(r)
     p, square = z, (r * z).sum(0)
+    if not bool(square.isfinite().all()):
+        raise DiffusionError("conjugate gradients: the right-hand side has NaN or infinite values")
     enough = tolerance**2 * square
     for step in range(max_steps):
         if bool((square <= enough).all()):

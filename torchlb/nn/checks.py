@@ -27,6 +27,13 @@ def check_shape(x: Tensor, lb: LaplaceBeltrami) -> None:
         )
 
 
+def as_columns(f: Tensor, lb: LaplaceBeltrami) -> Tensor:
+    """(N, C) or (B, N, C) of the f of a user, which may be (N,), too; errors as for `check_shape`."""
+    x = f[:, None] if isinstance(f, Tensor) and f.ndim == 1 else f
+    check_shape(x, lb)
+    return x
+
+
 def as_times(t: float | Tensor, x: Tensor, dtype: torch.dtype) -> Tensor:
     """Times for the channels of x, (C,); InputError unless they are one or C, finite and at least 0.
 

@@ -79,6 +79,8 @@ def conducting(lb: LaplaceBeltrami, conductivity: Tensor) -> Conducting:
     ------
     InputError : for another shape, values that are not positive, and operators that are not of a triangle mesh.
     """
+    if not isinstance(conductivity, Tensor):
+        raise TypeError(f"conductivity: expected a tensor, got {type(conductivity)}")
     medium = medium_of(lb)
     kappa = conductivity.detach().cpu().double()
     if kappa.shape not in ((lb.num_points,), (len(medium.faces),)):

@@ -20,7 +20,7 @@ from torch.nn.functional import softplus
 
 from torchlb.errors import DiffusionError
 from torchlb.linalg.exponential import heat
-from torchlb.nn.checks import as_times, check_choice, check_features, check_shape
+from torchlb.nn.checks import as_columns, as_times, check_choice, check_features
 from torchlb.nn.pair_flow import pair_flow
 from torchlb.operator.laplace_beltrami import LaplaceBeltrami
 from torchlb.spectral.eigenbasis import Eigenbasis
@@ -70,8 +70,7 @@ def heat_flow(
     True
     """
     method = checked_method(method or ("contour" if lb.has_weak_form else "deflated"))
-    x = f[:, None] if f.ndim == 1 else f
-    check_shape(x, lb)
+    x = as_columns(f, lb)
     dtype = torch.promote_types(torch.promote_types(x.dtype, lb.values.dtype), torch.float32)
     time = as_times(t, x, dtype)
     with torch.autocast(x.device.type, enabled=False):

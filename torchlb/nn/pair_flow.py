@@ -16,8 +16,8 @@ import torch
 from jaxtyping import Float
 from numpy.polynomial import chebyshev
 from torch import Tensor
-from torch.autograd.function import once_differentiable
 
+from torchlb.linalg.once import once_differentiable
 from torchlb.linalg.sparse import multiply
 from torchlb.nn.checks import uncompiled
 from torchlb.nn.systems import PairSystem, system

@@ -7,11 +7,11 @@ from typing import Any
 import torch
 from jaxtyping import Float
 from torch import Tensor
-from torch.autograd.function import once_differentiable
 
 from torchlb.errors import InputError
+from torchlb.linalg.once import once_differentiable
 from torchlb.linalg.sparse import csr_product
-from torchlb.nn.checks import as_times, check_shape, uncompiled
+from torchlb.nn.checks import as_columns, as_times, uncompiled
 from torchlb.nn.conduction import Conducting, conducting
 from torchlb.nn.systems import solve_columns
 from torchlb.operator.laplace_beltrami import LaplaceBeltrami
@@ -61,8 +61,7 @@ def implicit_step(
     >>> bool((u - vertices[:, 2] / 2).abs().max() < 1e-4)
     True
     """
-    x = f[:, None] if f.ndim == 1 else f
-    check_shape(x, lb)
+    x = as_columns(f, lb)
     columns, time = _columns(x, as_times(t, x, torch.float64))
     given, poured = (_data(lb, d, n, f) for d, n in ((boundary_values, 0), (flux, 1)))
     medium = lb if conductivity is None else conducting(lb, conductivity)
@@ -100,8 +99,7 @@ def poisson_solve(
     >>> bool((u - vertices[:, 2] / 2).abs().max() < 1e-4)
     True
     """
-    x = f[:, None] if f.ndim == 1 else f
-    check_shape(x, lb)
+    x = as_columns(f, lb)
     columns, _ = _columns(x, None)
     given, poured = (_data(lb, d, n, f) for d, n in ((boundary_values, 0), (flux, 1)))
     medium = lb if conductivity is None else conducting(lb, conductivity)
@@ -174,12 +172,14 @@ def _data(lb: LaplaceBeltrami, data: Tensor | float | None, kind: int, f: Tensor
     name = ("boundary_values", "flux")[kind]
     if not lb.has_weak_form:
         raise InputError(f"{name}: a stencil has no place for them; build from a triangle mesh")
-    if kind == 0 and lb.fixed is None:
-        raise InputError(
-            "boundary_values: no Dirichlet condition; build with condition='dirichlet'"
-        )
-    if kind == 1 and len(lb.weak_values) < 3:
-        raise InputError("flux: the shape is closed; it has no boundary that one could pass")
+    counts = torch.zeros(lb.num_points, dtype=torch.bool, device=f.device)
+    if kind == 0 and lb.fixed is not None:
+        counts = lb.fixed
+    elif kind == 1 and len(lb.weak_values) == 3:
+        counts = _product(lb, 2, torch.ones_like(lb.mass.double())[:, None])[:, 0] > 0
+        counts = counts if lb.fixed is None else counts & ~lb.fixed
+    if not bool(counts.any()):
+        raise InputError(f"{name}: {_missing(lb, kind)}")
     values = torch.as_tensor(data, dtype=torch.float64, device=f.device)
     try:
         values = values.expand(f.shape)
@@ -189,7 +189,16 @@ def _data(lb: LaplaceBeltrami, data: Tensor | float | None, kind: int, f: Tensor
         ) from error
     values = values[:, None] if f.ndim == 1 else values
     columns, _ = _columns(values, None)
-    return columns * lb.fixed[:, None] if kind == 0 and lb.fixed is not None else columns
+    return torch.where(counts[:, None], columns, 0.0)
+
+
+def _missing(lb: LaplaceBeltrami, kind: int) -> str:
+    """Why there is no point for Dirichlet values (kind 0) or for fluxes (1)."""
+    if len(lb.weak_values) < 3:
+        return "the shape is closed; it has no boundary for them"
+    if kind == 0:
+        return "no Dirichlet condition; build with condition='dirichlet'"
+    return "a Dirichlet condition holds along the whole boundary; pass a mask as `boundary` that leaves some of it"
 
 
 def _product(lb: LaplaceBeltrami | Conducting, number: int, x: Tensor) -> Tensor:

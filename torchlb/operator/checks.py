@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import operator
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -39,6 +40,8 @@ def check_points(points: ArrayLike, what: str = "points") -> Float[Tensor, "N n"
         points = as_tensor(points)
     except (TypeError, ValueError, RuntimeError) as error:
         hint = "; a mesh goes to from_trimesh" if hasattr(points, "faces") else ""
+        if isinstance(points, str | Path):
+            hint = "; trimesh.load_mesh reads a file, and from_trimesh takes what it gives"
         raise InputError(
             f"{what}: expected an (N, n) tensor or array, got {type(points)}{hint}"
         ) from error

@@ -38,7 +38,11 @@ class StencilFace(OperatorStorage):
         return StencilReport(order, self.dim, **fields, surface=self.surface)
 
     def forward(self, f: Float[Tensor, "*batch N C"] | Float[Tensor, " N"]) -> Tensor:
-        """Δf, of the shape of f: (N,), (N, C) or (B, N, C) on one surface. Units of f by 1/ℓ²."""
+        """Δf, of the shape of f: (N,), (N, C) or (B, N, C) on one surface. Units of f by 1/ℓ².
+
+        Near a boundary that of functions which satisfy its condition, ∂f/∂ν = 0 or f = 0; of any other it is far off
+        there, and `divergence(gradient(f))` is right.
+        """
         return self._apply_rows(self.values, f)
 
     def __matmul__(self, f: Tensor) -> Tensor:
@@ -115,5 +119,14 @@ class StencilFace(OperatorStorage):
         return (result + result.transpose(1, 2)) / 2
 
     def mean_curvature_normal(self) -> Float[Tensor, "N n"]:
-        """Δx, 1/ℓ: the mean-curvature vector, −(κ₁ + κ₂) times the outer normal; −2x on the unit sphere."""
-        return self(self.points)
+        """Δx, 1/ℓ: the mean-curvature vector, −(κ₁ + κ₂) times the outer normal; −2x on the unit sphere.
+
+        Where rows of Δ hold a point of the boundary, and with it a condition that x does not satisfy, it is div ∇x.
+        """
+        normal = self(self.points)
+        if self.boundary is None:
+            return normal
+        row = torch.arange(self.num_points, device=self.col.device)
+        row = row.repeat_interleave(self.crow.diff())[self.boundary[self.col]]
+        free = torch.ones_like(self.boundary).index_fill(0, row, False)[:, None]
+        return torch.where(free, normal, self.divergence(self.gradient(self.points)))

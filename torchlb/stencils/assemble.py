@@ -26,6 +26,8 @@ from torchlb.stencils.rows import Reason, Rows, matrix_rows, stencil_rows
 from torchlb.stencils.shape import Shape
 
 RULES = list(WEIGHT_RULES)
+MAX_SLOPE = 30.0
+"""ρ Σ|w| of a first derivative beside a boundary; where points lie well it has 5 to 15."""
 
 
 class Stencils:
@@ -118,7 +120,8 @@ class Stencils:
         """Δ by a fit that uses the condition; first derivatives by one that does not, to serve any f.
 
         By straight projection, where the derivative along a conormal is its component in the plane. Splines have no
-        such form; least squares stands in for them.
+        such form; least squares stands in for them. Points in a few lines along the boundary hardly determine what the
+        data did: first derivatives are those of the highest degree that they do.
         """
         points, frames, degree = self.shape.points, self.shape.frames, candidate.degree
         boundary, share = self.shape.boundary, self.shape.condition.share
@@ -129,13 +132,16 @@ class Stencils:
         rule = positive_weights if candidate.rule == "positive" else least_squares_weights
         weights = rule(coords, degree, flux=flux, share=share)
         heights = self._heights(centers, index, coords)
-        free = least_squares_weights(coords, degree, heights=heights)
-        usable = (free.residual <= MAX_RESIDUAL)[:, None, None]
-        return replace(
-            weights,
-            gradient=torch.where(usable, free.gradient, weights.gradient),
-            height_residual=free.height_residual,
-        )
+        free = part = least_squares_weights(coords, degree, heights=heights)
+        gradient, left = free.gradient.clone(), torch.arange(len(centers))
+        for lower in range(degree - 1, 0, -1):
+            slope = part.radius * part.gradient.abs().sum(1).amax(1)
+            left = left[~((part.residual <= MAX_RESIDUAL) & (slope <= MAX_SLOPE))]
+            if len(left) == 0:
+                break
+            part = least_squares_weights(coords[left], lower)
+            gradient[left] = part.gradient
+        return replace(weights, gradient=gradient, height_residual=free.height_residual)
 
     def _heights(self, centers: Tensor, index: Tensor, coords: Tensor) -> Float[Tensor, "B K n"]:
         """What a polynomial must follow: heights over the points of the plane that the coordinates name, on a mesh.

@@ -1,0 +1,47 @@
+"""Derivatives that exist once."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import wraps
+from typing import Any
+
+import torch
+from torch import Tensor
+
+
+def once_differentiable(backward: Callable[..., Any]) -> Callable[..., Any]:
+    """As torch's decorator of that name, but whoever asks for second derivatives gets the error whichever way he asks.
+
+    Torch's error stands at a leaf of its own, which `torch.autograd.grad` and `functional.hessian` do not come to on
+    their way to an input: they take the second derivative for zero.
+    """
+
+    @wraps(backward)
+    def called(ctx: Any, *grads: Any) -> Any:
+        with torch.no_grad():
+            found = backward(ctx, *(g.detach() if isinstance(g, Tensor) else g for g in grads))
+        if not torch.is_grad_enabled():
+            return found
+        inputs = [t for t in (*grads, *ctx.saved_tensors) if t is not None and t.requires_grad]
+        found = found if isinstance(found, tuple) else (found,)
+        return tuple(_last(v, *inputs) if isinstance(v, Tensor) else v for v in found)
+
+    return called
+
+
+class _Last(torch.autograd.Function):
+    """Its first argument, which depends on the others in a way that cannot be differentiated."""
+
+    @staticmethod
+    def forward(ctx: Any, value: Tensor, *inputs: Tensor) -> Tensor:  # pyright: ignore[reportIncompatibleMethodOverride]
+        return value.clone()
+
+    @staticmethod
+    def backward(ctx: Any, *grads: Any) -> Any:
+        raise RuntimeError(
+            "second derivatives of a solve, of heat flow or of a conductivity: they are differentiable once"
+        )
+
+
+_last: Any = _Last.apply
