@@ -26,7 +26,7 @@ from torchlb.stencils.rows import Reason, Rows, matrix_rows, stencil_rows
 from torchlb.stencils.shape import Shape
 
 RULES = list(WEIGHT_RULES)
-MAX_SLOPE = 30.0
+GRADIENT_GROWTH = 30.0
 """ρ Σ|w| of a first derivative beside a boundary; where points lie well it has 5 to 15."""
 
 
@@ -136,7 +136,7 @@ class Stencils:
         gradient, left = free.gradient.clone(), torch.arange(len(centers))
         for lower in range(degree - 1, 0, -1):
             slope = part.radius * part.gradient.abs().sum(1).amax(1)
-            left = left[~((part.residual <= MAX_RESIDUAL) & (slope <= MAX_SLOPE))]
+            left = left[~((part.residual <= MAX_RESIDUAL) & (slope <= GRADIENT_GROWTH))]
             if len(left) == 0:
                 break
             part = least_squares_weights(coords[left], lower)
