@@ -73,6 +73,7 @@ def main():
         plt.savefig(options.output / "loss.png", dpi=130)
         print(f"loss {losses[0]:.4f} → {losses[-1]:.4f}; {options.output / 'loss.png'}")
     if processes > 1:
+        dist.barrier()  # nobody leaves while another still draws
         dist.destroy_process_group()
 
 

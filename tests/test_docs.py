@@ -12,7 +12,7 @@ import torch
 import torchlb
 import torchlb.interop.trimesh
 from torchlb import DiffusionNet, LaplaceBeltrami
-from torchlb.surfaces import Circle, Sphere
+from torchlb.surfaces import Circle, Sphere, UnitDisk
 
 ROOT = Path(__file__).parents[1]
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
@@ -101,6 +101,12 @@ TRIGGERS = {
         LaplaceBeltrami.from_points(VERTICES, order=1, weak_form=False).stiffness
     ),
     "batch: not all": mixed_batch,
+    "boundary_values: no": lambda: torchlb.poisson_solve(
+        LaplaceBeltrami.from_mesh(*UnitDisk().mesh(100)), torch.zeros(100), boundary_values=1.0
+    ),
+    "boundary_values: the": lambda: torchlb.poisson_solve(
+        LaplaceBeltrami.from_mesh(VERTICES, FACES), 0 * VERTICES[:, 0], boundary_values=1.0
+    ),
     "…: not a mesh": lambda: (
         Path("shape.obj").write_text("nothing"),
         torchlb.interop.trimesh.read_shape("shape.obj"),
@@ -113,7 +119,7 @@ TRIGGERS = {
     "rotations need": circle_network,
 }
 # Hard to provoke on purpose; that the source has the words is checked instead.
-IN_THE_SOURCE = ("cotangent operator:", "… points have neither", "boundary_values: no")
+IN_THE_SOURCE = ("cotangent operator:", "… points have neither")
 
 
 def quoted_messages():

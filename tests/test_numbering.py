@@ -1,14 +1,19 @@
 """Points are built in the order of a k-d tree: neither results nor messages show it."""
 
+import math
+
 import pytest
 import torch
 
-from torchlb import LaplaceBeltrami
+from torchlb import LaplaceBeltrami, implicit_step
 from torchlb.errors import InputError, first_few, renumbered
+from torchlb.geometry.frames import mesh_frames
+from torchlb.geometry.neighbors import GraphBalls, mesh_graph
 from torchlb.geometry.numbering import Numbering
+from torchlb.geometry.vertex_fits import VertexFits
 from torchlb.linalg.sparse import to_scipy
 from torchlb.stencils.rows import matrix_rows
-from torchlb.surfaces import Sphere, UnitDisk
+from torchlb.surfaces import Hemisphere, Sphere, UnitDisk
 
 
 def test_near_points_are_near_in_the_order_of_the_tree():
@@ -59,6 +64,62 @@ def test_every_tensor_has_the_users_numbers():
     length = lb.boundary_mass.to_dense().sum(1)
     assert (length[~lb.boundary].abs() < 1e-12).all()
     assert length[lb.boundary].sum() == pytest.approx(2 * torch.pi, rel=1e-4)
+
+
+def circle(order):
+    angle = torch.rand(150, generator=torch.Generator().manual_seed(0)).double() * math.tau
+    points = torch.stack([angle.cos(), angle.sin()], 1)
+    return LaplaceBeltrami.from_points(points[order], dim=1)
+
+
+def cloud(order):
+    points = Sphere().random_points(400)
+    return LaplaceBeltrami.from_points(points[order], normals=-points[order])
+
+
+def hemisphere(order, condition="dirichlet"):
+    vertices, faces = Hemisphere().mesh(400)
+    return LaplaceBeltrami.from_mesh(vertices[order], order.argsort()[faces], condition=condition)
+
+
+@pytest.mark.parametrize(("build", "count"), [(circle, 150), (cloud, 400), (hemisphere, 400)])
+def test_the_order_of_the_points_does_not_matter(build, count):
+    """Rows, certificate, pair, frames, masses, surface and report are those of the same points."""
+    order = torch.randperm(count, generator=torch.Generator().manual_seed(1))
+    one, two = build(torch.arange(count)), build(order)
+    for name in ("matrix", *(["stiffness", "mass_matrix"] if one.has_weak_form else [])):
+        given, shuffled = (getattr(lb, name).to_dense() for lb in (one, two))
+        torch.testing.assert_close(given[order][:, order], shuffled, rtol=1e-12, atol=1e-12)
+    for name in ("mass", "frames", "normals", "boundary", "fixed"):
+        given, shuffled = getattr(one, name), getattr(two, name)
+        assert (given is None) is (shuffled is None)
+        assert given is None or given[order].equal(shuffled)
+    assert one.report.order[order].equal(two.report.order)
+    if one.faces is not None:
+        faces = [faces.sort(1).values.tolist() for faces in (one.faces, order[two.faces])]
+        assert sorted(faces[0]) == sorted(faces[1])
+
+
+def test_a_conductivity_has_the_users_numbers():
+    """That of the vertices and that of the faces, also where these are shuffled."""
+    order = torch.randperm(400, generator=torch.Generator().manual_seed(1))
+    one = hemisphere(torch.arange(400), "neumann")
+    two = hemisphere(order, "neumann")
+    f, kappa = one.points[:, 0], 1 + one.points[:, 1].square()
+    of_faces = kappa[one.faces].mean(1)
+    for given, shuffled in ((kappa, kappa[order]), (of_faces, of_faces)):
+        u = implicit_step(one, f, 0.1, conductivity=given)
+        v = implicit_step(two, f[order], 0.1, conductivity=shuffled)
+        torch.testing.assert_close(u[order], v)
+
+
+def test_fits_are_handed_over_once():
+    vertices, faces = UnitDisk().mesh(100)
+    balls = GraphBalls(vertices, mesh_graph(faces, 100), mesh_frames(vertices, faces))
+    fits = VertexFits(balls, (2,)).complete(balls)
+    assert sum(len(part.vertices) for part in fits.hand_over()) == int((fits.degree > 0).sum()) > 90
+    with pytest.raises(RuntimeError, match="before"):
+        fits.hand_over()
 
 
 def test_messages_name_points_as_the_user_does():

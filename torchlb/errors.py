@@ -20,7 +20,9 @@ __all__ = [
     "StabilityWarning",
     "StencilError",
     "TorchlbError",
+    "as_given",
     "first_few",
+    "renumbered",
     "warn",
 ]
 HERE = str(Path(__file__).parent)
@@ -82,7 +84,7 @@ def as_given(index: Any) -> Any:
 
 
 def first_few(index: Any, limit: int = 8) -> str:
-    """The first of an array of indices, for a message."""
+    """The smallest of an array of points, by the user's numbers, for a message."""
     names = sorted(as_given(index).tolist())[:limit]
     return ", ".join(map(str, names)) + (", …" if len(index) > limit else "")
 

@@ -118,7 +118,9 @@ def weak_pair(
     del surface.fits.heights
     linear = _linear(mesh.lengths, faces, count)
     if degree == 1:
-        return WeakPair(stored(sparse.triu(linear)), mass=torch.from_numpy(_row_sums(linear)))
+        return WeakPair(
+            stored(sparse.triu(linear), None, numbering), mass=torch.from_numpy(_row_sums(linear))
+        )
     p = prolongation(surface, mesh)
     blocks = element_matrices(metric, triangle(degree))
     del metric

@@ -150,7 +150,7 @@ class Tetrahedra:
         normals: Float[np.ndarray, "N 3"],
         spacing: Float[np.ndarray, " N"],
     ) -> Tetrahedra:
-        """Those of a cloud that lies in no plane; `spacing`, ℓ, to the nearest other point.
+        """Those of a cloud that lies in no plane; its normals, unit, and `spacing`, ℓ, to the nearest other point.
 
         Points are moved a little for it, mostly along the surface: many on one sphere are one cell with as many
         corners, which takes Qhull a time quadratic in their number (7,000: 15 s, moved 0.3 s).

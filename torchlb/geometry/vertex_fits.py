@@ -29,6 +29,10 @@ LEAST = 1.5
 """Neighbours per polynomial without which a fit is not tried."""
 
 
+ROOM = 2**14
+"""Fits in a pile, some 40 MB at degree 4."""
+
+
 class Fits(NamedTuple):
     """Fits of one degree to as many points each.
 
@@ -49,7 +53,7 @@ class Fits(NamedTuple):
 class _Pile:
     """Room for fits of one degree and size, of which only what is filled takes memory.
 
-    In one piece each: thousands of arrays that stay, between those that come and go, would scatter the memory.
+    In large pieces: thousands of arrays that stay, between those that come and go, would scatter the memory.
     """
 
     def __init__(self, degree: int, room: int, size: int, terms: int, like: Tensor) -> None:
@@ -106,12 +110,15 @@ class VertexFits:
         self.radius = points.new_ones(count)
         self.size = torch.zeros_like(self.degree)
         self.reason = torch.ones_like(self.degree)
-        self._piles: dict[tuple[int, int], _Pile] = {}
+        self._piles: dict[tuple[int, int], list[_Pile]] = {}
 
     def hand_over(self) -> list[Fits]:
         """The fits, those of one degree and size together; being large, they are not kept."""
-        piles, self._piles = self._piles, {}
-        return [pile.fits for pile in piles.values()]
+        found = [pile.fits for piles in self._piles.values() for pile in piles]
+        if not found and self.degree.any():
+            raise RuntimeError("the fits were handed over before")
+        self._piles.clear()
+        return found
 
     def take(
         self,
@@ -132,10 +139,11 @@ class VertexFits:
         if not good.any():
             return
         kept, coefficients, kind = vertices[good], fit.coefficients[good], (degree, index.shape[1])
-        if kind not in self._piles:
-            room = int((self.degree == 0).sum())
-            self._piles[kind] = _Pile(degree, room, index.shape[1], terms, coefficients)
-        self._piles[kind].add(kept, index[good], coefficients)
+        piles = self._piles.setdefault(kind, [])
+        if not piles or piles[-1].filled + len(kept) > len(piles[-1].vertices):
+            room = max(len(kept), min(ROOM, int((self.degree == 0).sum())))
+            piles.append(_Pile(degree, room, index.shape[1], terms, coefficients))
+        piles[-1].add(kept, index[good], coefficients)
         self.degree[kept], self.size[kept] = kind
         self.heights[kept, :terms] = coefficients @ heights[good]
         self.radius[kept] = fit.radius[good]

@@ -172,13 +172,11 @@ def _data(lb: LaplaceBeltrami, data: Tensor | float | None, kind: int, f: Tensor
     name = ("boundary_values", "flux")[kind]
     if not lb.has_weak_form:
         raise InputError(f"{name}: a stencil has no place for them; build from a triangle mesh")
-    counts = torch.zeros(lb.num_points, dtype=torch.bool, device=f.device)
-    if kind == 0 and lb.fixed is not None:
-        counts = lb.fixed
-    elif kind == 1 and len(lb.weak_values) == 3:
+    fixed = torch.zeros_like(lb.mass, dtype=torch.bool) if lb.fixed is None else lb.fixed
+    counts = fixed
+    if kind == 1 and len(lb.weak_values) == 3:
         counts = _product(lb, 2, torch.ones_like(lb.mass.double())[:, None])[:, 0] > 0
-        counts = counts if lb.fixed is None else counts & ~lb.fixed
-    if not bool(counts.any()):
+    if not bool((counts & ~fixed if kind == 1 else counts).any()):
         raise InputError(f"{name}: {_missing(lb, kind)}")
     values = torch.as_tensor(data, dtype=torch.float64, device=f.device)
     try:

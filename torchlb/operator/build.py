@@ -143,8 +143,8 @@ class AssembledOperator:
         return cls(rows, *of_shape, pair, faces, source, options, certificate)
 
     def restored(self, numbering: Numbering) -> AssembledOperator:
-        """From a numbering to the user's; all but the matrices of the pair and the faces, which have that."""
-        names = "points", "frames", "normals", "normal_order", "mass", "on_boundary"
+        """From a numbering to the user's; the matrices of the pair, the faces and the points have that already."""
+        names = "frames", "normals", "normal_order", "mass", "on_boundary"
         tensors = {name: getattr(self, name) for name in names}
         values = {name: numbering.restored(t) for name, t in tensors.items() if t is not None}
         pair = self.pair
