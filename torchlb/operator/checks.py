@@ -203,9 +203,14 @@ def check_faces(faces: ArrayLike, num_points: int) -> Int[Tensor, "F v"]:
     faces = faces.detach().to("cpu", torch.int64)
     bad = ((faces < 0) | (faces >= num_points)).any(1).nonzero()[:, 0]
     if len(bad):
+        hint = (
+            "; they count from 1: subtract 1"
+            if faces.min() == 1 and faces.max() == num_points
+            else ""
+        )
         raise InputError(
             f"faces: {len(bad)} of them ({first_few(bad)}) have indices outside 0 … {num_points - 1}: "
-            f"face {int(bad[0])} is {faces[bad[0]].tolist()}"
+            f"face {int(bad[0])} is {faces[bad[0]].tolist()}{hint}"
         )
     used = torch.zeros(num_points, dtype=torch.bool)
     used[proper_faces(faces).reshape(-1)] = True
