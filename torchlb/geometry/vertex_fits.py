@@ -29,8 +29,8 @@ LEAST = 1.5
 """Neighbours per polynomial without which a fit is not tried."""
 
 
-ROOM = 2**14
-"""Fits in a pile, some 40 MB at degree 4."""
+ROOM = 2**18
+"""Fits in a pile, 0.7 GB at degree 4: pieces below 32 MB would stay with glibc, and scatter its memory."""
 
 
 class Fits(NamedTuple):
