@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import numpy as np
 import torch
 from jaxtyping import Float, Int
 from scipy.spatial import KDTree
@@ -29,8 +30,10 @@ class Numbering:
 
     @classmethod
     def along_tree(cls, points: Float[Tensor, "N n"]) -> Numbering:
-        """The order of the leaves of a k-d tree of one point each: but for ties it does not depend on the one given."""
-        given = torch.from_numpy(KDTree(points.numpy(), leafsize=1).indices.astype("int64"))
+        """The order of the leaves of a k-d tree, the same however the points are numbered: they go in sorted."""
+        places = points.numpy()
+        first = np.lexsort(places.T)
+        given = torch.from_numpy(first[KDTree(places[first]).indices])
         return cls(given, torch.empty_like(given).scatter_(0, given, torch.arange(len(given))))
 
     def sorted(self, values: Tensor) -> Tensor:
