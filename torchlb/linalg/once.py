@@ -18,13 +18,12 @@ def once_differentiable(backward: Callable[..., Any]) -> Callable[..., Any]:
     """
 
     @wraps(backward)
-    def called(ctx: Any, *grads: Any) -> Any:
+    def called(ctx: Any, *grads: Tensor) -> tuple[Any, ...]:
         with torch.no_grad():
-            found = backward(ctx, *(g.detach() if isinstance(g, Tensor) else g for g in grads))
+            found = backward(ctx, *(g.detach() for g in grads))
         if not torch.is_grad_enabled():
             return found
         inputs = [t for t in (*grads, *ctx.saved_tensors) if t is not None and t.requires_grad]
-        found = found if isinstance(found, tuple) else (found,)
         return tuple(_last(v, *inputs) if isinstance(v, Tensor) else v for v in found)
 
     return called

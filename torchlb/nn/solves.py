@@ -173,9 +173,7 @@ def _data(lb: LaplaceBeltrami, data: Tensor | float | None, kind: int, f: Tensor
     if not lb.has_weak_form:
         raise InputError(f"{name}: a stencil has no place for them; build from a triangle mesh")
     fixed = torch.zeros_like(lb.mass, dtype=torch.bool) if lb.fixed is None else lb.fixed
-    counts = fixed
-    if kind == 1 and len(lb.weak_values) == 3:
-        counts = _product(lb, 2, torch.ones_like(lb.mass.double())[:, None])[:, 0] > 0
+    counts = _on_rim(lb) if kind == 1 else fixed
     if not bool((counts & ~fixed if kind == 1 else counts).any()):
         raise InputError(f"{name}: {_missing(lb, kind)}")
     values = torch.as_tensor(data, dtype=torch.float64, device=f.device)
@@ -188,6 +186,13 @@ def _data(lb: LaplaceBeltrami, data: Tensor | float | None, kind: int, f: Tensor
     values = values[:, None] if f.ndim == 1 else values
     columns, _ = _columns(values, None)
     return torch.where(counts[:, None], columns, 0.0)
+
+
+def _on_rim(lb: LaplaceBeltrami) -> Tensor:
+    """(N,), which points an edge of the boundary touches."""
+    if len(lb.weak_values) < 3:
+        return torch.zeros_like(lb.mass, dtype=torch.bool)
+    return _product(lb, 2, torch.ones_like(lb.mass.double())[:, None])[:, 0] > 0
 
 
 def _missing(lb: LaplaceBeltrami, kind: int) -> str:

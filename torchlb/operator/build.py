@@ -186,9 +186,10 @@ def build_cloud(
     here = numbering.sorted(points)
     if isinstance(where, Tensor):
         where = numbering.sorted(where)
+    if normals is not None:
+        normals = numbering.sorted(normals)
     settings = {"num_neighbors": options.num_neighbors, "condition": options.held}
-    settings |= {"normals": None if normals is None else numbering.sorted(normals)}
-    settings |= {"progress": progress}
+    settings |= {"normals": normals, "progress": progress}
     with renumbered(numbering.given):
         if on_surface:
             built = _build_on_surface(here, options, where, settings, numbering)
