@@ -70,9 +70,9 @@ def test_stiffness_is_symmetric_and_positive_for_any_conductivity(kind):
         assert torch.linalg.eigvalsh(dense).min() >= -1e-10 * scale
     flat = Medium.linear(lb.points, lb.faces)
     ones = torch.ones(80, dtype=torch.float64)
-    matrix = flat.stiffness(flat.at_gauss_points(ones)).toarray()
+    upper = flat.stiffness(flat.at_gauss_points(ones)).toarray()
     cotangent = LaplaceBeltrami.from_cotangent(lb.points, lb.faces).stiffness.to_dense()
-    torch.testing.assert_close(torch.from_numpy(matrix), cotangent, rtol=0, atol=1e-10)
+    torch.testing.assert_close(torch.from_numpy(upper), cotangent.triu(), rtol=0, atol=1e-10)
 
 
 @every_kind

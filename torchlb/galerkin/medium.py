@@ -15,6 +15,7 @@ from torchlb.galerkin.assembly import CHUNK, area_element, element_matrices, fla
 from torchlb.galerkin.curving import Surface, curve
 from torchlb.galerkin.elements import Element, triangle
 from torchlb.galerkin.nodes import lagrange_nodes
+from torchlb.galerkin.pair import upper_product
 from torchlb.galerkin.prolongation import prolongation
 from torchlb.geometry.numbering import Numbering
 from torchlb.linalg.once import once_differentiable
@@ -76,11 +77,11 @@ class Medium:
         return (at_nodes[self.nodes] @ self.element.values.T).exp()
 
     def stiffness(self, conductivity: Float[Tensor, "F Q"]) -> sparse.csr_array:
-        """PᵀK_FE(κ)P; symmetric and positive semidefinite for every κ > 0, rows sum to zero."""
+        """Upper triangle of PᵀK_FE(κ)P, which is positive semidefinite for every κ > 0; its rows sum to zero."""
         p = self.prolongation
         blocks = element_matrices(self.metric, self.element, conductivity)
         elements = summed(blocks.real, self.nodes, p.shape[0])
-        return sparse.csr_array(p.T @ (elements @ p))
+        return upper_product(p, elements)
 
     def coarse_stiffness(self, conductivity: Float[Tensor, "F Q"]) -> sparse.csr_array:
         """K₁(κ) of linear elements on flat triangles, with the mean of κ on each: it preconditions."""

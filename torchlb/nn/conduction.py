@@ -91,8 +91,8 @@ def conducting(lb: LaplaceBeltrami, conductivity: Tensor) -> Conducting:
     if not bool(((kappa > 0) & kappa.isfinite()).all()):
         raise InputError(f"conductivity: expected finite, positive values, got {kappa.min():.3g}")
     at_gauss_points = medium.at_gauss_points(kappa)
-    mass = _mass(lb, lb.weak_crow, lb.weak_col, lb.weak_values)
-    pair = stored(sparse.triu(medium.stiffness(at_gauss_points) + 1j * mass))
+    mass = sparse.triu(_mass(lb, lb.weak_crow, lb.weak_col, lb.weak_values))
+    pair = stored(medium.stiffness(at_gauss_points) + 1j * mass)
     linear = pair
     if len(lb.linear_crow):
         coarse = medium.coarse_stiffness(at_gauss_points)

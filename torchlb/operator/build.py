@@ -257,6 +257,21 @@ def _warn_of_doubts(surface: CloudSurface, fits: VertexFits, mass: Float[Tensor,
         )
 
 
+def numbered_mesh(
+    points: Float[Tensor, "N n"], faces: Int[Tensor, "F v"], *, flip: bool
+) -> tuple[Numbering, Float[Tensor, "N n"], Int[Tensor, "F v"], Int[Tensor, " F"]]:
+    """A numbering, the mesh in it, and of each face its place among those given.
+
+    Folds and slivers are flipped away where there is to be a pair; for the stencil, too, whose neighbours and first
+    normals come from the faces.
+    """
+    numbering = Numbering.along_tree(points)
+    here, (corners, order) = numbering.sorted(points), numbering.faces(faces)
+    if flip:
+        corners = flipped(pad(here, (0, 3 - here.shape[1])), corners)
+    return numbering, here, corners, order
+
+
 def build_mesh(
     vertices: ArrayLike,
     faces: ArrayLike,
@@ -280,10 +295,7 @@ def build_mesh(
         )
     where = check_boundary(boundary, len(vertices))
     progress = progress and sys.stderr.isatty()
-    numbering = Numbering.along_tree(vertices)
-    here, (corners, _) = numbering.sorted(vertices), numbering.faces(corners)
-    if options.weak_form:  # for the stencil, too: who is whose neighbour, and the first normals
-        corners = flipped(pad(here, (0, 3 - here.shape[1])), corners)
+    numbering, here, corners, _ = numbered_mesh(vertices, corners, flip=degree > 0)
     with renumbered(numbering.given):
         shape = mesh_shape(
             here,

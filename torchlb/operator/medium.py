@@ -4,15 +4,12 @@ from __future__ import annotations
 
 from typing import Any
 
-from torch.nn.functional import pad
 from torch.utils.weak import WeakIdKeyDictionary
 
 from torchlb.errors import InputError
-from torchlb.galerkin.flips import flipped
 from torchlb.galerkin.medium import Medium
 from torchlb.galerkin.pair import fitted_surface
-from torchlb.geometry.numbering import Numbering
-from torchlb.operator.build import Options
+from torchlb.operator.build import Options, numbered_mesh
 from torchlb.operator.laplace_beltrami import LaplaceBeltrami
 from torchlb.stencils.shape import mesh_shape
 
@@ -43,10 +40,7 @@ def _made(lb: LaplaceBeltrami) -> Medium:
         return Medium.linear(points, faces)
     options = Options(**lb.options)
     degree, degrees = options.elements
-    numbering = Numbering.along_tree(points)  # as in the operator, whose fits break ties by it
-    points = numbering.sorted(points)
-    faces, order = numbering.faces(faces)
-    faces = flipped(pad(points, (0, 3 - points.shape[1])), faces)
+    numbering, points, faces, order = numbered_mesh(points, faces, flip=True)
     shape = mesh_shape(
         points,
         faces,
