@@ -18,9 +18,8 @@ from numpy.polynomial import chebyshev
 from torch import Tensor
 
 from torchlb.linalg.once import once_differentiable
-from torchlb.linalg.sparse import multiply
 from torchlb.nn.checks import uncompiled
-from torchlb.nn.systems import PairSystem, system
+from torchlb.nn.systems import PairSystem, pair_system
 from torchlb.operator.laplace_beltrami import LaplaceBeltrami
 
 SHORTEST = 5.0
@@ -73,8 +72,7 @@ def _summed(
         chosen = (level == exponent) & (times > 0)
         columns = torch.from_numpy(chosen).to(x.device)
         pole = 10.0**exponent
-        solver = system(lb, pole)
-        assert isinstance(solver, PairSystem)
+        solver = pair_system(lb)
         c, derivative = (
             torch.from_numpy(np.stack(part, 1)).to(x)
             for part in zip(
@@ -83,7 +81,7 @@ def _summed(
         )
         needed = int(c.any(1).sum())
         for k, v in enumerate(
-            _polynomials(solver, x[:, columns], needed, tolerance / 10, transposed)
+            _polynomials(solver, pole, x[:, columns], needed, tolerance / 10, transposed)
         ):
             result[:, columns] += c[k] * v
             slope[:, columns] += derivative[k] / pole * v
@@ -91,14 +89,15 @@ def _summed(
 
 
 def _polynomials(
-    solver: PairSystem, x: Tensor, count: int, tolerance: float, transposed: bool
+    solver: PairSystem, pole: float, x: Tensor, count: int, tolerance: float, transposed: bool
 ) -> Iterator[Tensor]:
     """T_k(2Z − 1)x for k < count; of Zᵀ if transposed."""
+    poles = torch.full_like(x[0], pole)
 
     def doubled(v: Tensor) -> Tensor:
         if transposed:
-            return 2 * multiply(*solver.pattern, solver.mass, solver.solve(v, tolerance)) - v
-        return 2 * solver.solve(multiply(*solver.pattern, solver.mass, v), tolerance) - v
+            return 2 * solver.mass_product(solver.solve(v, poles, tolerance)) - v
+        return 2 * solver.solve(solver.mass_product(v), poles, tolerance) - v
 
     if solver.free is not None and not transposed:
         x = x * solver.free

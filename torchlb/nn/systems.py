@@ -13,6 +13,8 @@ from __future__ import annotations
 import atexit
 import math
 from collections import OrderedDict
+from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -24,9 +26,9 @@ from torch import Tensor
 from torch.utils.weak import WeakIdKeyDictionary
 
 from torchlb.linalg.conjugate_gradients import conjugate_gradients
-from torchlb.linalg.factor import cholesky, factorized
-from torchlb.linalg.sparse import multiply
-from torchlb.linalg.two_levels import two_levels
+from torchlb.linalg.factor import Factor, cholesky, factorized
+from torchlb.linalg.sparse import multiply, to_scipy
+from torchlb.linalg.two_levels import absolute_row_sums, two_levels
 from torchlb.nn.conduction import Conducting
 from torchlb.operator.batching import shapes_of
 from torchlb.operator.laplace_beltrami import LaplaceBeltrami
@@ -36,7 +38,9 @@ KEPT = 8
 SINGULAR = 1e-6
 """Share of M₁ over the area that makes K₁ definite; constants, which it moves alone, are split off."""
 SPACING = 4.0
-"""Between the times of shared factors: M + tK and its factor's matrix then differ by less than that."""
+"""Between the times of shared factors: M + tK and its factor's matrix then differ by half of that at most."""
+SHORT = 0.1
+"""Times the entries of K, over those of M: what is shorter hardly changes M."""
 SINGLE, STIFFEST = 1e-5, 1e5
 """A tolerance from which on steps are taken in float32, unless the entries of M + tK sum to more than so many times the
 area: what is rounded there would show."""
@@ -44,16 +48,30 @@ TINY = 1e-300
 SHIFT = 1e-9
 """Of an inverted stencil that is singular, in units of its diagonal."""
 Operator = LaplaceBeltrami | Conducting
+Terms = list[tuple[Tensor, Tensor]]
 _SYSTEMS: Any = WeakIdKeyDictionary()
 atexit.register(_SYSTEMS.clear)  # cholespy reports factors that outlive Python as leaks
 
 
-def system(lb: Operator, t: float | None) -> PairSystem | StencilSystem:
-    """That of an implicit step of a time t, or of a Poisson problem for None."""
+def pair_system(lb: Operator) -> PairSystem:
+    """That of an operator with a weak pair, for all times."""
     kept = _SYSTEMS.setdefault(lb.values, OrderedDict())
-    key = t, lb.values.device
+    key = lb.values.device
     if key not in kept:
-        kept[key] = PairSystem(lb, t) if lb.has_weak_form else StencilSystem(lb, t)
+        kept[key] = PairSystem(lb)
+    return kept[key]
+
+
+def stencil_system(lb: Operator, t: float | None) -> StencilSystem:
+    """That of an implicit step of a time t, or of a Poisson problem for None, by the stencil."""
+    kept = _SYSTEMS.setdefault(lb.values, OrderedDict())
+    return _kept(kept, (t, lb.values.device), lambda: StencilSystem(lb, t))
+
+
+def _kept(kept: OrderedDict[Any, Any], key: Any, make: Callable[[], Any]) -> Any:
+    """What is kept under a key, made where it is not; what was not used for longest goes."""
+    if key not in kept:
+        kept[key] = make()
         if len(kept) > KEPT:
             kept.popitem(last=False)
     kept.move_to_end(key)
@@ -76,20 +94,14 @@ def solve_columns(
         blocks = zip(shapes, b.split([shape.num_points for shape in shapes]), strict=True)
         parts = [solve_columns(s, part, time, tolerance, transposed) for s, part in blocks]
         return torch.cat(parts)
+    time = None if time is None else time.detach()
+    if lb.has_weak_form:
+        return pair_system(lb).solve(b, time, tolerance)
     if time is None:
-        return system(lb, None).solve(b, tolerance, transposed)
-    time = time.detach()
-    level = time
-    if lb.has_weak_form and len(time.unique()) > 1:
-        level = SPACING ** (time.log() / math.log(SPACING)).ceil()
+        return stencil_system(lb, None).solve(b, transposed)
     u = torch.zeros_like(b, dtype=torch.float64)
-    for t in level.unique().tolist():
-        where = level == t
-        solver = system(lb, t)
-        options = {}
-        if isinstance(solver, PairSystem) and not bool((time[where] == t).all()):
-            options["times"] = time[where]
-        u[:, where] = solver.solve(b[:, where], tolerance, transposed, **options)
+    for t in time.unique().tolist():
+        u[:, time == t] = stencil_system(lb, t).solve(b[:, time == t], transposed)
     return u
 
 
@@ -123,36 +135,124 @@ class _Components:
 
 
 class PairSystem:
-    """K, or M + tK, of a weak pair."""
+    """K, and M + tK for every t, of a weak pair."""
 
-    def __init__(self, lb: Operator, t: float | None) -> None:
-        stiffness, mass = (v.detach().double() for v in lb.weak_values[:2])
-        crow, col, linear = lb.linear_pair
+    def __init__(self, lb: Operator) -> None:
+        self.stiffness, self.mass = (values.detach() for values in lb.weak_values[:2])
         self.pattern = lb.weak_crow, lb.weak_col
-        values = stiffness if t is None else mass + t * stiffness
-        self.stiffness, self.mass, self.singular = stiffness, mass, t is None
-        self.unit = values.abs().max()
-        self.values = values / self.unit
+        self.units = [values.abs().max().double() for values in (self.mass, self.stiffness)]
         self.free = None if lb.fixed is None else (~lb.fixed).double()[:, None]
         self.components = _Components(lb)
-        self.ones_mass = multiply(*self.pattern, mass, torch.ones_like(lb.mass.double())[:, None])
-        self.one = torch.ones_like(self.ones_mass)
+        self.one = torch.ones_like(lb.mass.double())[:, None]
+        self.ones_mass = self.mass_product(self.one)
         self.area = self.components.sums(self.one, self.ones_mass)
+        self.stiff = float(self.stiffness.double().abs().sum() / self.mass.double().sum())
+        self.smooths = len(lb.linear_crow) > 0  # the cotangent's pair is the linear one
         self.steps = 0
-        self.soft = not self.singular and bool(values.abs().sum() <= STIFFEST * mass.sum())
-        n = lb.num_points
-        first, second = (
-            sparse.csr_array(
-                (v.detach().double().cpu().numpy(), col.cpu().numpy(), crow.cpu().numpy()),
-                shape=(n, n),
-            )
-            for v in linear[:2]
+        crow, col, linear = lb.linear_pair
+        first, second = (to_scipy(crow, col, v.double(), lb.shape) for v in linear[:2])
+        first = first - sparse.diags_array(first.sum(1))  # in float32 it would be indefinite
+        self.linear, self.factors = (first, second), OrderedDict()
+
+    def solve(
+        self, b: Float[Tensor, "N C"], time: Float[Tensor, " C"] | None, tolerance: float | None
+    ) -> Float[Tensor, "N C"]:
+        """The solution, zero at Dirichlet points, of mean zero on the other components of a Poisson problem.
+
+        On these, constants are split off, for which M + tK is M: they and the mass stay to rounding. A tolerance of
+        None takes the factors' solution, that of linear elements.
+        """
+        b = self._inside(b.double())
+        mean = self._mean(self.one, b)
+        right = torch.addcmul(b, self.ones_mass, mean, value=-1)
+        x = self._near(right, time) if tolerance is None else self._solved(right, time, tolerance)
+        shift = -self._mean(self.ones_mass, x)
+        return x.add_(shift if time is None else shift + mean)
+
+    def mass_product(self, x: Float[Tensor, "N C"]) -> Float[Tensor, "N C"]:
+        """M x, in float64."""
+        return multiply(*self.pattern, self.mass.double(), x.double())
+
+    def _solved(
+        self, right: Float[Tensor, "N C"], time: Float[Tensor, " C"] | None, tolerance: float
+    ) -> Float[Tensor, "N C"]:
+        """By conjugate gradients, on right-hand sides and matrices that are scaled to about one.
+
+        Columns of several times go together: a product takes hardly longer for thirty than for one. Their smoothing
+        leaves M out, which is small beside tK for functions so rough that smoothing matters.
+        """
+        unit = self._unit(time)
+        soft = time is not None and 1 + float(time.max()) * self.stiff <= STIFFEST
+        dtype = torch.float32 if soft and tolerance >= SINGLE else torch.float64
+        terms = [(share.to(dtype), v.to(dtype)) for share, v in self._terms(time, unit)]
+
+        def product(terms: Terms, x: Tensor) -> Tensor:
+            parts = [share * multiply(*self.pattern, values, x) for share, values in terms]
+            return self._inside(sum(parts[1:], parts[0]))
+
+        def near(r: Tensor) -> Tensor:
+            x = unit * self._near(r.double(), time)
+            # Where K is singular constants are large, from rounding alone.
+            return (x - self._mean(self.ones_mass, x) if time is None else x).to(r)
+
+        precondition = near
+        if self.smooths:
+            rough = [(share.float(), values.float()) for share, values in terms]
+            sums = [share * absolute_row_sums(self.pattern[0], values) for share, values in rough]
+            cycle = two_levels(partial(product, rough[-1:]), sum(sums[1:], sums[0]), near)
+
+            def precondition(r: Tensor) -> Tensor:
+                return cycle(r.float()).to(r)
+
+        size = right.norm(dim=0).clamp_min(TINY)
+        b = (right / size).to(dtype)
+        x, self.steps = conjugate_gradients(
+            partial(product, terms), b, precondition, tolerance=tolerance
         )
-        first = first - sparse.diags_array(
-            first.sum(1)
-        )  # rounded to float32 it would be indefinite
+        return x.double() * (size / unit)
+
+    def _unit(self, time: Tensor | None) -> Float[Tensor, " C"]:
+        """Of the entries of the matrices: one for all columns of a Poisson problem."""
+        of_mass, of_stiffness = self.units
+        return of_stiffness[None] if time is None else of_mass + time * of_stiffness
+
+    def _terms(self, time: Tensor | None, unit: Tensor) -> Terms:
+        """Matrices on the pattern with the share that each column has of them: M and K, or one for all columns."""
+        of_mass, of_stiffness = self.units
+        terms = [(of_stiffness / unit, self.stiffness / of_stiffness)]
+        if time is not None:
+            terms = [(of_mass / unit, self.mass / of_mass), (time * terms[0][0], terms[0][1])]
+        if bool((unit != unit[0]).any()):
+            return terms
+        whole = [share[0] * values for share, values in terms]
+        return [(torch.ones_like(unit), sum(whole[1:], whole[0]))]
+
+    def _near(self, r: Tensor, time: Tensor | None) -> Tensor:
+        """The solution by linear elements, in float64; where there are several times, of the nearest powers of four.
+
+        Times so short that tK is small beside M count as one; where there are still too many powers, every second or
+        third is taken.
+        """
+        if time is None:
+            return self._inside(self.factor(None).solve(r))
+        level = time
+        if bool((time != time[0]).any()):
+            power = time.clamp_min(SHORT / self.stiff).log() / math.log(SPACING)
+            every = max(math.ceil(float(power.max() - power.min()) / (KEPT - 1)), 1)
+            level = SPACING ** (every * (power / every).round())
+        x = torch.empty_like(r)
+        for t in level.unique().tolist():
+            x[:, level == t] = self.factor(t).solve(r[:, level == t])
+        return self._inside(x)
+
+    def factor(self, t: float | None) -> Factor:
+        """That of M₁ + tK₁, or of K₁ with a little of M₁ that makes it definite."""
+        return _kept(self.factors, t, lambda: self._factored(t))
+
+    def _factored(self, t: float | None) -> Factor:
+        first, second = self.linear
         if t is None:
-            scale = (SINGULAR / self.area).sqrt().expand(n, 1)[:, 0]
+            scale = (SINGULAR / self.area).sqrt().expand_as(self.one)[:, 0]
             scale = sparse.diags_array(scale.cpu().numpy())
             matrix = first + scale @ second @ scale
         else:
@@ -161,62 +261,11 @@ class PairSystem:
             free = self.free[:, 0].cpu().numpy()
             keep = sparse.diags_array(free)
             matrix = keep @ matrix @ keep + sparse.diags_array((1 - free) * matrix.diagonal())
-        self.factor = cholesky((matrix + matrix.T) / 2)
-        self.cycle = None  # the cotangent's pair is the linear one
-        if len(lb.linear_crow):
-            values = self.values
-            if self.free is not None:
-                rows = torch.repeat_interleave(self.pattern[0].diff())
-                values = values * self.free[rows, 0] * self.free[self.pattern[1], 0]
-            self.cycle, _ = two_levels(*self.pattern, values, self._coarse)
-
-    def solve(
-        self,
-        b: Float[Tensor, "N C"],
-        tolerance: float | None,
-        transposed: bool = False,
-        times: Float[Tensor, " C"] | None = None,
-    ) -> Float[Tensor, "N C"]:
-        """The solution, zero at Dirichlet points, of mean zero on the other components of a Poisson problem.
-
-        On these, constants are split off, for which M + tK is M: they and the mass stay to rounding. A tolerance of
-        None takes the factor's solution, that of linear elements; `times`, from t / 4 to t, are those of the columns.
-        """
-        b = self._inside(b.double())
-        mean = self._mean(self.one, b)
-        right = torch.addcmul(b, self.ones_mass, mean, value=-1)
-        if tolerance is None:
-            x = self._inside(self.factor.solve(right))
-        else:
-            size = right.norm(dim=0).clamp_min(TINY)
-            x, self.steps = conjugate_gradients(
-                lambda x: self._product(x, times),
-                (right / size).to(torch.float32 if self.soft and tolerance >= SINGLE else b.dtype),
-                self._precondition,
-                tolerance=tolerance,
-            )
-            x = x.double() * (size / self.unit)
-        shift = -self._mean(self.ones_mass, x)
-        return x.add_(shift if self.singular else shift + mean)
+        return cholesky((matrix + matrix.T) / 2)
 
     def _mean(self, weights: Tensor, x: Tensor) -> Tensor:
         """Weighted sums over components that no Dirichlet point holds, by their areas; 0 on the others."""
         return torch.where(self.components.free, self.components.sums(weights, x) / self.area, 0.0)
-
-    def _product(self, x: Tensor, times: Tensor | None) -> Tensor:
-        if times is None:
-            return self._inside(multiply(*self.pattern, self.values.to(x), x))
-        stiffness, mass = (multiply(*self.pattern, v.to(x), x) for v in (self.stiffness, self.mass))
-        return self._inside((mass + times.to(x) * stiffness) / self.unit)
-
-    def _precondition(self, r: Tensor) -> Tensor:
-        """Of a residual: the factor's solve between smoothing in the matrix of time t, in float32."""
-        return self._coarse(r) if self.cycle is None else self.cycle(r.float()).to(r)
-
-    def _coarse(self, r: Tensor) -> Tensor:
-        """The factor's solve, without the constants, which are large from rounding alone where K is singular."""
-        x = self.unit * self._inside(self.factor.solve(r.double()))
-        return (x - self._mean(self.ones_mass, x) if self.singular else x).to(r)
 
     def _inside(self, x: Tensor) -> Tensor:
         return x if self.free is None else x * self.free.to(x)
@@ -239,9 +288,7 @@ class StencilSystem:
         self.mass = lb.mass.detach().double()[:, None]
         self.lu = factorized(sparse.csc_array(shift * sparse.eye_array(n) - t * matrix), 1e-2)
 
-    def solve(
-        self, b: Float[Tensor, "N C"], tolerance: float | None, transposed: bool = False
-    ) -> Float[Tensor, "N C"]:
+    def solve(self, b: Float[Tensor, "N C"], transposed: bool = False) -> Float[Tensor, "N C"]:
         """As for the pair, but exact; `transposed` for the transposed matrix."""
         b = b.double() if self.free is None else b.double() * self.free
         if self.components is not None:

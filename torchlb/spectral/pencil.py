@@ -23,8 +23,8 @@ from torch import Tensor
 from torchlb.errors import EigenbasisError, warn
 from torchlb.linalg.krylov import prefers_krylov
 from torchlb.linalg.lanczos import Inverse, inverse, lanczos
-from torchlb.linalg.sparse import from_scipy
-from torchlb.linalg.two_levels import two_levels
+from torchlb.linalg.sparse import from_scipy, multiply
+from torchlb.linalg.two_levels import absolute_row_sums, two_levels
 from torchlb.spectral.eigenbasis import Eigenbasis
 from torchlb.spectral.eigensolver import GAP
 
@@ -258,7 +258,15 @@ def _correction(
 
 def _two_levels(stiffness: Sparse, coarse: Inverse) -> list[Inverse]:
     """An approximate inverse of K, around a coarse solve, and the product with K, both in float32."""
-    both = two_levels(*from_scipy(stiffness), lambda r: torch.from_numpy(coarse(r.numpy())))
+    crow, col, values = from_scipy(stiffness.astype(np.float32))
+    crow, col = crow.int(), col.int()
+
+    def product(x: Tensor) -> Tensor:
+        return multiply(crow, col, values, x)
+
+    sums = absolute_row_sums(crow, values)
+    cycle = two_levels(product, sums, lambda r: torch.from_numpy(coarse(r.numpy())))
+    both = cycle, product
     return [lambda x, apply=apply: apply(torch.from_numpy(x)).numpy() for apply in both]
 
 
