@@ -329,3 +329,38 @@ def test_few_points_elsewhere_name_an_order():
 
 def test_public_names():
     assert set(torchlb.__all__) <= set(dir(torchlb))
+
+
+def test_operators_in_the_place_of_features_are_named(unchecked):
+    """So are lists of shapes, for which there are batches."""
+    lb, f = LaplaceBeltrami.from_cotangent(VERTICES, FACES).float(), VERTICES.float()
+    net = torchlb.DiffusionNet(3, 2, k=8)
+    for features, operator in ((lb, f), ([f], [lb]), (f, f.numpy())):
+        with pytest.raises(TypeError, match=r"features, then their operator.*batch"):
+            net(features, operator)
+    for shapes in (lb, [lb, 1], [f]):
+        with pytest.raises(TypeError, match="sequence of operators"):
+            LaplaceBeltrami.batch(shapes)
+
+
+def test_arrays_are_welcome_as_times_and_scales(unchecked):
+    lb, values = LaplaceBeltrami.from_cotangent(VERTICES, FACES), np.array([0.1, 0.2])
+    for signature in (torchlb.heat_kernel_signature, torchlb.wave_kernel_signature):
+        found, expected = (signature(lb, v, k=9) for v in (values, torch.from_numpy(values)))
+        assert torch.equal(found, expected)
+    wavelets = [
+        torchlb.spectral_wavelets(lb, VERTICES, v, k=9) for v in (values, torch.from_numpy(values))
+    ]
+    assert torch.equal(*wavelets)
+
+
+def test_a_condition_that_holds_nowhere_is_named():
+    with pytest.warns(UserWarning, match=r"dirichlet.*nowhere.*no boundary"):
+        LaplaceBeltrami.from_mesh(VERTICES, FACES, condition="dirichlet")
+
+
+def test_a_shape_that_single_precision_cannot_hold_has_no_eigenbasis():
+    lb = LaplaceBeltrami.from_cotangent(1e-25 * VERTICES, FACES)
+    assert lb.eigenbasis(4).eigenvalues[1] > 1e49
+    with pytest.raises(torchlb.EigenbasisError, match="scaled, or kept in float64"):
+        LaplaceBeltrami.from_cotangent(1e-25 * VERTICES, FACES).float().eigenbasis(4)

@@ -87,6 +87,7 @@ def get_operators(
     ------
     ValueError : for bad input.
     """
+    verts, faces = torch.as_tensor(verts), None if faces is None else torch.as_tensor(faces)
     cloud = faces is None or faces.numel() == 0
     if verts.ndim != 2 or verts.shape[1] != 3:
         raise InputError(f"verts: expected shape (V, 3), got {tuple(verts.shape)}")

@@ -19,6 +19,11 @@ T = TypeVar("T")
 
 def check_shape(x: Tensor, lb: LaplaceBeltrami) -> None:
     """InputError unless x is (N, C) or (B, N, C) with the N of the operator, TypeError unless it is a tensor."""
+    if not isinstance(lb, LaplaceBeltrami) and not hasattr(lb, "num_points"):
+        raise TypeError(
+            f"expected features, then their operator, got a {type(lb).__name__} in its place; several shapes are one "
+            "operator, LaplaceBeltrami.batch(…), and their features below each other, torch.cat(…)"
+        )
     if not isinstance(x, Tensor):
         raise TypeError(f"expected f as a tensor, got {type(x)}; torch.as_tensor(f) makes one")
     if x.ndim not in (2, 3) or x.shape[-2] != lb.num_points:
@@ -62,9 +67,9 @@ def check_features(
     ------
     InputError : for a wrong shape, and for features of another type than the parameters, unless autocast made them so.
     """
+    check_shape(x, lb)
     if x.shape[-1] != channels:
         raise InputError(f"expected {channels} channels, got x of shape {tuple(x.shape)}")
-    check_shape(x, lb)
     device = x.device.type
     cast = torch.is_autocast_enabled(device) and x.dtype == torch.get_autocast_dtype(device)
     if x.dtype != parameter.dtype and not cast:

@@ -307,6 +307,10 @@ def build_mesh(
             fit_degrees=degrees,
             progress=progress,
         )
+        if options.condition == "dirichlet" and not _has_boundary(shape):
+            warn(
+                "condition='dirichlet' holds nowhere: the mesh has no boundary; pass a mask of vertices as `boundary`"
+            )
         pair = None
         if shape.fits is not None:
             pair = mesh_pair(here, corners, shape.fits, degree, numbering=numbering)
@@ -315,6 +319,10 @@ def build_mesh(
         remedy = "a finer mesh, or one without noise, has better ones"
         built = _finished(shape, "mesh", options, remedy, progress, pair)
     return replace(built.restored(numbering), points=vertices, faces=given)
+
+
+def _has_boundary(shape: Shape) -> bool:
+    return shape.boundary is not None and bool(shape.boundary.mask.any())
 
 
 def build_cotangent(vertices: ArrayLike, faces: ArrayLike) -> AssembledOperator:

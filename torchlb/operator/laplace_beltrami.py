@@ -175,8 +175,13 @@ class LaplaceBeltrami(StencilFace, WeakFace):
         Features are the shapes' below each other, (ΣN, C). Indices of shape s (its faces, say) move by
         ``lb.offsets[s]``. The weak pair is there if all have one. Eigenbases that the shapes hold are taken over; the
         others are solved when asked for.
-        Raises InputError for shapes of different dimension, floating type or device, or for none.
+        Raises InputError for shapes of different dimension, floating type or device, or for none; TypeError for what
+        is no sequence of operators.
         """
+        if isinstance(shapes, LaplaceBeltrami) or not all(
+            isinstance(shape, LaplaceBeltrami) for shape in shapes
+        ):
+            raise TypeError("batch: expected a sequence of operators, [lb, …]")
         if len(shapes) == 0:
             raise InputError("batch: got no shapes")
         sizes = [n for shape in shapes for n in shape.sizes or (shape.num_points,)]

@@ -85,7 +85,7 @@ def pencil_eigenbasis(
 
     Raises
     ------
-    EigenbasisError : where that is not reached, or K has a negative eigenvalue.
+    EigenbasisError : where that is not reached, K has a negative eigenvalue, or M a diagonal that is not positive.
 
     Examples
     --------
@@ -95,6 +95,11 @@ def pencil_eigenbasis(
     """
     held = np.zeros(len(mass), dtype=bool) if fixed is None else np.asarray(fixed, dtype=bool)
     matrices = [sparse.csr_array(x, dtype=np.float64) for x in (stiffness, mass_matrix)]
+    if not (matrices[1].diagonal() > 0).all():
+        raise EigenbasisError(
+            "eigenbasis: the mass matrix is not positive; a shape so small that areas are zero in float32 has to be "
+            "scaled, or kept in float64"
+        )
     parts = _parts(matrices[0], matrices[1], linear, held)
     if linear is None:
         tolerance = EXACT**2

@@ -70,7 +70,8 @@ def heat_kernel_signature(
     if times is None:
         bound = 4 * math.log(10)
         times = _log_space(bound / values[..., -1:], bound / _first_positive(basis), count)
-    decay = torch.exp(-values[..., :, None] * times.to(values)[..., None, :])
+    times = torch.as_tensor(times).to(values)
+    decay = torch.exp(-values[..., :, None] * times[..., None, :])
     return basis.synthesise(basis.eigenvectors**2, decay)
 
 
@@ -102,9 +103,8 @@ def wave_kernel_signature(
         energies = start * (1 - fraction) + end * fraction
     positive = (values > 0) & _present(basis)
     logs = torch.where(positive, values, values.new_ones(())).log()
-    exponent = (
-        -(((energies.to(values)[..., None, :] - logs[..., :, None]) / sigma[..., None]) ** 2) / 2
-    )
+    energies = torch.as_tensor(energies).to(values)
+    exponent = -(((energies[..., None, :] - logs[..., :, None]) / sigma[..., None]) ** 2) / 2
     weights = torch.where(positive[..., :, None], exponent, -torch.inf).softmax(dim=-2)
     return basis.synthesise(basis.eigenvectors**2, weights)
 
@@ -127,7 +127,8 @@ def spectral_wavelets(
     scales : s, ℓ²; a band sits at the eigenvalue 1/s.
     """
     basis = lb.eigenbasis(k)
-    gains = _wavelet_gains(basis.eigenvalues, scales.to(basis.eigenvalues))
+    scales = torch.as_tensor(scales).to(basis.eigenvalues)
+    gains = _wavelet_gains(basis.eigenvalues, scales)
     coefficients = basis.to_basis(f)
     parts = [basis.from_basis(g[..., None] * coefficients) for g in gains.to(f.dtype).unbind(-1)]
     return torch.stack(parts, dim=-2)
