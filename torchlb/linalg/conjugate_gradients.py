@@ -47,10 +47,11 @@ def conjugate_gradients(
         q = product(p)
         curvature = (p * q).sum(0)
         length = torch.where(square > enough, square / curvature, 0.0)
-        x, r = x + length * p, r - length * q
+        x.addcmul_(length, p)
+        r = torch.addcmul(r, length, q, value=-1)
         z = precondition(r)
         before, square = square, (r * z).sum(0)
-        p = z + torch.where(before > 0, square / before, 0.0) * p
+        p = torch.addcmul(z, torch.where(before > 0, square / before, 0.0), p)
     left = float((square / enough.clamp_min(1e-300)).max()) ** 0.5 * tolerance
     raise DiffusionError(
         f"conjugate gradients: {left:.1e} of the residual is left after {max_steps} steps, not {tolerance:.0e}. "

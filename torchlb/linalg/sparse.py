@@ -101,6 +101,36 @@ def multiply(
         return csr_tensor(crow, col, values, len(x)) @ x
 
 
+class _Symmetric(torch.autograd.Function):
+    """A x for a symmetric A, whose derivative in x is the same product."""
+
+    @staticmethod
+    def forward(ctx: Any, crow: Tensor, col: Tensor, values: Tensor, x: Tensor) -> Tensor:  # pyright: ignore[reportIncompatibleMethodOverride]
+        ctx.save_for_backward(crow, col, values)
+        return multiply(crow, col, values, x)
+
+    @staticmethod
+    def backward(ctx: Any, g: Tensor) -> tuple[Any, ...]:  # pyright: ignore[reportIncompatibleMethodOverride]
+        return None, None, None, symmetric_product(*ctx.saved_tensors, g)
+
+
+def symmetric_product(
+    crow: Int[Tensor, " N_plus_1"],
+    col: Int[Tensor, " nnz"],
+    values: Float[Tensor, " nnz"],
+    x: Float[Tensor, "N C"],
+) -> Float[Tensor, "N C"]:
+    """A x for a symmetric A, differentiable any number of times in x alone; values and x of one type.
+
+    >>> x = torch.ones(2, 1, requires_grad=True)
+    >>> y = symmetric_product(torch.tensor([0, 1, 2]), torch.tensor([0, 1]), torch.tensor([2.0, 4.0]), x)
+    >>> torch.autograd.grad(y.sum(), x)[0].T
+    tensor([[2., 4.]])
+    """
+    product: Any = _Symmetric.apply
+    return product(crow, col, values, x)
+
+
 @torch.library.custom_op(
     "torchlb::csr_product",
     mutates_args=(),

@@ -10,10 +10,10 @@ from torch import Tensor
 
 from torchlb.errors import InputError
 from torchlb.linalg.once import once_differentiable
-from torchlb.linalg.sparse import csr_product
+from torchlb.linalg.sparse import symmetric_product
 from torchlb.nn.checks import as_columns, as_times, uncompiled
 from torchlb.nn.conduction import Conducting, conducting
-from torchlb.nn.systems import solve_columns
+from torchlb.nn.systems import SINGLE, solve_columns
 from torchlb.operator.laplace_beltrami import LaplaceBeltrami
 
 TOLERANCE = 1e-10
@@ -33,7 +33,8 @@ def implicit_step(
     """(1 − tΔ)⁻¹f, one implicit Euler step of heat flow; differentiable in f, t and the boundary's data.
 
     (M + tK)u = Mf + tB·flux with the weak pair, by conjugate gradients that the linear pair preconditions; without one
-    (1 − tL)u = f with the stencil, by LU. Solved in float64; the result has the type of f.
+    (1 − tL)u = f with the stencil, by LU. Solved in float64, unless the tolerance is 1e-5 or more and f and the operator
+    are of single precision; the result has the type of f.
 
     Parameters
     ----------
@@ -62,7 +63,9 @@ def implicit_step(
     True
     """
     x = as_columns(f, lb)
-    columns, time = _columns(x, as_times(t, x, torch.float64))
+    dtype = torch.promote_types(torch.promote_types(x.dtype, lb.values.dtype), torch.float32)
+    dtype = dtype if tolerance >= SINGLE else torch.float64
+    columns, time = _columns(x, as_times(t, x, torch.float64), dtype)
     given, poured = (_data(lb, d, n, f) for d, n in ((boundary_values, 0), (flux, 1)))
     medium = lb if conductivity is None else conducting(lb, conductivity)
     right = _mass(lb, columns)
@@ -150,12 +153,14 @@ def potential(
     )  # in its shape and type
 
 
-def _columns(x: Tensor, time: Tensor | None) -> tuple[Tensor, Tensor]:
-    """The surfaces of a stack (B, N, C) as further channels, in float64, with a time for each."""
+def _columns(
+    x: Tensor, time: Tensor | None, dtype: torch.dtype = torch.float64
+) -> tuple[Tensor, Tensor]:
+    """The surfaces of a stack (B, N, C) as further channels, with a time for each."""
     time = x.new_zeros(0) if time is None else time
     if x.ndim == 2:
-        return x.double(), time
-    return x.double().transpose(0, 1).flatten(1), time.repeat(len(x))
+        return x.to(dtype), time
+    return x.to(dtype).transpose(0, 1).flatten(1), time.repeat(len(x))
 
 
 def _shaped(u: Tensor, f: Tensor) -> Tensor:
@@ -206,9 +211,7 @@ def _missing(lb: LaplaceBeltrami, kind: int) -> str:
 
 def _product(lb: LaplaceBeltrami | Conducting, number: int, x: Tensor) -> Tensor:
     """K, M or B times x."""
-    crow, col = lb.weak_crow, lb.weak_col
-    pattern = [crow, col, crow, col, torch.arange(len(col), device=col.device)]
-    return csr_product(pattern, lb.weak_values[number].double(), x)
+    return symmetric_product(lb.weak_crow, lb.weak_col, lb.weak_values[number].to(x), x)
 
 
 def _mass(lb: LaplaceBeltrami, x: Tensor) -> Tensor:
@@ -232,7 +235,7 @@ class _Solve(torch.autograd.Function):
         lb: Any,
         tolerance: Any,
     ) -> Tensor:
-        u = solve_columns(lb, b, time, tolerance)  # pyright: ignore[reportCallIssue]
+        u = solve_columns(lb, b, time, tolerance).to(b.dtype)  # pyright: ignore[reportCallIssue]
         ctx.save_for_backward(time, u, conductivity, given)
         ctx.rest = lb, tolerance
         return u
@@ -242,11 +245,11 @@ class _Solve(torch.autograd.Function):
     def backward(ctx: Any, g: Tensor) -> tuple[Any, ...]:  # pyright: ignore
         time, u, conductivity, given = ctx.saved_tensors
         lb, tolerance = ctx.rest
-        w = solve_columns(lb, g, time, tolerance, True)  # pyright: ignore[reportCallIssue]
+        w = solve_columns(lb, g, time, tolerance, True).to(g.dtype)  # pyright: ignore[reportCallIssue]
         grad_t = None
         if time is not None and ctx.needs_input_grad[1]:
             slope = _product(lb, 0, u) if lb.has_weak_form else -lb(u)
-            grad_t = -(w * slope).sum(0)
+            grad_t = -(w * slope).sum(0).to(time)
         grad_kappa = None
         if conductivity is not None and ctx.needs_input_grad[2]:
             whole = u if given is None else u + given

@@ -139,7 +139,7 @@ class PairSystem:
 
     def __init__(self, lb: Operator) -> None:
         self.stiffness, self.mass = (values.detach() for values in lb.weak_values[:2])
-        self.pattern = lb.weak_crow, lb.weak_col
+        self.pattern = lb.weak_crow.int(), lb.weak_col.int()
         self.units = [values.abs().max().double() for values in (self.mass, self.stiffness)]
         self.free = None if lb.fixed is None else (~lb.fixed).double()[:, None]
         self.components = _Components(lb)
@@ -191,9 +191,11 @@ class PairSystem:
             return self._inside(sum(parts[1:], parts[0]))
 
         def near(r: Tensor) -> Tensor:
+            if time is not None:
+                return self._near(r, time).mul_(unit.to(r))
             x = unit * self._near(r.double(), time)
             # Where K is singular constants are large, from rounding alone.
-            return (x - self._mean(self.ones_mass, x) if time is None else x).to(r)
+            return (x - self._mean(self.ones_mass, x)).to(r)
 
         precondition = near
         if self.smooths:
@@ -228,7 +230,7 @@ class PairSystem:
         return [(torch.ones_like(unit), sum(whole[1:], whole[0]))]
 
     def _near(self, r: Tensor, time: Tensor | None) -> Tensor:
-        """The solution by linear elements, in float64; where there are several times, of the nearest powers of four.
+        """The solution by linear elements; where there are several times, of the nearest powers of four.
 
         Times so short that tK is small beside M count as one; where there are still too many powers, every second or
         third is taken.
@@ -240,8 +242,11 @@ class PairSystem:
             power = time.clamp_min(SHORT / self.stiff).log() / math.log(SPACING)
             every = max(math.ceil(float(power.max() - power.min()) / (KEPT - 1)), 1)
             level = SPACING ** (every * (power / every).round())
+        levels = level.unique().tolist()
+        if len(levels) == 1:
+            return self._inside(self.factor(levels[0]).solve(r))
         x = torch.empty_like(r)
-        for t in level.unique().tolist():
+        for t in levels:
             x[:, level == t] = self.factor(t).solve(r[:, level == t])
         return self._inside(x)
 
