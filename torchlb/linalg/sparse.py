@@ -111,7 +111,8 @@ class _Symmetric(torch.autograd.Function):
 
     @staticmethod
     def backward(ctx: Any, g: Tensor) -> tuple[Any, ...]:  # pyright: ignore[reportIncompatibleMethodOverride]
-        return None, None, None, symmetric_product(*ctx.saved_tensors, g)
+        crow, col, values = ctx.saved_tensors
+        return None, None, None, symmetric_product(crow, col, values, g)
 
 
 def symmetric_product(

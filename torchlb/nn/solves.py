@@ -33,8 +33,8 @@ def implicit_step(
     """(1 − tΔ)⁻¹f, one implicit Euler step of heat flow; differentiable in f, t and the boundary's data.
 
     (M + tK)u = Mf + tB·flux with the weak pair, by conjugate gradients that the linear pair preconditions; without one
-    (1 − tL)u = f with the stencil, by LU. Solved in float64, unless the tolerance is 1e-5 or more and f and the operator
-    are of single precision; the result has the type of f.
+    (1 − tL)u = f with the stencil, by LU. Solved in float64, but for a tolerance of 1e-5 or more where f and the
+    operator are of single precision; the result has the type of f.
 
     Parameters
     ----------
