@@ -39,8 +39,9 @@ SINGULAR = 1e-6
 """Share of M₁ over the area that makes K₁ definite; constants, which it moves alone, are split off."""
 SPACING = 4.0
 """Between the times of shared factors: M + tK and its factor's matrix then differ by half of that at most."""
-SHORT = 0.1
-"""Times the entries of K, over those of M: what is shorter hardly changes M."""
+SHORT, LONG = 0.1, 100.0
+"""Times the entries of K, over those of M: what is shorter hardly changes M; where all are longer M hardly counts for
+rough functions."""
 SINGLE, STIFFEST = 1e-5, 1e5
 """A tolerance from which on steps are taken in float32, unless the entries of M + tK sum to more than so many times the
 area: what is rounded there would show."""
@@ -178,8 +179,8 @@ class PairSystem:
     ) -> Float[Tensor, "N C"]:
         """By conjugate gradients, on right-hand sides and matrices that are scaled to about one.
 
-        Columns of several times go together: a product takes hardly longer for thirty than for one. Their smoothing
-        leaves M out, which is small beside tK for functions so rough that smoothing matters.
+        Columns of several times go together: a product takes hardly longer for thirty than for one. If all are long
+        their smoothing leaves M out.
         """
         unit = self._unit(time)
         soft = time is not None and 1 + float(time.max()) * self.stiff <= STIFFEST
@@ -201,7 +202,9 @@ class PairSystem:
         if self.smooths:
             rough = [(share.float(), values.float()) for share, values in terms]
             sums = [share * absolute_row_sums(self.pattern[0], values) for share, values in rough]
-            cycle = two_levels(partial(product, rough[-1:]), sum(sums[1:], sums[0]), near)
+            if time is not None and float(time.min()) * self.stiff > LONG:
+                rough = rough[-1:]
+            cycle = two_levels(partial(product, rough), sum(sums[1:], sums[0]), near)
 
             def precondition(r: Tensor) -> Tensor:
                 return cycle(r.float()).to(r)
