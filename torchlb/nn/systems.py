@@ -28,7 +28,7 @@ from torch.utils.weak import WeakIdKeyDictionary
 from torchlb.linalg.conjugate_gradients import conjugate_gradients
 from torchlb.linalg.factor import Factor, cholesky, factorized
 from torchlb.linalg.sparse import multiply, to_scipy
-from torchlb.linalg.two_levels import absolute_row_sums, two_levels
+from torchlb.linalg.two_levels import Linear, Matrix, absolute_row_sums, main_entries, two_levels
 from torchlb.nn.conduction import Conducting
 from torchlb.operator.batching import shapes_of
 from torchlb.operator.laplace_beltrami import LaplaceBeltrami
@@ -39,7 +39,7 @@ SINGULAR = 1e-6
 """Share of M₁ over the area that makes K₁ definite; constants, which it moves alone, are split off."""
 SPACING = 4.0
 """Between the times of shared factors: M + tK and its factor's matrix then differ by half of that at most."""
-SHORT, LONG = 0.1, 100.0
+SHORT, LONG = 0.1, 1e3
 """Times the entries of K, over those of M: what is shorter hardly changes M; where all are longer M hardly counts for
 rough functions."""
 SINGLE, STIFFEST = 1e-5, 1e5
@@ -49,7 +49,6 @@ TINY = 1e-300
 SHIFT = 1e-9
 """Of an inverted stencil that is singular, in units of its diagonal."""
 Operator = LaplaceBeltrami | Conducting
-Terms = list[tuple[Tensor, Tensor]]
 _SYSTEMS: Any = WeakIdKeyDictionary()
 atexit.register(_SYSTEMS.clear)  # cholespy reports factors that outlive Python as leaks
 
@@ -148,7 +147,10 @@ class PairSystem:
         self.ones_mass = self.mass_product(self.one)
         self.area = self.components.sums(self.one, self.ones_mass)
         self.stiff = float(self.stiffness.double().abs().sum() / self.mass.double().sum())
-        self.smooths = len(lb.linear_crow) > 0  # the cotangent's pair is the linear one
+        self.rough = []
+        if len(lb.linear_crow):  # the cotangent's pair is the linear one
+            parts = zip((self.mass, self.stiffness), self.units, strict=True)
+            self.rough = [main_entries(*self.pattern, v / unit) for v, unit in parts]
         self.steps = 0
         crow, col, linear = lb.linear_pair
         first, second = (to_scipy(crow, col, v.double(), lb.shape) for v in linear[:2])
@@ -182,14 +184,16 @@ class PairSystem:
         Columns of several times go together: a product takes hardly longer for thirty than for one. If all are long
         their smoothing leaves M out.
         """
-        unit = self._unit(time)
+        unit, shares = self._shares(time)
         soft = time is not None and 1 + float(time.max()) * self.stiff <= STIFFEST
         dtype = torch.float32 if soft and tolerance >= SINGLE else torch.float64
-        terms = [(share.to(dtype), v.to(dtype)) for share, v in self._terms(time, unit)]
-
-        def product(terms: Terms, x: Tensor) -> Tensor:
-            parts = [share * multiply(*self.pattern, values, x) for share, values in terms]
-            return self._inside(sum(parts[1:], parts[0]))
+        parts = list(zip((self.mass, self.stiffness), self.units, strict=True))[-len(shares) :]
+        values = [(v / of).to(dtype) for v, of in parts]
+        exact = [share.to(dtype) for share in shares]
+        if not bool((unit != unit[0]).any()):
+            whole = [share[0] * v for share, v in zip(exact, values, strict=True)]
+            exact, values = [torch.ones_like(exact[0])], [sum(whole[1:], whole[0])]
+        matrices = [(*self.pattern, v) for v in values]
 
         def near(r: Tensor) -> Tensor:
             if time is not None:
@@ -199,38 +203,38 @@ class PairSystem:
             return (x - self._mean(self.ones_mass, x)).to(r)
 
         precondition = near
-        if self.smooths:
-            rough = [(share.float(), values.float()) for share, values in terms]
-            sums = [share * absolute_row_sums(self.pattern[0], values) for share, values in rough]
-            if time is not None and float(time.min()) * self.stiff > LONG:
-                rough = rough[-1:]
-            cycle = two_levels(partial(product, rough), sum(sums[1:], sums[0]), near)
+        if self.rough:
+            cycle = self._cycle(time, [share.float() for share in shares], near)
 
             def precondition(r: Tensor) -> Tensor:
                 return cycle(r.float()).to(r)
 
         size = right.norm(dim=0).clamp_min(TINY)
         b = (right / size).to(dtype)
-        x, self.steps = conjugate_gradients(
-            partial(product, terms), b, precondition, tolerance=tolerance
-        )
+        product = partial(self._product, matrices, exact)
+        x, self.steps = conjugate_gradients(product, b, precondition, tolerance=tolerance)
         return x.double() * (size / unit)
 
-    def _unit(self, time: Tensor | None) -> Float[Tensor, " C"]:
-        """Of the entries of the matrices: one for all columns of a Poisson problem."""
+    def _shares(self, time: Tensor | None) -> tuple[Float[Tensor, " C"], list[Tensor]]:
+        """A unit of each column's matrix, and its shares in it of M and K scaled to one; of K alone without times."""
         of_mass, of_stiffness = self.units
-        return of_stiffness[None] if time is None else of_mass + time * of_stiffness
+        if time is None:
+            return of_stiffness[None], [torch.ones_like(of_stiffness[None])]
+        unit = of_mass + time * of_stiffness
+        return unit, [of_mass / unit, time * of_stiffness / unit]
 
-    def _terms(self, time: Tensor | None, unit: Tensor) -> Terms:
-        """Matrices on the pattern with the share that each column has of them: M and K, or one for all columns."""
-        of_mass, of_stiffness = self.units
-        terms = [(of_stiffness / unit, self.stiffness / of_stiffness)]
-        if time is not None:
-            terms = [(of_mass / unit, self.mass / of_mass), (time * terms[0][0], terms[0][1])]
-        if bool((unit != unit[0]).any()):
-            return terms
-        whole = [share[0] * values for share, values in terms]
-        return [(torch.ones_like(unit), sum(whole[1:], whole[0]))]
+    def _cycle(self, time: Tensor | None, shares: list[Tensor], near: Linear) -> Linear:
+        """Smoothing around the factors' solve, in float32."""
+        rough = self.rough[-len(shares) :]
+        sums = [s * absolute_row_sums(m[0], m[2]) for s, m in zip(shares, rough, strict=True)]
+        if time is not None and float(time.min()) * self.stiff > LONG:
+            rough, shares = rough[-1:], shares[-1:]
+        return two_levels(partial(self._product, rough, shares), sum(sums[1:], sums[0]), near)
+
+    def _product(self, matrices: list[Matrix], shares: list[Tensor], x: Tensor) -> Tensor:
+        """Of every column with its shares of the matrices."""
+        parts = [s * multiply(*m, x) for s, m in zip(shares, matrices, strict=True)]
+        return self._inside(sum(parts[1:], parts[0]))
 
     def _near(self, r: Tensor, time: Tensor | None) -> Tensor:
         """The solution by linear elements; where there are several times, of the nearest powers of four.

@@ -24,7 +24,7 @@ from torchlb.errors import EigenbasisError, warn
 from torchlb.linalg.krylov import prefers_krylov
 from torchlb.linalg.lanczos import Inverse, inverse, lanczos
 from torchlb.linalg.sparse import from_scipy, multiply
-from torchlb.linalg.two_levels import absolute_row_sums, two_levels
+from torchlb.linalg.two_levels import absolute_row_sums, main_entries, two_levels
 from torchlb.spectral.eigenbasis import Eigenbasis
 from torchlb.spectral.eigensolver import GAP
 
@@ -196,14 +196,16 @@ def _swept(
     stiffness, mass_matrix = part.stiffness, part.mass_matrix
     assert part.linear is not None
     cycle, product = _two_levels(stiffness, solve)
-    linear_mass, single = (m.astype(np.float32) for m in (part.linear[1], mass_matrix))
+    linear_mass, *single = (
+        matrix.astype(np.float32) for matrix in (part.linear[1], stiffness, mass_matrix)
+    )
 
     def shifted(p: np.ndarray, shifts: np.ndarray) -> np.ndarray:
         return product(p) - (linear_mass @ p) * shifts
 
     count, zero, steps = u.shape[1], int(part.conserving), STEPS
     u = np.ascontiguousarray(u, dtype=np.float32)
-    values, known = _ritz((u, product(u), single @ u), count)
+    values, known = _ritz((u, *(matrix @ u for matrix in single)), count)
     for sweep in range(SWEEPS + 1):
         u, ku, mu = known
         residual = ku - mu * values.astype(u.dtype)
@@ -262,9 +264,8 @@ def _correction(
 
 
 def _two_levels(stiffness: Sparse, coarse: Inverse) -> list[Inverse]:
-    """An approximate inverse of K, around a coarse solve, and the product with K, both in float32."""
-    crow, col, values = from_scipy(stiffness.astype(np.float32))
-    crow, col = crow.int(), col.int()
+    """An approximate inverse of K, around a coarse solve, and the product with what is large of K, both in float32."""
+    crow, col, values = main_entries(*from_scipy(stiffness))
 
     def product(x: Tensor) -> Tensor:
         return multiply(crow, col, values, x)
