@@ -331,12 +331,12 @@ def test_public_names():
     assert set(torchlb.__all__) <= set(dir(torchlb))
 
 
-def test_operators_in_the_place_of_features_are_named(unchecked):
+def test_features_in_the_place_of_operators_are_named(unchecked):
     """So are lists of shapes, for which there are batches."""
     lb, f = LaplaceBeltrami.from_cotangent(VERTICES, FACES).float(), VERTICES.float()
     net = torchlb.DiffusionNet(3, 2, k=8)
     for features, operator in ((lb, f), ([f], [lb]), (f, f.numpy())):
-        with pytest.raises(TypeError, match=r"features, then their operator.*batch"):
+        with pytest.raises(TypeError, match=r"functions take \(lb, f\), layers \(x, lb\).*batch"):
             net(features, operator)
     for shapes in (lb, [lb, 1], [f]):
         with pytest.raises(TypeError, match="sequence of operators"):
@@ -355,7 +355,7 @@ def test_arrays_are_welcome_as_times_and_scales(unchecked):
 
 
 def test_a_condition_that_holds_nowhere_is_named():
-    with pytest.warns(UserWarning, match=r"dirichlet.*nowhere.*no boundary"):
+    with pytest.warns(UserWarning, match=r"dirichlet.*nowhere.*leave the condition out"):
         LaplaceBeltrami.from_mesh(VERTICES, FACES, condition="dirichlet")
 
 

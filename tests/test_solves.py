@@ -366,3 +366,56 @@ def test_pairs_in_single_precision_keep_a_cholesky_factor(surface):
     for build in (LaplaceBeltrami.from_cotangent, LaplaceBeltrami.from_mesh):
         lb = build(*surface.mesh(300)).float()
         assert all(systems.pair_system(lb).factor(t).is_cholesky for t in (None, 1e6))
+
+
+def dense_step(lb, f, times):
+    """(M + tK)⁻¹Mf of every column, by dense algebra on the stored matrices."""
+    stiffness, mass = (m.to_dense().double() for m in (lb.stiffness, lb.mass_matrix))
+    columns = [
+        torch.linalg.solve(mass + t * stiffness, mass @ c) for t, c in zip(times, f.T, strict=True)
+    ]
+    return torch.stack(columns, dim=1)
+
+
+@pytest.mark.parametrize("scale", [1e-25, 1.0, 1e25])
+def test_shapes_in_any_units_are_solved(scale):
+    """u of a shape s times as large, for times s² as long, is the same."""
+    vertices, faces = Torus().mesh(120)
+    one, other = (LaplaceBeltrami.from_mesh(s * vertices, faces, order=2) for s in (1.0, scale))
+    f, times = rough(one, 4), torch.tensor([1e-4, 0.3, 0.01, 0.3], dtype=torch.float64)
+    for tolerance in (1e-10, 1e-5):
+        found = implicit_step(other, f, scale**2 * times, tolerance=tolerance)
+        error = found - implicit_step(one, f, times)
+        assert error.abs().max() <= 10 * tolerance * f.abs().max()
+    flowed = heat_flow(other, f, 0.1 * scale**2) - heat_flow(one, f, 0.1)
+    assert flowed.abs().max() <= 1e-6 * f.abs().max()
+
+
+def test_times_over_many_decades_share_few_factors():
+    """From none at all to ten thousand; in any order."""
+    lb = LaplaceBeltrami.from_mesh(*Torus().mesh(120), order=2)
+    times = torch.cat([torch.zeros(1), torch.logspace(-9, 4, 11), torch.zeros(1)]).double()[
+        torch.randperm(13)
+    ]
+    f = rough(lb, 13)
+    torch.testing.assert_close(
+        implicit_step(lb, f, times), dense_step(lb, f, times), rtol=0, atol=1e-8
+    )
+    assert len(systems.pair_system(lb).factors) <= systems.KEPT
+
+
+def test_operators_in_single_precision_are_solved_in_double():
+    """To what their own matrices, which are rounded, say."""
+    lb = LaplaceBeltrami.from_mesh(*Torus().mesh(120), order=2).float()
+    f, times = rough(lb, 3).double(), torch.tensor([0.01, 0.1, 1.0], dtype=torch.float64)
+    torch.testing.assert_close(
+        implicit_step(lb, f, times, tolerance=1e-13), dense_step(lb, f, times), rtol=0, atol=1e-7
+    )
+
+
+def test_no_columns_are_no_problem():
+    lb = LaplaceBeltrami.from_mesh(*Torus().mesh(120), order=2)
+    f = rough(lb, 3)
+    for empty in (f[:, :0], f.expand(2, -1, -1)[:0]):
+        assert implicit_step(lb, empty, 0.1).shape == empty.shape
+        assert poisson_solve(lb, empty).shape == empty.shape

@@ -39,7 +39,8 @@ def conjugate_gradients(
     z = precondition(r)
     p, square = z, (r * z).sum(0)
     if not bool(square.isfinite().all()):
-        raise DiffusionError("conjugate gradients: the right-hand side has NaN or infinite values")
+        what = "preconditioner" if bool(b.isfinite().all()) else "right-hand side"
+        raise DiffusionError(f"conjugate gradients: the {what} has NaN or infinite values")
     enough = tolerance**2 * square
     for step in range(max_steps):
         if bool((square <= enough).all()):

@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-Linear = Callable[[Tensor], Tensor]
+from torchlb.linalg.conjugate_gradients import Linear
 
 Matrix = tuple[Tensor, Tensor, Tensor]  # crow, col, values
 
@@ -67,7 +65,7 @@ def main_entries(
     values = values.float()
     row = torch.repeat_interleave(torch.arange(len(crow) - 1, device=col.device), crow.diff())
     root = absolute_row_sums(crow, values)[:, 0].sqrt()
-    kept = (values.abs() >= SMALL * root[row] * root[col]) | (row == col)
+    kept = (values.abs() >= SMALL * (root[row] * root[col])) | (row == col)
     rest = torch.zeros_like(root).index_add(0, row, torch.where(kept, 0.0, values))
     row, col, values = row[kept], col[kept], values[kept]
     values = torch.where(row == col, values + rest[row], values)

@@ -19,10 +19,10 @@ T = TypeVar("T")
 
 def check_shape(x: Tensor, lb: LaplaceBeltrami) -> None:
     """InputError unless x is (N, C) or (B, N, C) with the N of the operator, TypeError unless it is a tensor."""
-    if not isinstance(lb, LaplaceBeltrami) and not hasattr(lb, "num_points"):
+    if not hasattr(lb, "num_points"):
         raise TypeError(
-            f"expected features, then their operator, got a {type(lb).__name__} in its place; several shapes are one "
-            "operator, LaplaceBeltrami.batch(…), and their features below each other, torch.cat(…)"
+            f"expected an operator, got a {type(lb).__name__} in its place: functions take (lb, f), layers (x, lb); "
+            "several shapes are one operator, LaplaceBeltrami.batch(…), with features below each other, torch.cat(…)"
         )
     if not isinstance(x, Tensor):
         raise TypeError(f"expected f as a tensor, got {type(x)}; torch.as_tensor(f) makes one")

@@ -67,12 +67,12 @@ def _summed(
     times = time.detach().cpu().numpy()
     at_zero = torch.from_numpy(times == 0).to(x.device)
     result[:, at_zero] = x[:, at_zero]
+    solver = pair_system(lb)
     level = np.floor(np.log10(np.where(times > 0, times / SHORTEST, 1.0)))
     for exponent in np.unique(level[times > 0]).tolist():
         chosen = (level == exponent) & (times > 0)
         columns = torch.from_numpy(chosen).to(x.device)
         pole = 10.0**exponent
-        solver = pair_system(lb)
         c, derivative = (
             torch.from_numpy(np.stack(part, 1)).to(x)
             for part in zip(

@@ -33,8 +33,8 @@ def implicit_step(
     """(1 − tΔ)⁻¹f, one implicit Euler step of heat flow; differentiable in f, t and the boundary's data.
 
     (M + tK)u = Mf + tB·flux with the weak pair, by conjugate gradients that the linear pair preconditions; without one
-    (1 − tL)u = f with the stencil, by LU. Solved in float64, but for a tolerance of 1e-5 or more where f and the
-    operator are of single precision; the result has the type of f.
+    (1 − tL)u = f with the stencil, by LU. Solved in float64; to a tolerance of 1e-5 or more steps are in float32, and
+    where f and the operator are, right-hand sides, too. The result has the type of f.
 
     Parameters
     ----------
@@ -64,7 +64,7 @@ def implicit_step(
     """
     x = as_columns(f, lb)
     dtype = torch.promote_types(torch.promote_types(x.dtype, lb.values.dtype), torch.float32)
-    dtype = dtype if tolerance >= SINGLE else torch.float64
+    dtype = torch.float64 if tolerance < SINGLE else dtype
     columns, time = _columns(x, as_times(t, x, torch.float64), dtype)
     given, poured = (_data(lb, d, n, f) for d, n in ((boundary_values, 0), (flux, 1)))
     medium = lb if conductivity is None else conducting(lb, conductivity)

@@ -14,7 +14,7 @@ import atexit
 import math
 from collections import OrderedDict
 from collections.abc import Callable
-from functools import partial
+from functools import cached_property, partial
 from typing import Any
 
 import numpy as np
@@ -25,10 +25,10 @@ from scipy.sparse import csgraph
 from torch import Tensor
 from torch.utils.weak import WeakIdKeyDictionary
 
-from torchlb.linalg.conjugate_gradients import conjugate_gradients
+from torchlb.linalg.conjugate_gradients import Linear, conjugate_gradients
 from torchlb.linalg.factor import Factor, cholesky, factorized
 from torchlb.linalg.sparse import multiply, to_scipy
-from torchlb.linalg.two_levels import Linear, Matrix, absolute_row_sums, main_entries, two_levels
+from torchlb.linalg.two_levels import Matrix, absolute_row_sums, main_entries, two_levels
 from torchlb.nn.conduction import Conducting
 from torchlb.operator.batching import shapes_of
 from torchlb.operator.laplace_beltrami import LaplaceBeltrami
@@ -38,10 +38,10 @@ KEPT = 8
 SINGULAR = 1e-6
 """Share of M₁ over the area that makes K₁ definite; constants, which it moves alone, are split off."""
 SPACING = 4.0
-"""Between the times of shared factors: M + tK and its factor's matrix then differ by half of that at most."""
-SHORT, LONG = 0.1, 1e3
-"""Times the entries of K, over those of M: what is shorter hardly changes M; where all are longer M hardly counts for
-rough functions."""
+"""Between the times of shared factors: M + tK and its factor's matrix then differ by its root at most."""
+SHORT, LONG = 0.1, 10.0
+"""Of t|K| over |M|: times below the first, on the mean, count as one; above the second, in every row, smoothing leaves
+M out."""
 SINGLE, STIFFEST = 1e-5, 1e5
 """A tolerance from which on steps are taken in float32, unless the entries of M + tK sum to more than so many times the
 area: what is rounded there would show."""
@@ -56,16 +56,13 @@ atexit.register(_SYSTEMS.clear)  # cholespy reports factors that outlive Python 
 def pair_system(lb: Operator) -> PairSystem:
     """That of an operator with a weak pair, for all times."""
     kept = _SYSTEMS.setdefault(lb.values, OrderedDict())
-    key = lb.values.device
-    if key not in kept:
-        kept[key] = PairSystem(lb)
-    return kept[key]
+    return _kept(kept, None, lambda: PairSystem(lb))
 
 
 def stencil_system(lb: Operator, t: float | None) -> StencilSystem:
     """That of an implicit step of a time t, or of a Poisson problem for None, by the stencil."""
     kept = _SYSTEMS.setdefault(lb.values, OrderedDict())
-    return _kept(kept, (t, lb.values.device), lambda: StencilSystem(lb, t))
+    return _kept(kept, t, lambda: StencilSystem(lb, t))
 
 
 def _kept(kept: OrderedDict[Any, Any], key: Any, make: Callable[[], Any]) -> Any:
@@ -138,19 +135,16 @@ class PairSystem:
     """K, and M + tK for every t, of a weak pair."""
 
     def __init__(self, lb: Operator) -> None:
-        self.stiffness, self.mass = (values.detach() for values in lb.weak_values[:2])
+        self.stiffness, self.mass = self.parts = [v.detach() for v in lb.weak_values[:2]]
+        self.units = [values.abs().max().double() for values in self.parts]
         self.pattern = lb.weak_crow.int(), lb.weak_col.int()
-        self.units = [values.abs().max().double() for values in (self.mass, self.stiffness)]
         self.free = None if lb.fixed is None else (~lb.fixed).double()[:, None]
         self.components = _Components(lb)
         self.one = torch.ones_like(lb.mass.double())[:, None]
         self.ones_mass = self.mass_product(self.one)
         self.area = self.components.sums(self.one, self.ones_mass)
         self.stiff = float(self.stiffness.double().abs().sum() / self.mass.double().sum())
-        self.rough = []
-        if len(lb.linear_crow):  # the cotangent's pair is the linear one
-            parts = zip((self.mass, self.stiffness), self.units, strict=True)
-            self.rough = [main_entries(*self.pattern, v / unit) for v, unit in parts]
+        self.smooths = len(lb.linear_crow) > 0  # the cotangent's pair is the linear one
         self.steps = 0
         crow, col, linear = lb.linear_pair
         first, second = (to_scipy(crow, col, v.double(), lb.shape) for v in linear[:2])
@@ -165,10 +159,18 @@ class PairSystem:
         On these, constants are split off, for which M + tK is M: they and the mass stay to rounding. A tolerance of
         None takes the factors' solution, that of linear elements.
         """
+        if b.shape[1] == 0:
+            return b.double()
+        if time is not None and bool((time.diff() < 0).any()):  # columns of a factor side by side
+            order = time.argsort()
+            return self.solve(b[:, order], time[order], tolerance)[:, order.argsort()]
+        if time is not None and bool(time[0] == time[-1]):
+            time = time[:1]
         b = self._inside(b.double())
         mean = self._mean(self.one, b)
         right = torch.addcmul(b, self.ones_mass, mean, value=-1)
-        x = self._near(right, time) if tolerance is None else self._solved(right, time, tolerance)
+        near = partial(self._near, self._levels(time, b.shape[1]))
+        x = near(right) if tolerance is None else self._solved(right, time, tolerance, near)
         shift = -self._mean(self.ones_mass, x)
         return x.add_(shift if time is None else shift + mean)
 
@@ -177,85 +179,88 @@ class PairSystem:
         return multiply(*self.pattern, self.mass.double(), x.double())
 
     def _solved(
-        self, right: Float[Tensor, "N C"], time: Float[Tensor, " C"] | None, tolerance: float
+        self, right: Float[Tensor, "N C"], time: Tensor | None, tolerance: float, near: Linear
     ) -> Float[Tensor, "N C"]:
         """By conjugate gradients, on right-hand sides and matrices that are scaled to about one.
 
-        Columns of several times go together: a product takes hardly longer for thirty than for one. If all are long
-        their smoothing leaves M out.
+        Columns of several times go together: a product takes hardly longer for thirty than for one.
         """
         unit, shares = self._shares(time)
-        soft = time is not None and 1 + float(time.max()) * self.stiff <= STIFFEST
+        soft = time is not None and 1 + float(time[-1]) * self.stiff <= STIFFEST
         dtype = torch.float32 if soft and tolerance >= SINGLE else torch.float64
-        parts = list(zip((self.mass, self.stiffness), self.units, strict=True))[-len(shares) :]
-        values = [(v / of).to(dtype) for v, of in parts]
-        exact = [share.to(dtype) for share in shares]
-        if not bool((unit != unit[0]).any()):
-            whole = [share[0] * v for share, v in zip(exact, values, strict=True)]
-            exact, values = [torch.ones_like(exact[0])], [sum(whole[1:], whole[0])]
-        matrices = [(*self.pattern, v) for v in values]
+        wide = torch.promote_types(self.mass.dtype, dtype)
+        values = [(v.to(wide) / of).to(dtype) for v, of in zip(self.parts, self.units, strict=True)]
+        exact = [(share.to(dtype), v) for share, v in zip(shares, values, strict=False)]
+        if len(unit) == 1:
+            whole = torch.stack([share * v for share, v in exact]).sum(0)
+            exact = [(torch.ones_like(unit).to(dtype), whole)]
+        product = partial(self._product, [(share, (*self.pattern, v)) for share, v in exact])
 
-        def near(r: Tensor) -> Tensor:
-            if time is not None:
-                return self._near(r, time).mul_(unit.to(r))
-            x = unit * self._near(r.double(), time)
+        def precondition(r: Tensor) -> Tensor:
+            x = near(r.double()).mul_(unit)
             # Where K is singular constants are large, from rounding alone.
-            return (x - self._mean(self.ones_mass, x)).to(r)
+            return (x - self._mean(self.ones_mass, x) if time is None else x).to(r)
 
-        precondition = near
-        if self.rough:
-            cycle = self._cycle(time, [share.float() for share in shares], near)
+        inverse = precondition
+        if self.smooths:
+            cycle = self._cycle(shares, precondition)
 
-            def precondition(r: Tensor) -> Tensor:
+            def inverse(r: Tensor) -> Tensor:
                 return cycle(r.float()).to(r)
 
         size = right.norm(dim=0).clamp_min(TINY)
         b = (right / size).to(dtype)
-        product = partial(self._product, matrices, exact)
-        x, self.steps = conjugate_gradients(product, b, precondition, tolerance=tolerance)
+        x, self.steps = conjugate_gradients(product, b, inverse, tolerance=tolerance)
         return x.double() * (size / unit)
 
     def _shares(self, time: Tensor | None) -> tuple[Float[Tensor, " C"], list[Tensor]]:
-        """A unit of each column's matrix, and its shares in it of M and K scaled to one; of K alone without times."""
-        of_mass, of_stiffness = self.units
+        """A unit for the matrix of each time, and its shares of K and M scaled to one; K alone without times."""
+        of_stiffness, of_mass = self.units
         if time is None:
             return of_stiffness[None], [torch.ones_like(of_stiffness[None])]
         unit = of_mass + time * of_stiffness
-        return unit, [of_mass / unit, time * of_stiffness / unit]
+        return unit, [time * of_stiffness / unit, of_mass / unit]
 
-    def _cycle(self, time: Tensor | None, shares: list[Tensor], near: Linear) -> Linear:
-        """Smoothing around the factors' solve, in float32."""
-        rough = self.rough[-len(shares) :]
-        sums = [s * absolute_row_sums(m[0], m[2]) for s, m in zip(shares, rough, strict=True)]
-        if time is not None and float(time.min()) * self.stiff > LONG:
-            rough, shares = rough[-1:], shares[-1:]
-        return two_levels(partial(self._product, rough, shares), sum(sums[1:], sums[0]), near)
+    @cached_property
+    def _rough(self) -> list[tuple[Matrix, Float[Tensor, "N 1"]]]:
+        """What smoothing takes of K and of M, scaled to one, and the absolute row sums."""
+        parts = zip(self.parts, self.units, strict=True)
+        matrices = [main_entries(*self.pattern, v.double() / unit) for v, unit in parts]
+        return [(m, absolute_row_sums(m[0], m[2])) for m in matrices]
 
-    def _product(self, matrices: list[Matrix], shares: list[Tensor], x: Tensor) -> Tensor:
+    def _cycle(self, shares: list[Tensor], coarse: Linear) -> Linear:
+        """Smoothing around the factors' solve, in float32; of K alone where M is small even at the shortest time."""
+        shares = [share.float() for share in shares]
+        sums = [share * s for share, (_, s) in zip(shares, self._rough, strict=False)]
+        terms = [(share, matrix) for share, (matrix, _) in zip(shares, self._rough, strict=False)]
+        if len(sums) == 2 and bool((sums[0][:, 0] > LONG * sums[1][:, 0]).all()):
+            terms = terms[:1]
+        return two_levels(partial(self._product, terms), sum(sums[1:], sums[0]), coarse)
+
+    def _product(self, terms: list[tuple[Tensor, Matrix]], x: Tensor) -> Tensor:
         """Of every column with its shares of the matrices."""
-        parts = [s * multiply(*m, x) for s, m in zip(shares, matrices, strict=True)]
+        parts = [share * multiply(*matrix, x) for share, matrix in terms]
         return self._inside(sum(parts[1:], parts[0]))
 
-    def _near(self, r: Tensor, time: Tensor | None) -> Tensor:
-        """The solution by linear elements; where there are several times, of the nearest powers of four.
+    def _levels(self, time: Tensor | None, columns: int) -> list[tuple[float | None, int]]:
+        """Times of factors, and for how many columns each: where there are several, the nearest powers of four.
 
         Times so short that tK is small beside M count as one; where there are still too many powers, every second or
         third is taken.
         """
-        if time is None:
-            return self._inside(self.factor(None).solve(r))
-        level = time
-        if bool((time != time[0]).any()):
-            power = time.clamp_min(SHORT / self.stiff).log() / math.log(SPACING)
-            every = max(math.ceil(float(power.max() - power.min()) / (KEPT - 1)), 1)
-            level = SPACING ** (every * (power / every).round())
-        levels = level.unique().tolist()
-        if len(levels) == 1:
-            return self._inside(self.factor(levels[0]).solve(r))
-        x = torch.empty_like(r)
-        for t in levels:
-            x[:, level == t] = self.factor(t).solve(r[:, level == t])
-        return self._inside(x)
+        if time is None or len(time) == 1:
+            return [(None if time is None else float(time), columns)]
+        power = time.clamp_min(SHORT / self.stiff).log() / math.log(SPACING)
+        every = max(math.ceil(float(power[-1] - power[0]) / (KEPT - 1)), 1)
+        level = SPACING ** (every * (power / every).round())
+        level, count = level.unique_consecutive(return_counts=True)
+        return list(zip(level.tolist(), count.tolist(), strict=True))
+
+    def _near(self, levels: list[tuple[float | None, int]], r: Tensor) -> Tensor:
+        """The solution by linear elements."""
+        blocks = r.split([count for _, count in levels], dim=1)
+        solved = [self.factor(t).solve(block) for (t, _), block in zip(levels, blocks, strict=True)]
+        return self._inside(torch.cat(solved, dim=1))
 
     def factor(self, t: float | None) -> Factor:
         """That of M₁ + tK₁, or of K₁ with a little of M₁ that makes it definite."""

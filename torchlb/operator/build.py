@@ -307,9 +307,10 @@ def build_mesh(
             fit_degrees=degrees,
             progress=progress,
         )
-        if options.condition == "dirichlet" and not _has_boundary(shape):
+        if options.condition == "dirichlet" and shape.boundary is None:
             warn(
-                "condition='dirichlet' holds nowhere: the mesh has no boundary; pass a mask of vertices as `boundary`"
+                "condition='dirichlet' holds nowhere: the mesh has no boundary, or `boundary` none of it; leave the "
+                "condition out"
             )
         pair = None
         if shape.fits is not None:
@@ -319,10 +320,6 @@ def build_mesh(
         remedy = "a finer mesh, or one without noise, has better ones"
         built = _finished(shape, "mesh", options, remedy, progress, pair)
     return replace(built.restored(numbering), points=vertices, faces=given)
-
-
-def _has_boundary(shape: Shape) -> bool:
-    return shape.boundary is not None and bool(shape.boundary.mask.any())
 
 
 def build_cotangent(vertices: ArrayLike, faces: ArrayLike) -> AssembledOperator:

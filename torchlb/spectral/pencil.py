@@ -196,16 +196,14 @@ def _swept(
     stiffness, mass_matrix = part.stiffness, part.mass_matrix
     assert part.linear is not None
     cycle, product = _two_levels(stiffness, solve)
-    linear_mass, *single = (
-        matrix.astype(np.float32) for matrix in (part.linear[1], stiffness, mass_matrix)
-    )
+    linear_mass = part.linear[1].astype(np.float32)
 
     def shifted(p: np.ndarray, shifts: np.ndarray) -> np.ndarray:
         return product(p) - (linear_mass @ p) * shifts
 
     count, zero, steps = u.shape[1], int(part.conserving), STEPS
     u = np.ascontiguousarray(u, dtype=np.float32)
-    values, known = _ritz((u, *(matrix @ u for matrix in single)), count)
+    values, known = _ritz((u, *(m.astype(u.dtype) @ u for m in (stiffness, mass_matrix))), count)
     for sweep in range(SWEEPS + 1):
         u, ku, mu = known
         residual = ku - mu * values.astype(u.dtype)
