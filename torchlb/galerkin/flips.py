@@ -63,7 +63,9 @@ def _value(vertices: Tensor, normals: Tensor, pairs: Tensor) -> Tensor:
 
 def _flips(faces: Tensor, bad: Tensor) -> tuple[Tensor, Tensor, Tensor] | None:
     """Flips of the edges of the bad faces: the two faces (a, b, c), (b, a, d) and (c, d, b), (d, c, a) instead."""
-    count, size = len(faces), int(faces.max()) + 1
+    around, size = _around(faces, bad), int(faces.max()) + 1
+    faces, bad = faces[around], torch.searchsorted(around, bad)
+    count = len(faces)
     half = torch.cat([faces[:, list(edge)] for edge in EDGES])  # h is of face h mod F
     opposite = torch.cat([faces[:, 2], faces[:, 0], faces[:, 1]])
     low, high = half.amin(1), half.amax(1)
@@ -85,7 +87,16 @@ def _flips(faces: Tensor, bad: Tensor) -> tuple[Tensor, Tensor, Tensor] | None:
         return None
     a, b = half[sides].unbind(1)
     after = torch.stack([torch.stack([c, d, b], 1), torch.stack([d, c, a], 1)], dim=1)
-    return sides % count, other % count, after
+    return around[sides % count], around[other % count], after
+
+
+def _around(faces: Tensor, bad: Tensor) -> Tensor:
+    """The bad faces and two rings about them, ascending: all that the edges of their flips can belong to."""
+    for _ in range(2):
+        touched = torch.zeros(int(faces.max()) + 1, dtype=torch.bool)
+        touched[faces[bad]] = True
+        bad = touched[faces].any(1).nonzero()[:, 0]
+    return bad
 
 
 def _independent(

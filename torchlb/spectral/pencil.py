@@ -11,6 +11,7 @@ Chebyshev smoothing in K around a solve with that factor.
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -196,14 +197,14 @@ def _swept(
     stiffness, mass_matrix = part.stiffness, part.mass_matrix
     assert part.linear is not None
     cycle, product = _two_levels(stiffness, solve)
-    linear_mass = part.linear[1].astype(np.float32)
+    linear_mass, single = (m.astype(np.float32) for m in (part.linear[1], mass_matrix))
 
     def shifted(p: np.ndarray, shifts: np.ndarray) -> np.ndarray:
         return product(p) - (linear_mass @ p) * shifts
 
     count, zero, steps = u.shape[1], int(part.conserving), STEPS
     u = np.ascontiguousarray(u, dtype=np.float32)
-    values, known = _ritz((u, *(m.astype(u.dtype) @ u for m in (stiffness, mass_matrix))), count)
+    values, known = _ritz((u, product(u), single @ u), count)
     for sweep in range(SWEEPS + 1):
         u, ku, mu = known
         residual = ku - mu * values.astype(u.dtype)
@@ -262,15 +263,15 @@ def _correction(
 
 
 def _two_levels(stiffness: Sparse, coarse: Inverse) -> list[Inverse]:
-    """An approximate inverse of K, around a coarse solve, and the product with what is large of K, both in float32."""
-    crow, col, values = main_entries(*from_scipy(stiffness))
-
-    def product(x: Tensor) -> Tensor:
-        return multiply(crow, col, values, x)
-
-    sums = absolute_row_sums(crow, values)
-    cycle = two_levels(product, sums, lambda r: torch.from_numpy(coarse(r.numpy())))
-    both = cycle, product
+    """An approximate inverse of K, around a coarse solve, and the product with K, both in float32."""
+    crow, col, values = from_scipy(stiffness.astype(np.float32))
+    matrix, rough = (crow.int(), col.int(), values), main_entries(crow, col, values)
+    cycle = two_levels(
+        partial(multiply, *rough),
+        absolute_row_sums(rough[0], rough[2]),
+        lambda r: torch.from_numpy(coarse(r.numpy())),
+    )
+    both = cycle, partial(multiply, *matrix)
     return [lambda x, apply=apply: apply(torch.from_numpy(x)).numpy() for apply in both]
 
 
