@@ -5,6 +5,7 @@ from __future__ import annotations
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
+from torch.nn.functional import pad
 
 from torchlb.linalg.conjugate_gradients import Linear
 
@@ -62,15 +63,17 @@ def main_entries(
     >>> main_entries(crow, col, torch.tensor([1.0, 1e-4, 1e-4, 1.0]))[1:]
     (tensor([0, 1], dtype=torch.int32), tensor([1.0001, 1.0001]))
     """
-    values = values.float()
-    row = torch.repeat_interleave(torch.arange(len(crow) - 1, device=col.device), crow.diff())
-    root = absolute_row_sums(crow, values)[:, 0].sqrt()
-    kept = (values.abs() >= SMALL * (root[row] * root[col])) | (row == col)
-    rest = torch.zeros_like(root).index_add(0, row, torch.where(kept, 0.0, values))
-    row, col, values = row[kept], col[kept], values[kept]
-    values = torch.where(row == col, values + rest[row], values)
-    count = torch.bincount(row, minlength=len(root))
-    return torch.cat([count.new_zeros(1), count.cumsum(0)]).int(), col.int(), values
+    values, col, count = values.float(), col.int(), crow.diff()
+    row = torch.arange(len(count), dtype=col.dtype, device=col.device).repeat_interleave(count)
+    root = (SMALL * absolute_row_sums(crow, values)[:, 0]).sqrt()
+    diagonal = row == col
+    kept = (values.abs() >= root.repeat_interleave(count) * root.index_select(0, col)) | diagonal
+    rest = torch.segment_reduce(torch.where(kept, 0.0, values), "sum", offsets=crow.long())
+    places, ends = kept.nonzero()[:, 0], pad(kept.cumsum(0, dtype=torch.int32), (1, 0))
+    col, values, diagonal = (part.index_select(0, places) for part in (col, values, diagonal))
+    own = diagonal.nonzero()[:, 0]
+    values[own] += rest[col[own]]
+    return ends[crow], col, values
 
 
 def absolute_row_sums(

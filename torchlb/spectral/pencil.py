@@ -24,7 +24,7 @@ from torch import Tensor
 from torchlb.errors import EigenbasisError, warn
 from torchlb.linalg.krylov import prefers_krylov
 from torchlb.linalg.lanczos import Inverse, inverse, lanczos
-from torchlb.linalg.sparse import from_scipy, multiply
+from torchlb.linalg.sparse import multiply
 from torchlb.linalg.two_levels import absolute_row_sums, main_entries, two_levels
 from torchlb.spectral.eigenbasis import Eigenbasis
 from torchlb.spectral.eigensolver import GAP
@@ -95,7 +95,7 @@ def pencil_eigenbasis(
     tensor([0., 2.], dtype=torch.float64)
     """
     held = np.zeros(len(mass), dtype=bool) if fixed is None else np.asarray(fixed, dtype=bool)
-    matrices = [sparse.csr_array(x, dtype=np.float64) for x in (stiffness, mass_matrix)]
+    matrices = [_narrow(matrix) for matrix in (stiffness, mass_matrix)]
     if not (matrices[1].diagonal() > 0).all():
         raise EigenbasisError(
             "eigenbasis: the mass matrix is not positive; a shape so small that areas are zero in float32 has to be "
@@ -117,10 +117,10 @@ def _parts(
 
     They are numbered along the surface (Cuthill–McKee), which halves the time of the products.
     """
-    joint = sparse.csr_array(abs(stiffness) + abs(mass_matrix))
+    joint = _joined(stiffness, mass_matrix)
     count, component = csgraph.connected_components(joint, directed=False)
-    near = [] if linear is None else [sparse.csr_array(x, dtype=np.float64) for x in linear]
-    pattern = sparse.csr_array(abs(near[0]) + abs(near[1])) if near else joint
+    near = [] if linear is None else [_narrow(matrix) for matrix in linear]
+    pattern = _joined(near[0], near[1]) if near else joint
     order = csgraph.reverse_cuthill_mckee(pattern, symmetric_mode=True)
     parts = []
     for c in range(count):
@@ -134,6 +134,21 @@ def _parts(
             linear = (own[0], own[1]) if own else None
             parts.append(_Part(free, k, m, linear, len(free) == len(whole)))
     return parts
+
+
+def _narrow(matrix: Sparse) -> Sparse:
+    """With indices of 32 bits, in float64."""
+    indices, indptr = (part.astype(np.int32) for part in (matrix.indices, matrix.indptr))
+    return sparse.csr_array((matrix.data.astype(float), indices, indptr), shape=matrix.shape)
+
+
+def _joined(one: Sparse, other: Sparse) -> Sparse:
+    """|A| + |B|, without zeros; in a tenth of the time where they are on one pattern."""
+    if np.array_equal(one.indptr, other.indptr) and np.array_equal(one.indices, other.indices):
+        data = abs(one.data) + abs(other.data)
+        if data.all():
+            return sparse.csr_array((data, one.indices, one.indptr), shape=one.shape)
+    return sparse.csr_array(abs(one) + abs(other))
 
 
 def _constant(mass_matrix: Sparse) -> np.ndarray:
@@ -264,14 +279,15 @@ def _correction(
 
 def _two_levels(stiffness: Sparse, coarse: Inverse) -> list[Inverse]:
     """An approximate inverse of K, around a coarse solve, and the product with K, both in float32."""
-    crow, col, values = from_scipy(stiffness.astype(np.float32))
-    matrix, rough = (crow.int(), col.int(), values), main_entries(crow, col, values)
+    parts = stiffness.indptr, stiffness.indices, stiffness.data.astype(np.float32)
+    crow, col, values = (torch.from_numpy(part) for part in parts)
+    rough = main_entries(crow, col, values)
     cycle = two_levels(
         partial(multiply, *rough),
         absolute_row_sums(rough[0], rough[2]),
         lambda r: torch.from_numpy(coarse(r.numpy())),
     )
-    both = cycle, partial(multiply, *matrix)
+    both = cycle, partial(multiply, crow, col, values)
     return [lambda x, apply=apply: apply(torch.from_numpy(x)).numpy() for apply in both]
 
 
@@ -309,7 +325,9 @@ def _merged(
     for part, (_, _, *vectors), at in zip(parts, found, columns[:-1], strict=True):
         to = place[at : at + vectors[0].shape[1]]
         for whole, own in zip((phi, left), vectors, strict=True):
-            whole[np.ix_(part.points, to[to < keep])] = own[:, to < keep]
+            block = np.zeros((len(part.points), keep))
+            block[:, to[to < keep]] = own[:, to < keep]
+            whole[part.points] = block
     count = len(constants)
     if count:
         nulls = [part for part in parts if part.conserving]
@@ -318,7 +336,7 @@ def _merged(
         t *= np.sign(t[0, 0])
         phi[:, :count], left[:, :count] = phi[:, :count] @ t, left[:, :count] @ t
         phi[np.concatenate([part.points for part in nulls]), 0] = 1 / linalg.norm(root)
-    signs = np.where(phi[np.abs(phi).argmax(0), np.arange(keep)] < 0, -1.0, 1.0)
+    signs = np.where(-phi.min(0) > phi.max(0), -1.0, 1.0)  # the largest entry is positive
     arrays = (values[:keep].copy(), phi * signs, left * signs, errors[:keep].copy())
     eigenvalues, eigenvectors, left, errors = (torch.from_numpy(x) for x in arrays)
     return Eigenbasis(
