@@ -53,7 +53,8 @@ def element_matrices(
     gradients = torch.stack(products, 1).flatten(0, 1).flatten(1)
     squares = _squares(shape)
     blocks = torch.empty(len(g), squares.shape[1], dtype=torch.complex128)
-    for part in torch.arange(len(g)).split(CHUNK):
+    for first in range(0, len(g), CHUNK):
+        part = slice(first, first + CHUNK)
         root = area_element(g[part])
         adjugate = shape.weights[:, None] * g[part] / root[..., None]
         if conductivity is not None:

@@ -14,7 +14,7 @@ from torchlb.galerkin.assembly import CHUNK, area_element, flat_metric, metric
 from torchlb.galerkin.elements import EDGES, lattice, triangle
 from torchlb.galerkin.nodes import Nodes
 from torchlb.galerkin.rim import RimCurves, rim_curves
-from torchlb.geometry.vectors import dot
+from torchlb.geometry.vectors import at, dot
 from torchlb.geometry.vertex_fits import VertexFits
 
 NEWTON_STEPS = 4
@@ -87,9 +87,9 @@ def curve(surface: Surface, nodes: Nodes) -> tuple[CurvedMesh, Float[Tensor, "F 
     rim = (nodes.uses == 1).nonzero()[:, 0]
     degree = max(int(fits.degree.max()), 2)
     curves = rim_curves(points, nodes.edges[rim], degree + 2 + degree % 2)
-    flat = torch.einsum("xv,xvn->xn", nodes.shares, points[nodes.corners])
+    flat = torch.einsum("xv,xvn->xn", nodes.shares, at(points, nodes.corners))
     start = flat + _rim_displacement(points, nodes, rim, curves)
-    along = normalize(torch.einsum("xv,xvn->xn", nodes.shares, surface.normals[nodes.corners]))
+    along = normalize(torch.einsum("xv,xvn->xn", nodes.shares, at(surface.normals, nodes.corners)))
     ends = node_ends(nodes)
     height, sound = _heights(surface, nodes, ends, start, along)
     outside = torch.zeros(len(nodes.faces), dtype=torch.bool)
@@ -191,14 +191,14 @@ def _met(
     along: Tensor,
 ) -> Float[Tensor, " E"]:
     """t where the lines of the nodes meet the graphs of the vertices' fits, by Newton's method; ∞ where they do not."""
-    fits, frame, normal = surface.fits, surface.frames[vertex], surface.normals[vertex]
+    fits, frame, normal = surface.fits, at(surface.frames, vertex), at(surface.normals, vertex)
     top, radius = int(fits.degree.max()), fits.radius[vertex, None]
     terms = num_monomials(2, top) - 1
-    heights = (fits.heights[vertex, :terms] @ normal[..., None])[..., 0]
+    heights = (at(fits.heights, vertex)[:, :terms] @ normal[..., None])[..., 0]
     slopes = derivative_coefficients(heights, 2, top)
-    direction = along[node]
+    direction = at(along, node)
     turn = (direction[:, None] @ frame)[:, 0] / radius
-    offset, t = start[node] - surface.points[vertex], torch.zeros_like(radius[:, 0])
+    offset, t = at(start, node) - at(surface.points, vertex), torch.zeros_like(radius[:, 0])
     for _ in range(NEWTON_STEPS):
         p = offset + t[:, None] * direction
         y = (p[:, None] @ frame)[:, 0] / radius
@@ -227,7 +227,8 @@ def _flattened(
 
     `stand` is where nodes are on flat triangles and on the surface; `whole`, which of those inside faces may be there.
     """
-    sides = (points[nodes.faces[:, [1, 2, 0]]] - points[nodes.faces]).norm(dim=2)
+    corners = at(points, nodes.faces)
+    sides = (corners.roll(-1, dims=1) - corners).norm(dim=2)
     lengths = mollified(sides)
     plane, shape = flat_metric(lengths), triangle(nodes.degree)
     area = area_element(plane)

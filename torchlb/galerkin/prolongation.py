@@ -11,6 +11,7 @@ from torch import Tensor
 
 from torchlb.fits.weights import cardinal
 from torchlb.galerkin.curving import CurvedMesh, Ends, Surface, node_ends
+from torchlb.geometry.vectors import at
 from torchlb.geometry.vertex_fits import Fits
 
 AT_ONCE = 2**11
@@ -67,9 +68,12 @@ def _fill(
     count = len(surface.points)
     for block, part, own in _of_fits(surface.fits.hand_over(), ends, by_fit, count):
         used, vertex = own >= 0, block.vertices[part]
-        offset = mesh.places[count + ends.node[own]] - surface.points[vertex, None]
+        end = own.clamp_min(0)
+        offset = at(mesh.places, count + at(ends.node, end)) - surface.points[vertex, None]
         y = offset @ surface.frames[vertex] / surface.fits.radius[vertex, None, None]
-        weights = cardinal(block.coefficients[part], y, block.degree) * ends.share[own][..., None]
+        weights = (
+            cardinal(block.coefficients[part], y, block.degree) * at(ends.share, end)[..., None]
+        )
         place = first[own[used]][:, None] + torch.arange(weights.shape[2])
         indices[place] = block.points[part].int()[used.nonzero()[:, 0]]
         data[place] = weights[used]

@@ -22,7 +22,7 @@ from torchlb.geometry.neighbors import (
     admissible_neighbors,
     planes_of,
 )
-from torchlb.geometry.vectors import dot
+from torchlb.geometry.vectors import at, dot
 from torchlb.geometry.vertex_fits import VertexFits, is_regular
 
 NO_NORMAL = 1e-12
@@ -76,7 +76,7 @@ def mesh_frames(
     irrelevant, and so is the codimension. Error O(h) on a smooth surface.
     """
     dim = faces.shape[1] - 1
-    edges = vertices[faces[:, 1:]] - vertices[faces[:, :1]]
+    edges = _edges(vertices, faces)
     basis, triangle = torch.linalg.qr(edges.mT)
     area = torch.diagonal(triangle, dim1=-2, dim2=-1).prod(-1).abs()
     projector = (area[:, None, None] * (basis @ basis.mT)).repeat_interleave(dim + 1, dim=0)
@@ -103,11 +103,11 @@ def refine_frames(
     """
     points, frames = balls.points, balls.frames[centers]
     order = torch.zeros(len(centers), dtype=torch.int64)
-    middles = (points[balls.longest[centers]] - points[centers, None]) @ frames / 2
+    middles = (at(points, balls.longest[centers]) - points[centers, None]) @ frames / 2
     search = Search(balls, centers, candidates)
     for number, rows, index in search:
-        frame = frames[rows]
-        offset = points[index[:, 1:]] - points[index[:, :1]]
+        frame, places = at(frames, rows), at(points, index)
+        offset = places[:, 1:] - places[:, :1]
         coords = offset @ frame
         fit = centered_fit(coords, candidates[number].degree)
         heights = offset - coords @ frame.mT
@@ -166,16 +166,16 @@ def local_heights(
     coords: Float[Tensor, "B K d"],
 ) -> Float[Tensor, "B K n"]:
     """e − E_i y, from the points y of the centre's tangent plane to the neighbours, as vectors of space."""
-    return points[neighbors] - points[centers, None] - coords @ frames[centers].mT
+    return at(points, neighbors) - at(points, centers)[:, None] - coords @ at(frames, centers).mT
 
 
 def _tangent_offsets(points: Tensor, frames: Tensor, centers: Tensor, neighbors: Tensor) -> Tensor:
-    return (points[neighbors] - points[centers, None]) @ frames[centers]
+    return (at(points, neighbors) - at(points, centers)[:, None]) @ at(frames, centers)
 
 
 def _normal_offsets(points: Tensor, frames: Tensor, centers: Tensor, neighbors: Tensor) -> Tensor:
-    offset = points[neighbors] - points[centers, None]
-    theirs = frames[neighbors].mT  # (B, K, d, n)
+    offset = at(points, neighbors) - at(points, centers)[:, None]
+    theirs = at(frames, neighbors).mT  # (B, K, d, n)
     return torch.linalg.solve(theirs @ frames[centers, None], theirs @ offset[..., None])[..., 0]
 
 
@@ -205,12 +205,18 @@ def normals_of_frames(frames: Float[Tensor, "N n d"]) -> Float[Tensor, "N n"]:
     ]
 
 
+def _edges(vertices: Float[Tensor, "N n"], faces: Int[Tensor, "F v"]) -> Float[Tensor, "F edges n"]:
+    """From the first corner of each face to the others."""
+    corners = at(vertices, faces)
+    return corners[:, 1:] - corners[:, :1]
+
+
 def face_normals(vertices: Float[Tensor, "N n"], faces: Int[Tensor, "F n"]) -> Float[Tensor, "N n"]:
     """Area-weighted sum at every vertex of the normals of its faces (segments in R², triangles in R³).
 
     Counter-clockwise triangles point at the viewer, counter-clockwise polygons outward.
     """
-    edges = vertices[faces[:, 1:]] - vertices[faces[:, :1]]
+    edges = _edges(vertices, faces)
     if vertices.shape[1] == 3:
         normal = torch.linalg.cross(edges[:, 0], edges[:, 1])
     else:
@@ -226,9 +232,8 @@ def vertex_normals(
 ) -> Float[Tensor, "N n"]:
     """`face_normals` of length one; zero where a vertex has none but for the rounding of its faces."""
     total = face_normals(vertices, faces)
-    edges = vertices[faces[:, 1:]] - vertices[faces[:, :1]]
-    size = torch.zeros_like(vertices[:, 0])
+    size, product = torch.zeros_like(vertices[:, 0]), _edges(vertices, faces).norm(dim=-1).prod(1)
     for corner in faces.T:
-        size.index_add_(0, corner, edges.norm(dim=-1).prod(1))
+        size.index_add_(0, corner, product)
     length = total.norm(dim=1)
     return torch.where((length > NO_NORMAL * size)[:, None], total / length[:, None], 0.0)

@@ -19,7 +19,7 @@ from scipy import sparse
 from scipy.spatial import KDTree
 from torch import Tensor
 
-from torchlb.geometry.vectors import dot
+from torchlb.geometry.vectors import at, dot
 from torchlb.geometry.voronoi import natural_neighbors
 
 MIN_ALIGNMENT = 0.5
@@ -276,7 +276,7 @@ class GraphBalls:
         self, centers: Int[Tensor, " B"], size: int
     ) -> tuple[Int[Tensor, "B K"], Int[Tensor, " B"]]:
         local, others = self._reach(centers, size)
-        offset = self.points.index_select(0, others) - self.points[centers[local]]
+        offset = at(self.points, others) - at(self.points, at(centers, local))
         square = dot(offset, offset)
         square[others == centers[local]] = -1.0  # before all that coincide with it
         total = torch.bincount(local, minlength=len(centers))
@@ -292,9 +292,7 @@ class GraphBalls:
     ) -> Bool[Tensor, " P"]:
         good = admissible(self.points, self._planes, centers, others)
         if self.sides is not None:
-            good &= (
-                dot(self.sides.index_select(0, centers), self.sides.index_select(0, others)) >= 0
-            )
+            good &= dot(at(self.sides, centers), at(self.sides, others)) >= 0
         return good
 
     def _reach(

@@ -15,6 +15,7 @@ from scipy.sparse import csgraph
 from torch import Tensor
 
 from torchlb.geometry.neighbors import MAX_SLOPE, MIN_ALIGNMENT
+from torchlb.geometry.vectors import at, dot
 
 SMOOTH = 0.97
 """An edge whose ends' normals mirror each other better than this (within 14°) and that lies flat is trusted first."""
@@ -43,10 +44,10 @@ def _across(
     j: Int[Tensor, " P"],
 ) -> tuple[Float[Tensor, " P"], Float[Tensor, " P"]]:
     """(cosine between n_j and the mirror image of n_i, larger slope of the edge over the planes at its two ends)."""
-    edge = points[j] - points[i]
+    edge, ends = at(points, j) - at(points, i), [at(normals, end) for end in (i, j)]
     edge = edge / edge.norm(dim=1, keepdim=True)
-    rise_i, rise_j = ((edge * normals[end]).sum(1) for end in (i, j))
-    cosine = (normals[i] * normals[j]).sum(1) - 2 * rise_i * rise_j
+    rise_i, rise_j = (dot(edge, end) for end in ends)
+    cosine = dot(*ends) - 2 * rise_i * rise_j
     return cosine, torch.maximum(rise_i.abs(), rise_j.abs())
 
 
@@ -106,7 +107,7 @@ def thin_sides(
     below the tangent plane and yet has nearly the same one. Elsewhere a shape may have one side only.
     """
     i, j = pairs
-    opposite = (oriented[i] * oriented[j]).sum(1).abs() >= MIN_ALIGNMENT
+    opposite = dot(at(oriented, i), at(oriented, j)).abs() >= MIN_ALIGNMENT
     opposite &= _across(points, oriented, i, j)[1] > MAX_SLOPE
     thin = torch.zeros(len(points), dtype=torch.bool)
     thin[torch.cat([i[opposite], j[opposite]])] = True
