@@ -76,7 +76,8 @@ def monomial_derivatives(
     dim = coords.shape[-1]
     lower = torch.cat([torch.ones_like(coords[..., :1]), monomials(coords, degree - 1)], dim=-1)
     factor, place = _lowered(dim, degree)
-    return factor.to(coords) * lower[..., place.to(coords.device)]
+    taken = lower.index_select(-1, place.to(coords.device).flatten())
+    return factor.to(coords) * taken.unflatten(-1, place.shape)
 
 
 def derivative_coefficients(

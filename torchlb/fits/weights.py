@@ -48,8 +48,9 @@ class Weights:
     height_residual: Float[Tensor, " B"]
 
     def __getitem__(self, rows: Tensor) -> Weights:
-        """The given stencils."""
-        return Weights(*(getattr(self, f.name)[rows] for f in fields(Weights)))
+        """The given stencils (a mask, or positions in any order)."""
+        rows = rows.nonzero()[:, 0] if rows.dtype == torch.bool else rows
+        return Weights(*(getattr(self, f.name).index_select(0, rows) for f in fields(Weights)))
 
     def updated(self, rows: Tensor, part: Weights) -> Weights:
         """The same with other stencils in these rows."""
@@ -90,11 +91,11 @@ def _finish(
     """Return from scaled coordinates to units of length."""
     rho = radius[:, None, None]
     hessian = weights[..., dim:] / rho.square()
-    pure = [a == b for a in range(dim) for b in range(a, dim)][: hessian.shape[-1]]
+    pure = [float(a == b) for a in range(dim) for b in range(a, dim)][: hessian.shape[-1]]
     return Weights(
         gradient=weights[..., :dim] / rho,
         hessian=hessian,
-        laplacian=hessian[..., pure].sum(-1),
+        laplacian=hessian @ hessian.new_tensor(pure),
         radius=radius,
         condition=condition,
         residual=residual,

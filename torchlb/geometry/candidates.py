@@ -119,8 +119,9 @@ class Search:
         index = count = torch.empty(0)
         for number, candidate in enumerate(self.candidates):
             left = self._next[pending] < len(self.candidates)
-            pending = pending[left]
-            index, count = (index[left], count[left]) if held else (index, count)
+            if not left.all():
+                pending = pending[left]
+                index, count = (index[left], count[left]) if held else (index, count)
             eligible = self._next[pending] <= number
             if not eligible.any():
                 continue
