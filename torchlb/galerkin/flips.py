@@ -25,10 +25,9 @@ def flipped(vertices: Tensor, faces: Tensor) -> Tensor:
 
     Only edges of two triangles, and only where the new edge is not there yet. The normals are renewed each round.
     """
-    faces = faces.clone()
+    faces, normals = faces.clone(), vertex_normals(vertices, faces)
+    alignment, quality = _scores(vertices, normals, faces)
     for _ in range(ROUNDS):
-        normals = vertex_normals(vertices, faces)
-        alignment, quality = _scores(vertices, normals, faces)
         bad = ((alignment < ALIGNED) | (quality < GOOD)).nonzero()[:, 0]
         pairs = _flips(faces, bad) if len(bad) else None
         if pairs is None:
@@ -41,7 +40,18 @@ def flipped(vertices: Tensor, faces: Tensor) -> Tensor:
         if len(chosen) == 0:
             return faces
         faces[left[chosen]], faces[right[chosen]] = after[chosen, 0], after[chosen, 1]
+        part = _touching(faces, after[chosen])
+        renewed = torch.unique(after[chosen])
+        normals[renewed] = vertex_normals(vertices, faces[part])[renewed]
+        alignment[part], quality[part] = _scores(vertices, normals, faces[part])
     return faces
+
+
+def _touching(faces: Tensor, corners: Tensor) -> Tensor:
+    """The faces with one of these vertices, ascending."""
+    touched = torch.zeros(int(faces.max()) + 1, dtype=torch.bool)
+    touched[corners] = True
+    return touched[faces].any(1).nonzero()[:, 0]
 
 
 def _scores(vertices: Tensor, normals: Tensor, faces: Tensor) -> tuple[Tensor, Tensor]:
@@ -63,7 +73,9 @@ def _value(vertices: Tensor, normals: Tensor, pairs: Tensor) -> Tensor:
 
 def _flips(faces: Tensor, bad: Tensor) -> tuple[Tensor, Tensor, Tensor] | None:
     """Flips of the edges of the bad faces: the two faces (a, b, c), (b, a, d) and (c, d, b), (d, c, a) instead."""
-    around, size = _around(faces, bad), int(faces.max()) + 1
+    around, size = bad, int(faces.max()) + 1
+    for _ in range(2):  # all that the edges of their flips can belong to
+        around = _touching(faces, faces[around])
     faces, bad = faces[around], torch.searchsorted(around, bad)
     count = len(faces)
     half = torch.cat([faces[:, list(edge)] for edge in EDGES])  # h is of face h mod F
@@ -88,15 +100,6 @@ def _flips(faces: Tensor, bad: Tensor) -> tuple[Tensor, Tensor, Tensor] | None:
     a, b = half[sides].unbind(1)
     after = torch.stack([torch.stack([c, d, b], 1), torch.stack([d, c, a], 1)], dim=1)
     return around[sides % count], around[other % count], after
-
-
-def _around(faces: Tensor, bad: Tensor) -> Tensor:
-    """The bad faces and two rings about them, ascending: all that the edges of their flips can belong to."""
-    for _ in range(2):
-        touched = torch.zeros(int(faces.max()) + 1, dtype=torch.bool)
-        touched[faces[bad]] = True
-        bad = touched[faces].any(1).nonzero()[:, 0]
-    return bad
 
 
 def _independent(
