@@ -260,7 +260,7 @@ class PairSystem:
         """The solution by linear elements."""
         blocks = r.split([count for _, count in levels], dim=1)
         solved = [self.factor(t).solve(block) for (t, _), block in zip(levels, blocks, strict=True)]
-        return self._inside(torch.cat(solved, dim=1))
+        return self._inside(solved[0] if len(solved) == 1 else torch.cat(solved, dim=1))
 
     def factor(self, t: float | None) -> Factor:
         """That of M₁ + tK₁, or of K₁ with a little of M₁ that makes it definite."""
