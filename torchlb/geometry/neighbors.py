@@ -92,9 +92,9 @@ def admissible(
 
 
 def _admissible_part(points: Tensor, planes: Tensor, centers: Tensor, others: Tensor) -> Tensor:
-    offset = points.index_select(0, others) - points.index_select(0, centers)
+    offset = at(points, others) - at(points, centers)
     total = dot(offset, offset)
-    mine, theirs = planes.index_select(0, centers), planes.index_select(0, others)
+    mine, theirs = at(planes, centers), at(planes, others)
     if planes.ndim == 3:
         flat = torch.einsum("pn,pnd->pd", offset, mine)
         height = total - dot(flat, flat)
@@ -276,9 +276,10 @@ class GraphBalls:
         self, centers: Int[Tensor, " B"], size: int
     ) -> tuple[Int[Tensor, "B K"], Int[Tensor, " B"]]:
         local, others = self._reach(centers, size)
-        offset = at(self.points, others) - at(self.points, at(centers, local))
+        center = at(centers, local)
+        offset = at(self.points, others) - at(self.points, center)
         square = dot(offset, offset)
-        square[others == centers[local]] = -1.0  # before all that coincide with it
+        square[others == center] = -1.0  # before all that coincide with it
         total = torch.bincount(local, minlength=len(centers))
         place = torch.arange(len(local)) - (total.cumsum(0) - total)[local]
         shape = len(centers), max([size, *total.tolist()])

@@ -16,7 +16,7 @@ from torch import Tensor
 
 from torchlb.geometry.cocone import FLAT, TINY, Tetrahedra, refined_normals
 from torchlb.geometry.manifold import edges_of, spanning_pairs, two_orientations
-from torchlb.geometry.vectors import dot
+from torchlb.geometry.vectors import at, dot
 
 LONG = 1.4
 """A Voronoi cell that reaches so many times as far as along the normal has another one."""
@@ -59,9 +59,9 @@ class Poles:
         """Of every point the number of the ray with the largest value."""
         count = len(self.tetrahedra.points)
         most = value.new_full((count,), -torch.inf).scatter_reduce(0, self.point, value, "amax")
-        at = (value == most.index_select(0, self.point)).nonzero()[:, 0]
+        rays = (value == at(most, self.point)).nonzero()[:, 0]
         last = torch.full((count,), len(value) - 1)
-        return last.scatter_reduce(0, self.point[at], at, "amin")
+        return last.scatter_reduce(0, self.point[rays], rays, "amin")
 
     @cached_property
     def _longest(self) -> tuple[Float[Tensor, "N 3"], Float[Tensor, " N"]]:
@@ -72,7 +72,7 @@ class Poles:
 
     def corrected(self, normals: Float[Tensor, "N 3"]) -> Float[Tensor, "N 3"]:
         """The normals, but for those along which the Voronoi cell is short: there the direction where it is longest."""
-        along = dot(self.ray, normals.index_select(0, self.point)).abs()
+        along = dot(self.ray, at(normals, self.point)).abs()
         longest, length = self._longest
         short = along[self.farthest(along)] * LONG < length
         return torch.where(short[:, None], longest / length[:, None], normals)
@@ -83,7 +83,7 @@ class Poles:
         The two poles of a point lie on two sides, the surer the straighter they are opposed; two spheres that share a
         triangle lie on one side, the surer the deeper they intersect. The surest of these that close no circle decide.
         """
-        rise = dot(self.ray, normals.index_select(0, self.point))
+        rise = dot(self.ray, at(normals, self.point))
         up, down = self.farthest(rise), self.farthest(-rise)
         opposed = -_cosine(self.ray[up], self.ray[down]).numpy()
         one, two, sure = self._touching()

@@ -138,8 +138,8 @@ def _parts(
 
 def _narrow(matrix: Sparse) -> Sparse:
     """With indices of 32 bits, in float64."""
-    indices, indptr = (part.astype(np.int32) for part in (matrix.indices, matrix.indptr))
-    return sparse.csr_array((matrix.data.astype(float), indices, indptr), shape=matrix.shape)
+    ends = (part.astype(np.int32, copy=False) for part in (matrix.indices, matrix.indptr))
+    return sparse.csr_array((matrix.data.astype(float, copy=False), *ends), shape=matrix.shape)
 
 
 def _joined(one: Sparse, other: Sparse) -> Sparse:
