@@ -192,6 +192,17 @@ def test_the_potential_of_a_gradient_is_the_function(kind):
         assert potential(lb, turned, tolerance=tolerance).abs().max() <= bound * size
 
 
+def test_linear_elements_solve_as_well_in_float32():
+    """Where K is singular, too: constants come back from sums in that type."""
+    vertices, faces = Torus().mesh(3000)
+    lb = LaplaceBeltrami.from_mesh(vertices, faces)
+    source = features(lb, 20) + vertices[:, :1]
+    expected = potential(lb, None, source)
+    single = potential(lb.float(), None, source.float())
+    assert single.dtype == torch.float32
+    assert (single - expected).norm() < 1e-4 * expected.norm()
+
+
 @pytest.mark.parametrize("cached", [1, 4 * 250, 4 * 10000])
 def test_a_batch_diffuses_in_blocks_of_shapes(eight, monkeypatch, cached):
     """One shape, a few or all at a time: the same, derivatives in x and t too."""
