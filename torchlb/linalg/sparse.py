@@ -59,14 +59,19 @@ def csr_product(
     return _product(list(pattern), values, x, transposed)
 
 
-def _compute_dtype(left: Tensor, right: Tensor) -> torch.dtype:
+def compute_dtype(left: Tensor, right: Tensor) -> torch.dtype:
+    """The wider of two types, at least float32.
+
+    >>> compute_dtype(torch.ones(1).bfloat16(), torch.ones(1).half())
+    torch.float32
+    """
     wider = torch.promote_types(left.dtype, right.dtype)
     return torch.promote_types(wider, torch.float32)
 
 
 def _result_dtype(values: Tensor, x: Tensor) -> torch.dtype:
     half = x.dtype in (torch.float16, torch.bfloat16)
-    return x.dtype if half else _compute_dtype(values, x)
+    return x.dtype if half else compute_dtype(values, x)
 
 
 @cache
@@ -142,7 +147,7 @@ def _product(pattern: Sequence[Tensor], values: Tensor, x: Tensor, transposed: b
     crow, col, crow_t, col_t, order_t = pattern
     if transposed:
         crow, col, values = crow_t, col_t, values.index_select(0, order_t)
-    dtype = _compute_dtype(values, x)
+    dtype = compute_dtype(values, x)
     return multiply(crow, col, values.to(dtype), x.to(dtype)).to(_result_dtype(values, x))
 
 
@@ -154,7 +159,7 @@ def _product(pattern: Sequence[Tensor], values: Tensor, x: Tensor, transposed: b
 def _values_gradient(pattern: Sequence[Tensor], left: Tensor, right: Tensor) -> Tensor:
     """Σ_c left[row, c] right[col, c] at every entry (row, col), without the (nnz, C) of its terms."""
     crow, col, *_ = pattern
-    dtype = _compute_dtype(left, right)
+    dtype = compute_dtype(left, right)
     matrix = csr_tensor(
         crow, col, torch.zeros(len(col), dtype=dtype, device=left.device), len(right)
     )
@@ -170,7 +175,7 @@ def _(pattern: Sequence[Tensor], values: Tensor, x: Tensor, transposed: bool) ->
 
 @_values_gradient.register_fake
 def _(pattern: Sequence[Tensor], left: Tensor, right: Tensor) -> Tensor:
-    return left.new_empty(pattern[1].shape[0], dtype=_compute_dtype(left, right))
+    return left.new_empty(pattern[1].shape[0], dtype=compute_dtype(left, right))
 
 
 def _save(ctx: Any, inputs: tuple[Any, ...], output: Tensor) -> None:

@@ -20,6 +20,7 @@ from torch.nn.functional import softplus
 
 from torchlb.errors import DiffusionError
 from torchlb.linalg.exponential import heat
+from torchlb.linalg.sparse import compute_dtype
 from torchlb.nn.checks import as_columns, as_times, check_choice, check_features
 from torchlb.nn.pair_flow import pair_flow
 from torchlb.operator.laplace_beltrami import LaplaceBeltrami
@@ -71,7 +72,7 @@ def heat_flow(
     """
     method = checked_method(method or ("contour" if lb.has_weak_form else "deflated"))
     x = as_columns(f, lb)
-    dtype = torch.promote_types(torch.promote_types(x.dtype, lb.values.dtype), torch.float32)
+    dtype = compute_dtype(x, lb.values)
     time = as_times(t, x, dtype)
     with torch.autocast(x.device.type, enabled=False):
         y = _flow(lb, x.to(dtype), time, method, k, tolerance)

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from torchlb.errors import InputError
 from torchlb.linalg.once import once_differentiable
-from torchlb.linalg.sparse import symmetric_product
+from torchlb.linalg.sparse import compute_dtype, symmetric_product
 from torchlb.nn.checks import as_columns, as_times, uncompiled
 from torchlb.nn.conduction import Conducting, conducting
 from torchlb.nn.systems import SINGLE, solve_columns
@@ -63,8 +63,7 @@ def implicit_step(
     True
     """
     x = as_columns(f, lb)
-    dtype = torch.promote_types(torch.promote_types(x.dtype, lb.values.dtype), torch.float32)
-    dtype = torch.float64 if tolerance < SINGLE else dtype
+    dtype = torch.float64 if tolerance < SINGLE else compute_dtype(x, lb.values)
     columns, time = _columns(x, as_times(t, x, torch.float64), dtype)
     given, poured = (_data(lb, d, n, f) for d, n in ((boundary_values, 0), (flux, 1)))
     medium = lb if conductivity is None else conducting(lb, conductivity)
@@ -144,8 +143,7 @@ def potential(
             for values, part in zip(lb.gradient_values, weighted.unbind(-2), strict=True)
         ]
     right = sum(products[1:], products[0])
-    dtype = torch.promote_types(torch.promote_types(right.dtype, lb.values.dtype), torch.float32)
-    dtype = dtype if tolerance is None else torch.float64
+    dtype = compute_dtype(right, lb.values) if tolerance is None else torch.float64
     right = right if lb.has_weak_form else right / lb.mass.double()[:, None]
     columns, _ = _columns(right, None, dtype)
     if source is None and field is not None:
