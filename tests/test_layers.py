@@ -194,7 +194,7 @@ def test_the_potential_of_a_gradient_is_the_function(kind):
 
 @pytest.mark.parametrize("unit", [1e-12, 1.0, 1e12])
 def test_linear_elements_solve_as_well_in_float32(unit):
-    """Where K is singular, too: constants come back from sums in that type. Beside a much smaller component."""
+    """Where K is singular, too, beside a much smaller component; in units whose squares leave the range of float32."""
     large, small = Torus().mesh(3000), Ellipsoid().mesh(500)
     vertices = torch.cat([large[0], 1e-3 * small[0] + 50.0])
     lb = LaplaceBeltrami.from_mesh(unit * vertices, torch.cat([large[1], small[1] + len(large[0])]))

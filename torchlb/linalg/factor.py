@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from importlib import import_module
 from typing import Any
 
 import numpy as np
@@ -32,7 +31,7 @@ def cholesky(matrix: Any) -> Factor:
     """Factor of a sparse matrix, (N, N), scipy's or what scipy takes, for right-hand sides on any device.
 
     By CHOLMOD (`cholespy`), 2.5 times faster than SuperLU and 6 times in the solves. SuperLU takes over where cholespy
-    is not installed or the matrix is not symmetric and positive definite; solves raise RuntimeError if it is singular.
+    is not installed or the matrix is not symmetric and positive definite; it raises RuntimeError if it is singular.
 
     >>> cholesky(sparse.diags_array([2.0, 4.0])).solve(torch.tensor([2.0, 2.0]))
     tensor([1.0000, 0.5000])
@@ -41,59 +40,54 @@ def cholesky(matrix: Any) -> Factor:
 
 
 class Factor:
-    """A⁻¹ of a sparse matrix, factored in float64 at the first solve on a device and in a type."""
+    """A⁻¹ of a sparse matrix; factored in float64 once for every kind of device that a right-hand side is on.
+
+    Attributes
+    ----------
+    is_cholesky : whether it is a Cholesky factor, the matrix thus positive definite.
+    """
 
     def __init__(self, matrix: sparse.csr_array) -> None:
         self._matrix, self._solvers = matrix, {}
         skew = abs(matrix - matrix.T)
         self._symmetric = skew.nnz == 0 or skew.max() <= SYMMETRY * abs(matrix).max()
-        self._definite = self._symmetric and bool((matrix.diagonal() > 0).all())
-
-    @property
-    def is_cholesky(self) -> bool:
-        """Whether it is a Cholesky factor, the matrix thus positive definite."""
-        if not self._solvers:
-            self._solver(torch.device("cpu"), torch.float64)
-        return self._definite
+        self.is_cholesky = self._symmetric and bool((matrix.diagonal() > 0).all())
+        self._solver(torch.device("cpu"))
 
     def solve(self, b: Float[Tensor, "N ..."]) -> Float[Tensor, "N ..."]:
-        """A⁻¹b, (N,) or (N, C), in the type and on the device of b; without derivatives.
-
-        Float32 is solved in float64, too, on the CPU without a copy.
-        """
-        single = b.device.type == "cpu" and b.dtype == torch.float32
-        dtype = torch.float32 if single else torch.float64
-        solver, most = self._solver(b.device, dtype), COLUMNS.get(b.device.type, 1)
+        """A⁻¹b, (N,) or (N, C), in the type and on the device of b; without derivatives."""
+        solver, most = self._solver(b.device), COLUMNS.get(b.device.type, 1)
         if isinstance(solver, SuperLU):
             return torch.from_numpy(solver.solve(b.detach().double().cpu().numpy())).to(b)
         if b.ndim > 1 and b.shape[1] > most:
             return torch.cat([self.solve(part) for part in b.split(most, dim=1)], dim=1)
-        right = b.detach().to(dtype).contiguous()
+        right = b.detach().to(torch.float64).contiguous()
         x = torch.empty_like(right)
         if right.numel():
             solver.solve(right, x)
         return x.to(b.dtype)
 
-    def _solver(self, device: torch.device, dtype: torch.dtype) -> Any:
-        if self._definite and (device, dtype) not in self._solvers:
-            try:
-                self._solvers[device, dtype] = _cholespy(self._matrix, device, dtype)
-            except (ImportError, ValueError):  # not there; not positive definite
-                self._definite = False
-        if self._definite:
-            return self._solvers[device, dtype]
-        if None not in self._solvers:
-            matrix = sparse.csc_array(self._matrix)
-            self._solvers[None] = factorized(matrix, 0.0 if self._symmetric else 1e-1)
-        return self._solvers[None]
+    def _solver(self, device: torch.device) -> Any:
+        key = device if self.is_cholesky else torch.device("cpu")
+        if key not in self._solvers:
+            self._solvers[key] = self._factored(key)
+        return self._solvers[key]
+
+    def _factored(self, device: torch.device) -> Any:
+        try:
+            if self.is_cholesky:
+                return _cholespy(self._matrix, device)
+        except (ImportError, ValueError):  # not there; not positive definite
+            self.is_cholesky = False
+        return factorized(sparse.csc_array(self._matrix), 0.0 if self._symmetric else 1e-1)
 
 
-def _cholespy(matrix: sparse.csr_array, device: torch.device, dtype: torch.dtype) -> Any:
-    cholespy: Any = import_module("cholespy")
-    solver = cholespy.CholeskySolverF if dtype == torch.float32 else cholespy.CholeskySolverD
+def _cholespy(matrix: sparse.csr_array, device: torch.device) -> Any:
+    from cholespy import CholeskySolverD, MatrixType  # pyright: ignore[reportAttributeAccessIssue]
+
     # As CSC the arrays are sorted and reallocated in place, at times wrongly; CSR, here the same, is copied.
     indptr, indices = (
         torch.from_numpy(t.astype(np.int32)) for t in (matrix.indptr, matrix.indices)
     )
     parts = (t.to(device) for t in (indptr, indices, torch.from_numpy(matrix.data)))
-    return solver(len(matrix.indptr) - 1, *parts, cholespy.MatrixType.CSR)
+    return CholeskySolverD(len(matrix.indptr) - 1, *parts, MatrixType.CSR)

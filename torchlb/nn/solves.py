@@ -143,9 +143,7 @@ def potential(
             for values, part in zip(lb.gradient_values, weighted.unbind(-2), strict=True)
         ]
     right = sum(products[1:], products[0])
-    dtype = compute_dtype(right, lb.values) if tolerance is None else torch.float64
-    right = right if lb.has_weak_form else right / lb.mass.double()[:, None]
-    columns, _ = _columns(right, None, dtype)
+    columns, _ = _columns(right if lb.has_weak_form else right / lb.mass.double()[:, None], None)
     if source is None and field is not None:
         source = field[..., 0, :]
     assert source is not None, "neither field nor source"

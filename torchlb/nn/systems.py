@@ -157,19 +157,18 @@ class PairSystem:
         """The solution, zero at Dirichlet points, of mean zero on the other components of a Poisson problem.
 
         On these, constants are split off, for which M + tK is M: they and the mass stay to rounding. A tolerance of
-        None takes the factors' solution, that of linear elements, in the type of b.
+        None takes the factors' solution, that of linear elements.
         """
-        b = b if tolerance is None else b.double()
         if b.shape[1] == 0:
-            return b
+            return b.double()
         if time is not None and bool((time.diff() < 0).any()):  # columns of a factor side by side
             order = time.argsort()
             return self.solve(b[:, order], time[order], tolerance)[:, order.argsort()]
         if time is not None and bool(time[0] == time[-1]):
             time = time[:1]
-        b = self._inside(b)
+        b = self._inside(b.double())
         mean = self._mean(self.one, b)
-        right = torch.addcmul(b, self.ones_mass.to(b), mean, value=-1)
+        right = torch.addcmul(b, self.ones_mass, mean, value=-1)
         near = partial(self._near, self._levels(time, b.shape[1]))
         x = near(right) if tolerance is None else self._solved(right, time, tolerance, near)
         shift = -self._mean(self.ones_mass, x)
@@ -282,12 +281,8 @@ class PairSystem:
         return cholesky((matrix + matrix.T) / 2)
 
     def _mean(self, weights: Tensor, x: Tensor) -> Tensor:
-        """Weighted sums over components that no Dirichlet point holds, by their areas; 0 on the others.
-
-        In float64: the factor of K makes some 10⁷ of what is left of constants.
-        """
-        means = self.components.sums(weights, x.double()) / self.area
-        return torch.where(self.components.free, means, 0.0).to(x)
+        """Weighted sums over components that no Dirichlet point holds, by their areas; 0 on the others."""
+        return torch.where(self.components.free, self.components.sums(weights, x) / self.area, 0.0)
 
     def _inside(self, x: Tensor) -> Tensor:
         return x if self.free is None else x * self.free.to(x)
