@@ -14,7 +14,7 @@ from scipy import sparse
 from scipy.sparse import csgraph
 
 Faces = Int[np.ndarray, "_ 3"]
-VOTE = 100
+VOTE, EDGE = 100, 30
 """Of a corner whose normal is that of its face, and of an edge: flows are whole numbers."""
 CLOSED = 1000
 """A closed fan comes before an open one of up to so many triangles."""
@@ -233,7 +233,7 @@ def _cut(
     kept, back = np.full(count, count), np.full(count, count + 1)  # source and sink
     node, votes = np.arange(count), np.rint(VOTE * vote).astype(np.int32)
     ends = np.concatenate([i, j, kept, node]), np.concatenate([j, i, node, back])
-    pairs = np.full(2 * len(i), VOTE, dtype=np.int32)
+    pairs = np.full(2 * len(i), EDGE, dtype=np.int32)
     capacity = np.concatenate([pairs, np.maximum(votes, 0), np.maximum(-votes, 0)])
     graph = sparse.csr_array((capacity, ends), shape=(count + 2, count + 2))
     left = graph - csgraph.maximum_flow(graph, count, count + 1).flow
