@@ -219,11 +219,42 @@ def test_poles_tell_which_way_is_out(shape, kind):
     assert (found == 0).double().mean() < 0.01
 
 
+@pytest.mark.parametrize("seed", range(8))
+@pytest.mark.parametrize("size", [60, 100])
+def test_what_touches_does_not_turn_the_other(seed, size):
+    """Three ellipsoids of random points in a row: 5 % of the normals on the wrong side at most, by a tree a half."""
+    points = torch.randn(3 * size, 3, generator=torch.Generator().manual_seed(seed)).double()
+    points = points / points.norm(dim=1, keepdim=True)
+    axes = torch.tensor([1.0, 1.0, 1.5], dtype=torch.float64)
+    normals = points / axes
+    normals = normals / normals.norm(dim=1, keepdim=True)
+    points = points * axes
+    points[:, 0] += 2 * (torch.arange(3 * size) % 3)
+    spacing = torch.cdist(points, points).fill_diagonal_(torch.inf).amin(1)
+    poles = Poles.of(Tetrahedra.of(points.numpy(), normals.numpy(), spacing.numpy()))
+    assert (poles.outward(normals) < 0).double().mean() <= 0.05
+
+
+@pytest.mark.parametrize("waves", [3.0, 6.0, 20.0])
+def test_an_open_surface_has_two_sides_of_its_own(waves):
+    """A sheet that bends both ways has all its normals on one side, though its convex hull is on both."""
+    points = torch.rand(1000, 3, generator=torch.Generator().manual_seed(0)).double()
+    points[:, 2] = 0.1 * (waves * points[:, 0]).sin()
+    slope = 0.1 * waves * (waves * points[:, :1]).cos()
+    normals = torch.cat([-slope, 0 * slope, torch.ones_like(slope)], 1)
+    normals = normals / normals.norm(dim=1, keepdim=True)
+    spacing = torch.cdist(points, points).fill_diagonal_(torch.inf).amin(1)
+    poles = Poles.of(Tetrahedra.of(points.numpy(), normals.numpy(), spacing.numpy()))
+    side = poles.outward(normals)
+    assert (side >= 0).all()
+    assert (side > 0).double().mean() > 0.9
+
+
 def test_a_part_of_a_patch_is_turned_if_its_normals_say_so():
     """The cap of a sphere, around which the seam is short; not the faces at single wrong normals."""
     points, faces = (x.numpy() for x in Sphere().mesh(1000))
     cap = points[:, 2] > 0.6
-    wrong = np.random.default_rng(0).random(len(points)) < 0.05
+    wrong = np.random.default_rng(0).random(len(points)) < 0.01
     outward = np.where((cap ^ wrong)[:, None], -points, points)
     turned = facing_out(points, faces, outward, whole=False)
     a, b, c = points[turned].swapaxes(0, 1)

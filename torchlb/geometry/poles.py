@@ -26,7 +26,7 @@ LONG = 1.4
 ENCLOSED = 0.9
 """Share of the convex hull that lies on one side of a surface, from which on that is its outside."""
 OPEN = 3.0
-"""How many times more a vote contradicts where the convex hull is not outside: 8 and more, on other shapes up to 1.4."""
+"""How many times more than a tree a vote contradicts where the convex hull is not all outside: 8 and more, else 1.4."""
 SHARP, RESIDUAL, STEPS = 16.0, 1e-2, 1000
 """Of a vote on two sides: relations weigh exp(16 (cosine − 1)); relative residual, and bound on the steps to it."""
 
@@ -173,10 +173,10 @@ class _Relations:
         count, free = len(self.outside), np.flatnonzero(~self.outside)
         signed = np.where(self.against, -self.weight, self.weight)
         one: Any = sparse.coo_array((signed, (self.i, self.j)), shape=(count, count))
-        around = sum(np.bincount(end, self.weight, count) for end in (self.i, self.j))[free]
+        around = np.bincount(self.i, self.weight, count) + np.bincount(self.j, self.weight, count)
         rows = sparse.csr_array(one + one.T)[free]
-        matrix = sparse.csr_array(sparse.diags_array(around) - rows[:, free])
-        scale = sparse.diags_array(1 / np.maximum(around, TINY))
+        matrix = sparse.csr_array(sparse.diags_array(around[free]) - rows[:, free])
+        scale = sparse.diags_array(1 / np.maximum(around[free], TINY))
         x, _ = cg(matrix, rows @ self.outside, rtol=RESIDUAL, maxiter=STEPS, M=scale)
         side = np.ones(count)
         side[free] = np.where(x > 0, 1.0, -1.0)
