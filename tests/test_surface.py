@@ -203,15 +203,19 @@ def test_walls_of_cavities_face_into_them():
     ]
 
 
+def poles_of(points, normals):
+    spacing = torch.cdist(points, points).fill_diagonal_(torch.inf).amin(1)
+    return Poles.of(Tetrahedra.of(points.numpy(), normals.numpy(), spacing.numpy()))
+
+
 @pytest.mark.parametrize("kind", ["points", "random_points"])
 @pytest.mark.parametrize("shape", [Sphere(), Torus(), Hemisphere()])
 def test_poles_tell_which_way_is_out(shape, kind):
     """Of normals with random signs: the right side, or none at less than 1 %; open shapes as if they were closed."""
     points = getattr(shape, kind)(1000)
     sign = torch.randint(2, (1000, 1), generator=torch.Generator().manual_seed(0)).double() * 2 - 1
-    spacing = torch.cdist(points, points).fill_diagonal_(torch.inf).amin(1)
     normals = shape.normals(points)
-    poles = Poles.of(Tetrahedra.of(points.numpy(), normals.numpy(), spacing.numpy()))
+    poles = poles_of(points, normals)
     found = poles.outward(sign * normals) * sign[:, 0]
     if shape.__class__ is Hemisphere:
         found = found * found.mean().sign()  # out, or up
@@ -230,8 +234,7 @@ def test_what_touches_does_not_turn_the_other(seed, size):
     normals = normals / normals.norm(dim=1, keepdim=True)
     points = points * axes
     points[:, 0] += 2 * (torch.arange(3 * size) % 3)
-    spacing = torch.cdist(points, points).fill_diagonal_(torch.inf).amin(1)
-    poles = Poles.of(Tetrahedra.of(points.numpy(), normals.numpy(), spacing.numpy()))
+    poles = poles_of(points, normals)
     assert (poles.outward(normals) < 0).double().mean() <= 0.05
 
 
@@ -243,8 +246,7 @@ def test_an_open_surface_has_two_sides_of_its_own(waves):
     slope = 0.1 * waves * (waves * points[:, :1]).cos()
     normals = torch.cat([-slope, 0 * slope, torch.ones_like(slope)], 1)
     normals = normals / normals.norm(dim=1, keepdim=True)
-    spacing = torch.cdist(points, points).fill_diagonal_(torch.inf).amin(1)
-    poles = Poles.of(Tetrahedra.of(points.numpy(), normals.numpy(), spacing.numpy()))
+    poles = poles_of(points, normals)
     side = poles.outward(normals)
     assert (side >= 0).all()
     assert (side > 0).double().mean() > 0.9

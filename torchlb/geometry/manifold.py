@@ -123,6 +123,18 @@ def two_orientations(
     return own, other
 
 
+def tree_sides(i: np.ndarray, j: np.ndarray, against: np.ndarray, count: int) -> np.ndarray:
+    """Which of `count` nodes are on the second side, by the pairs (i, j), best first, that close no circle.
+
+    >>> against = np.array([True, False, False])
+    >>> tree_sides(np.array([0, 1, 2]), np.array([1, 2, 0]), against, 3).tolist()
+    [False, True, True]
+    """
+    chosen = spanning_pairs(i, j, count)
+    own, other = two_orientations(i[chosen], j[chosen], against[chosen], count)
+    return own > other
+
+
 def patches(faces: Faces, count: int) -> Int[np.ndarray, " F"]:
     """Number of the patch of each face: faces that hang together by edges of two faces."""
     one, two = edges_of(faces, count).twins
@@ -188,9 +200,7 @@ def wound_alike(
     i, j, size = one // 3, two // 3, len(faces)
     bend = 1.001 - (normals[i] * normals[j]).sum(1) * np.where(against, -1, 1)
     order = np.argsort(bend, kind="stable")
-    number = order[spanning_pairs(i[order], j[order], size)]
-    own, other = two_orientations(i[number], j[number], against[number], size)
-    flip = own > other
+    flip = tree_sides(i[order], j[order], against[order], size)
     seam = against ^ flip[i] ^ flip[j]
     at_seam = np.zeros(size, dtype=bool)
     at_seam[i[seam]] = at_seam[j[seam]] = True

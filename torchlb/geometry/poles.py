@@ -18,7 +18,7 @@ from scipy.sparse.linalg import cg
 from torch import Tensor
 
 from torchlb.geometry.cocone import FLAT, TINY, Tetrahedra, refined_normals
-from torchlb.geometry.manifold import edges_of, spanning_pairs, two_orientations
+from torchlb.geometry.manifold import edges_of, tree_sides
 from torchlb.geometry.vectors import at, dot
 
 LONG = 1.4
@@ -162,11 +162,7 @@ class _Relations:
 
     def tree(self) -> Float[np.ndarray, " S"]:
         """Sides, 1 or −1, by the surest pairs that close no circle."""
-        count = len(self.outside)
-        chosen = spanning_pairs(self.i, self.j, count)
-        ends = self.i[chosen], self.j[chosen]
-        own, other = two_orientations(*ends, self.against[chosen], count)
-        return np.where(own > other, 1.0, -1.0)
+        return np.where(tree_sides(self.i, self.j, self.against, len(self.outside)), 1.0, -1.0)
 
     def vote(self) -> Float[np.ndarray, " S"]:
         """Sides, 1 or −1: the signs of x, 1 outside, where Σ w (x_i ∓ x_j)² over all pairs is least."""
