@@ -1,9 +1,9 @@
 """Speed of the layers, as Markdown tables: python benchmarks/layers.py [--quick] [--device cuda].
 
-The sparse product forward and backward, beside torch's own on the same matrix; and a training step of DiffusionNet,
-beside the same network on DiffusionNet's own operators and sparse format (benchmarks/learning.py); an epoch on eight
-shapes, one by one and in a batch. The rows of a table are timed in turns, so that a busy machine slows all of them,
-and the median is printed.
+The sparse product forward and backward, beside torch's own on the same matrix and a copy of as many bytes; gradients
+and a training step of DiffusionNet, beside the same on DiffusionNet's own operators and sparse format
+(benchmarks/learning.py); an epoch on eight shapes, one by one and in a batch. The rows of a table are timed in turns,
+so that a busy machine slows all of them, and the median is printed.
 """
 
 from __future__ import annotations
@@ -11,6 +11,7 @@ from __future__ import annotations
 import argparse
 import time
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 import torch
@@ -58,27 +59,43 @@ def table(title: str, seconds: dict[str, list[float]], baseline: str) -> None:
         print(f"| {name} | {1e3 * np.median(column):.1f} | {np.median(column) / base:.2f} |")
 
 
+def both_ways(
+    multiply: Callable[[torch.Tensor], torch.Tensor], x: torch.Tensor
+) -> Callable[[], torch.Tensor]:
+    """A product and its derivative."""
+    weights = torch.randn_like(multiply(x).detach())
+    return lambda: torch.autograd.grad(multiply(x), x, weights)[0]
+
+
 def product(lb: LaplaceBeltrami, channels: int, repeats: int, device: str) -> None:
+    """The last row copies what is read and written at least: matrix, features and result, both ways."""
     x = torch.randn(lb.num_points, channels, device=device, requires_grad=True)
-    weights = torch.randn(lb.num_points, channels, device=device)
     csr, coo = lb.matrix, lb.matrix.to_sparse_coo().coalesce()
-
-    def both_ways(multiply: Callable[[torch.Tensor], torch.Tensor]) -> Callable[[], torch.Tensor]:
-        return lambda: torch.autograd.grad(multiply(x), x, weights)[0]
-
-    steps = {
-        "torchlb": both_ways(lb),
-        "torch CSR": both_ways(lambda x: csr @ x),
-        "torch COO": both_ways(lambda x: coo @ x),
-    }
+    products = {"torchlb": lb, "torch CSR": lambda x: csr @ x, "torch COO": lambda x: coo @ x}
+    steps = {}
+    for name, multiply in products.items():
+        torch.manual_seed(0)
+        steps[name] = both_ways(multiply, x)
     reference = steps["torch COO"]()
     for name, step in steps.items():
         worst = ((step() - reference).abs().max() / reference.abs().max()).item()
         if worst > 1e-5:
             raise ArithmeticError(f"{name}: gradient off by {worst:.1e}")
+    matrix = (csr.crow_indices(), csr.col_indices(), csr.values())
+    moved = 2 * sum(t.nbytes for t in matrix) + 4 * x.nbytes
+    source = torch.empty(moved // 2, dtype=torch.uint8, device=device)
+    target = torch.empty_like(source)
+    steps["copy"] = lambda: target.copy_(source)
     title = f"Sparse product, forward and backward, N = {lb.num_points:,}, C = {channels}, "
     title += f"{lb.col.numel() / lb.num_points:.0f} entries a row"
     table(title, medians(steps, repeats, device), "torch CSR")
+
+
+def gradients(shape: dict[str, Any], channels: int, repeats: int, device: str) -> None:
+    x = torch.randn(shape["original"].num_points, channels, device=device, requires_grad=True)
+    steps = {name: both_ways(lb.local_gradient, x) for name, lb in shape.items()}
+    title = f"Gradients, forward and backward, N = {len(x):,}, C = {channels}"
+    table(title, medians(steps, repeats, device), "original")
 
 
 def training_step(shape: dict[str, object], width: int, k: int, repeats: int, device: str) -> None:
@@ -127,13 +144,17 @@ def main() -> None:
     parser.add_argument("--channels", type=int, default=64)
     parser.add_argument("--k", type=int, default=128)
     parser.add_argument("--repeats", type=int, default=15)
+    parser.add_argument("--copies", type=int, default=1, help="in a batch, for one more product")
     parser.add_argument("--device", default="cpu")
     options = parser.parse_args()
     if options.quick:
         options.points, options.channels, options.k, options.repeats = 500, 8, 24, 3
     torch.set_num_threads(1)
     print("# Layers\n", *versions(), sep="\n")
-    print(f"\nOn {options.device}, one thread; float32.")
+    where = options.device
+    if where.startswith("cuda"):
+        where = torch.cuda.get_device_name(where)
+    print(f"\nOn {where}, one thread; float32.")
     vertices, faces = StarShaped().mesh(options.points)
     stencil = LaplaceBeltrami.from_mesh(vertices, faces)
     cotangent = LaplaceBeltrami.from_cotangent(vertices, faces)
@@ -143,7 +164,12 @@ def main() -> None:
         lb.float().to(options.device)
     original.to(options.device)
     product(stencil, options.channels, options.repeats, options.device)
+    if options.copies > 1:
+        many = LaplaceBeltrami.batch([stencil] * options.copies)
+        product(many, options.channels, options.repeats, options.device)
+        del many
     shape = {"torchlb": stencil, "cotangent": cotangent, "original": original}
+    gradients(shape, options.channels, options.repeats, options.device)
     training_step(shape, options.channels, options.k, options.repeats, options.device)
     for smallest, largest in ((700, 2000), (3000, 6000)):
         scale = options.points / 10000
