@@ -14,8 +14,8 @@ from torch.autograd import grad, gradcheck, gradgradcheck
 
 from tolerances import TOLERANCE
 from torchlb.linalg.sparse import (
-    _product,
-    _values_gradient,
+    _product_op,
+    _values_gradient_op,
     csr_product,
     from_scipy,
     to_scipy,
@@ -190,9 +190,9 @@ def test_exported_for_any_number_of_columns_it_gives_the_same():
 @pytest.mark.parametrize("dtype", [*FLOATS, torch.bfloat16])
 def test_operations_are_registered_as_pytorch_asks(dtype):
     product, x, y = Product(6, 5, dtype), features(5, 3, dtype), features(6, 3, dtype)
-    torch.library.opcheck(_product, (product.pattern, product.values, x, False))
-    torch.library.opcheck(_product, (product.pattern, product.values, y, True))
-    torch.library.opcheck(_values_gradient, (product.pattern, y, x))
+    torch.library.opcheck(_product_op, (*product.pattern, product.values, x, False))
+    torch.library.opcheck(_product_op, (*product.pattern, product.values, y, True))
+    torch.library.opcheck(_values_gradient_op, (*product.pattern, y, x))
 
 
 def test_a_copied_module_gives_the_same():

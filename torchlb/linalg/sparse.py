@@ -1,15 +1,16 @@
 """The sparse product that layers differentiate through, on plain tensors.
 
 A sparse CSR tensor as a buffer breaks `deepcopy`, autocast and second derivatives, and its native backward is slow.
-Here the matrix is `crow, col, values`, the transpose's pattern is computed once, and two custom operations, whose
-derivatives are each other, give derivatives of any order in values and features, under `torch.compile` and export.
+Here the matrix is `crow, col, values`, the transpose's pattern is computed once, and two operations, whose derivatives
+are each other, give derivatives of any order in values and features. `torch.compile` and export see them as custom
+operations, which take twice as long to call: that counts on a GPU, and for small shapes.
 """
 
 from __future__ import annotations
 
 import warnings
 from collections.abc import Sequence
-from functools import cache
+from functools import cache, partial
 from typing import Any
 
 import numpy as np
@@ -56,7 +57,8 @@ def csr_product(
     >>> csr_product(pattern, values, torch.tensor([[1.0], [10.0]])).tolist()
     [[21.0], [30.0]]
     """
-    return _product(list(pattern), values, x, transposed)
+    inputs = *pattern, values, x, transposed
+    return _product_op(*inputs) if torch.compiler.is_compiling() else _Product.apply(*inputs)  # pyright: ignore[reportReturnType]
 
 
 def compute_dtype(left: Tensor, right: Tensor) -> torch.dtype:
@@ -137,28 +139,18 @@ def symmetric_product(
     return product(crow, col, values, x)
 
 
-@torch.library.custom_op(
-    "torchlb::csr_product",
-    mutates_args=(),
-    schema="(Tensor[] pattern, Tensor values, Tensor x, bool transposed) -> Tensor",
-)
-def _product(pattern: Sequence[Tensor], values: Tensor, x: Tensor, transposed: bool) -> Tensor:
-    """A x, or Aᵀ x, for the pattern [crow, col, crow_t, col_t, order_t]."""
-    crow, col, crow_t, col_t, order_t = pattern
+def _product(*inputs: Any) -> Tensor:
+    """A x, or Aᵀ x, by crow, col, crow_t, col_t, order_t, values, x, transposed."""
+    crow, col, crow_t, col_t, order_t, values, x, transposed = inputs
+    dtype, result_dtype = compute_dtype(values, x), _result_dtype(values, x)
     if transposed:
         crow, col, values = crow_t, col_t, values.index_select(0, order_t)
-    dtype = compute_dtype(values, x)
-    return multiply(crow, col, values.to(dtype), x.to(dtype)).to(_result_dtype(values, x))
+    return multiply(crow, col, values.to(dtype), x.to(dtype)).to(result_dtype)
 
 
-@torch.library.custom_op(
-    "torchlb::csr_values_gradient",
-    mutates_args=(),
-    schema="(Tensor[] pattern, Tensor left, Tensor right) -> Tensor",
-)
-def _values_gradient(pattern: Sequence[Tensor], left: Tensor, right: Tensor) -> Tensor:
+def _values_gradient(*inputs: Any) -> Tensor:
     """Σ_c left[row, c] right[col, c] at every entry (row, col), without the (nnz, C) of its terms."""
-    crow, col, *_ = pattern
+    crow, col, _, _, _, left, right = inputs
     dtype = compute_dtype(left, right)
     matrix = csr_tensor(
         crow, col, torch.zeros(len(col), dtype=dtype, device=left.device), len(right)
@@ -167,46 +159,89 @@ def _values_gradient(pattern: Sequence[Tensor], left: Tensor, right: Tensor) -> 
         return torch.sparse.sampled_addmm(matrix, left.to(dtype), right.to(dtype).T).values()
 
 
-@_product.register_fake
-def _(pattern: Sequence[Tensor], values: Tensor, x: Tensor, transposed: bool) -> Tensor:
-    num_rows = pattern[2 if transposed else 0].shape[0] - 1
+def _save(ctx: Any, inputs: tuple[Any, ...], output: Any = None) -> None:
+    ctx.save_for_backward(*inputs[:7])
+    ctx.transposed = inputs[7:] == (True,)
+
+
+def _product_backward(ctx: Any, grad: Tensor, product: Any, values_gradient: Any) -> Any:
+    *pattern, values, x = ctx.saved_tensors
+    grad_values = grad_x = None
+    if ctx.needs_input_grad[5]:
+        left, right = (x, grad) if ctx.transposed else (grad, x)
+        grad_values = values_gradient(*pattern, left, right).to(values.dtype)
+    if ctx.needs_input_grad[6]:
+        grad_x = product(*pattern, values, grad, not ctx.transposed).to(x.dtype)
+    return None, None, None, None, None, grad_values, grad_x, None
+
+
+def _values_gradient_backward(ctx: Any, grad: Tensor, product: Any) -> Any:
+    *pattern, left, right = ctx.saved_tensors
+    grad_left = grad_right = None
+    if ctx.needs_input_grad[5]:
+        grad_left = product(*pattern, grad, right, False).to(left.dtype)
+    if ctx.needs_input_grad[6]:
+        grad_right = product(*pattern, grad, left, True).to(right.dtype)
+    return None, None, None, None, None, grad_left, grad_right
+
+
+class _Product(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, *inputs: Any) -> Tensor:
+        _save(ctx, inputs)
+        return _product(*inputs)
+
+    @staticmethod
+    def backward(ctx: Any, grad: Tensor) -> Any:  # pyright: ignore[reportIncompatibleMethodOverride]
+        return _product_backward(ctx, grad, _Product.apply, _ValuesGradient.apply)
+
+
+class _ValuesGradient(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, *inputs: Any) -> Tensor:
+        _save(ctx, inputs)
+        return _values_gradient(*inputs)
+
+    @staticmethod
+    def backward(ctx: Any, grad: Tensor) -> Any:  # pyright: ignore[reportIncompatibleMethodOverride]
+        return _values_gradient_backward(ctx, grad, _Product.apply)
+
+
+PATTERN = "Tensor crow, Tensor col, Tensor crow_t, Tensor col_t, Tensor order_t"
+_product_op = torch.library.custom_op(
+    "torchlb::csr_product",
+    _product,
+    mutates_args=(),
+    schema=f"({PATTERN}, Tensor values, Tensor x, bool transposed) -> Tensor",
+)
+_values_gradient_op = torch.library.custom_op(
+    "torchlb::csr_values_gradient",
+    _values_gradient,
+    mutates_args=(),
+    schema=f"({PATTERN}, Tensor left, Tensor right) -> Tensor",
+)
+
+
+@_product_op.register_fake
+def _(*inputs: Any) -> Tensor:
+    crow, _, crow_t, _, _, values, x, transposed = inputs
+    num_rows = (crow_t if transposed else crow).shape[0] - 1
     return x.new_empty(num_rows, x.shape[1], dtype=_result_dtype(values, x))
 
 
-@_values_gradient.register_fake
-def _(pattern: Sequence[Tensor], left: Tensor, right: Tensor) -> Tensor:
-    return left.new_empty(pattern[1].shape[0], dtype=compute_dtype(left, right))
+@_values_gradient_op.register_fake
+def _(*inputs: Any) -> Tensor:
+    _, col, *_, left, right = inputs
+    return left.new_empty(col.shape[0], dtype=compute_dtype(left, right))
 
 
-def _save(ctx: Any, inputs: tuple[Any, ...], output: Tensor) -> None:
-    pattern, first, second, *transposed = inputs
-    ctx.save_for_backward(*pattern, first, second)
-    ctx.transposed = transposed == [True]
-
-
-def _product_backward(ctx: Any, grad: Tensor) -> tuple[Any, ...]:
-    *pattern, values, x = ctx.saved_tensors
-    grad_values = grad_x = None
-    if ctx.needs_input_grad[1]:
-        left, right = (x, grad) if ctx.transposed else (grad, x)
-        grad_values = _values_gradient(pattern, left, right).to(values.dtype)
-    if ctx.needs_input_grad[2]:
-        grad_x = _product(pattern, values, grad, not ctx.transposed).to(x.dtype)
-    return [None] * 5, grad_values, grad_x, None
-
-
-def _values_gradient_backward(ctx: Any, grad: Tensor) -> tuple[Any, ...]:
-    *pattern, left, right = ctx.saved_tensors
-    grad_left = grad_right = None
-    if ctx.needs_input_grad[1]:
-        grad_left = _product(pattern, grad, right, False).to(left.dtype)
-    if ctx.needs_input_grad[2]:
-        grad_right = _product(pattern, grad, left, True).to(right.dtype)
-    return [None] * 5, grad_left, grad_right
-
-
-_product.register_autograd(_product_backward, setup_context=_save)
-_values_gradient.register_autograd(_values_gradient_backward, setup_context=_save)
+_product_op.register_autograd(
+    partial(_product_backward, product=_product_op, values_gradient=_values_gradient_op),
+    setup_context=_save,
+)
+_values_gradient_op.register_autograd(
+    partial(_values_gradient_backward, product=_product_op), setup_context=_save
+)
 
 
 def to_scipy(
