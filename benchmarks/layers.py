@@ -56,7 +56,7 @@ def table(title: str, seconds: dict[str, list[float]], baseline: str) -> None:
     print(f"\n### {title}\n\n| | ms | of {baseline} |\n|:--|--:|--:|")
     base = np.median(seconds[baseline])
     for name, column in seconds.items():
-        print(f"| {name} | {1e3 * np.median(column):.1f} | {np.median(column) / base:.2f} |")
+        print(f"| {name} | {1e3 * np.median(column):.2f} | {np.median(column) / base:.2f} |")
 
 
 def both_ways(
