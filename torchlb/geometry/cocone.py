@@ -184,19 +184,54 @@ class Tetrahedra:
         second[hull] = len(cells) + np.arange(hull.sum())
         return cls(points, cells, centers, triangles, ends, (first, second), hull)
 
-    def surface(self, cloud: Cloud) -> tuple[Faces, Faces]:
-        """(triangles of the surface, best first; all small triangles)."""
+    def surface(self, cloud: Cloud, side: Float[np.ndarray, " S"]) -> Candidates:
+        """Small triangles that may be of the surface; `side` tells the spheres outside of it from those inside."""
         radius, normal = cloud.circles(self.triangles)
         kept = radius <= cloud.limits(self.triangles)
         triangles, radius, normal = self.triangles[kept], radius[kept], normal[kept]
         ends = self.ends[0][kept], self.ends[1][kept]
-        near = np.ones(len(triangles), dtype=bool)
-        for corner in triangles.T:
-            near &= _leaves_cone(cloud.points[corner], cloud.normals[corner], ends)
         alignment = np.abs((normal[:, None] * cloud.normals[triangles]).sum(-1)).min(1)
-        found = np.flatnonzero(near & (alignment > TILTED))
+        tangent = alignment > TILTED
+        for corner in triangles.T:
+            tangent &= _leaves_cone(cloud.points[corner], cloud.normals[corner], ends)
+        parting = side[self.sides[0][kept]] != side[self.sides[1][kept]]
         cost = radius / np.maximum(alignment, TILTED) ** 2
-        return triangles[found[np.argsort(cost[found], kind="stable")]], triangles
+        return Candidates.of(triangles, tangent, parting, cost)
+
+
+@dataclass(frozen=True)
+class Candidates:
+    """Triangles for a surface, the best first.
+
+    Attributes
+    ----------
+    small : (P, 3), all that are within the reach of their corners, in no order.
+    triangles : (F, 3), of these the tangent and the parting ones.
+    tangent : (F,), which pass the cocone test.
+    parting : (F,), which have the outside on one side and the inside on the other.
+    """
+
+    small: Faces
+    triangles: Faces
+    tangent: Bool[np.ndarray, " F"]
+    parting: Bool[np.ndarray, " F"]
+
+    @classmethod
+    def of(
+        cls,
+        triangles: Faces,
+        tangent: Bool[np.ndarray, " P"],
+        parting: Bool[np.ndarray, " P"],
+        cost: Float[np.ndarray, " P"],
+    ) -> Candidates:
+        """The least cost first."""
+        found = np.flatnonzero(tangent | parting)
+        found = found[np.argsort(cost[found], kind="stable")]
+        return cls(triangles, triangles[found], tangent[found], parting[found])
+
+    def best(self, points: Float[np.ndarray, "N 3"], first: Bool[np.ndarray, " F"]) -> Faces:
+        """The manifold of those that are `first`, and of the others what fits to it."""
+        return best_manifold(points, self.triangles[np.argsort(~first, kind="stable")])
 
 
 def _circumcenters(points: np.ndarray, cells: Int[np.ndarray, "T 4"]) -> Float[np.ndarray, "T 3"]:

@@ -84,8 +84,10 @@ class Poles:
         short = along[self.farthest(along)] * LONG < length
         return torch.where(short[:, None], longest / length[:, None], normals)
 
-    def outward(self, normals: Float[Tensor, "N 3"]) -> Float[Tensor, " N"]:
-        """1 or −1 where a normal points out of the solid or into it, 0 where that cannot be told.
+    def sides(
+        self, normals: Float[Tensor, "N 3"]
+    ) -> tuple[Float[np.ndarray, " S"], Float[Tensor, " N"]]:
+        """Which spheres are outside, 1, or inside, −1; which normals point out, 1, or in, −1; 0: it cannot be told.
 
         The two poles of a point lie on two sides, the surer the straighter they are opposed; two spheres that share a
         triangle lie on one side, the surer the deeper they intersect. Spheres have their sides by a tree of the surest
@@ -105,11 +107,12 @@ class Poles:
         side, tree = relations.vote(), relations.tree()
         if OPEN * relations.contradicted(tree) < relations.contradicted(side):
             side = tree
-        sign = torch.from_numpy(np.where(side[ends[0]] == side[ends[1]], 0.0, side[ends[0]]))
+        outward = np.where(side[ends[0]] == side[ends[1]], 0.0, side[ends[0]])
         around = side[first:].mean()
         if abs(around) < 2 * ENCLOSED - 1:  # an open surface faces up
-            around = float((sign * normals[:, -1]).sum())
-        return sign if around >= 0 else -sign
+            around = outward @ normals[:, -1].numpy()
+        turn = 1.0 if around >= 0 else -1.0
+        return turn * side, torch.from_numpy(turn * outward)
 
     def _touching(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Spheres that share a triangle, or an edge of the convex hull; and the cosine of their radii there."""

@@ -13,7 +13,7 @@ from scipy.spatial import Delaunay
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from torchlb.geometry.cocone import Cloud, Tetrahedra, best_manifold, refined_normals
+from torchlb.geometry.cocone import Candidates, Cloud, Tetrahedra, refined_normals
 from torchlb.geometry.frames import cloud_frames, vertex_normals
 from torchlb.geometry.gaps import closed, filled, with_left_points
 from torchlb.geometry.manifold import (
@@ -143,25 +143,25 @@ def cloud_surface(
     if planar is None:
         nearest = np.linalg.norm(places[near[:, 1]] - places, axis=1)
         tetrahedra = Tetrahedra.of(places, normals.numpy(), nearest)
-        outward = normals
+        poles = Poles.of(tetrahedra)
         if given is None:
-            poles = Poles.of(tetrahedra)
             normals = corrected_normals(points, normals, candidates, poles)
-            outward = normals * poles.outward(normals)[:, None]
+        side, sign = poles.sides(normals)
+        outward = normals * sign[:, None] if given is None else given
         cloud = Cloud(places, normals.numpy(), near, reach, rim)
-        found, pool = tetrahedra.surface(cloud)
+        found = tetrahedra.surface(cloud, side)
     else:
         cloud = Cloud(places, normals.numpy(), near, reach, rim)
-        found = pool = cloud.small(planar)
+        small = cloud.small(planar)
+        found = Candidates(small, small, *np.ones((2, len(small)), dtype=bool))
         outward = normals
         if given is None:  # all up
             outward = normals * (normals @ normals[0]).sign()[:, None] * normals[0, 2].sign()
-    outward = outward.numpy()
-    faces, seam = wound_alike(places, _clean(best_manifold(places, found), count))
+    outward, pairs = outward.numpy(), _kin(cloud)
+    faces, seam = wound_alike(places, _chosen(cloud, found, pairs))
     faces = facing_out(places, _clean(faces[~seam], count) if seam.any() else faces, outward)
     cloud = _oriented(cloud, faces)
-    bare, faces = faces, _without_gaps(cloud, faces, pool)
-    pairs = _kin(cloud)
+    bare, faces = faces, _without_gaps(cloud, faces, found.small)
     faces, done = closed(cloud, faces, _at_gaps(faces, pairs, count))
     faces = with_left_points(cloud, faces)
     if faces is not bare:
@@ -186,6 +186,25 @@ def _upright(
     first, second = (frames - normals[..., None] * (normals[:, None] @ frames)).unbind(-1)
     first = normalize(torch.where(first.norm(dim=1, keepdim=True) > 0.5, first, second))
     return torch.stack([first, torch.linalg.cross(normals, first)], -1)
+
+
+def _chosen(cloud: Cloud, found: Candidates, pairs: tuple[np.ndarray, np.ndarray]) -> Faces:
+    """The faces, clean: those first that part the outside from the inside.
+
+    But not at points that belong together and would then be of different pieces, as of lips that touch: the mouth is
+    inside. There, those that are tangent come first.
+    """
+    i, j = pairs
+    faces = _clean(found.best(cloud.points, found.parting), len(cloud.points))
+    piece = pieces_of(faces, len(cloud.points))
+    used = np.bincount(faces.ravel(), minlength=len(cloud.points)) > 0
+    across = (piece[i] != piece[j]) & used[i] & used[j]
+    if not across.any():
+        return faces
+    torn = np.zeros_like(used)
+    torn[i[across]] = torn[j[across]] = True
+    first = np.where(torn[found.triangles].any(1), found.tangent, found.parting)
+    return _clean(found.best(cloud.points, first), len(cloud.points))
 
 
 def _without_gaps(cloud: Cloud, faces: Faces, pool: Faces) -> Faces:
