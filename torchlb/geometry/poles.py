@@ -27,6 +27,8 @@ ENCLOSED = 0.9
 """Share of the convex hull that lies on one side of a surface, from which on that is its outside."""
 OPEN = 3.0
 """How many times more than a tree a vote contradicts where the convex hull is not all outside: 8 and more, else 1.4."""
+ONE_SIDED = 0.1
+"""Of the weight of opposed poles: sides that contradict more are none, 0.13 and more on bands with one, else 0.04."""
 SHARP, RESIDUAL, STEPS = 16.0, 1e-2, 1000
 """Of a vote on two sides: relations weigh exp(16 (cosine − 1)); relative residual, and bound on the steps to it."""
 
@@ -91,7 +93,8 @@ class Poles:
 
         The two poles of a point lie on two sides, the surer the straighter they are opposed; two spheres that share a
         triangle lie on one side, the surer the deeper they intersect. Spheres have their sides by a tree of the surest
-        of these, if that contradicts them far less, as on an open surface, or by all with the convex hull outside.
+        of these, if that contradicts them far less, as on an open surface, or by all with the convex hull outside. If
+        that contradicts much, too, as on a band with one side, all spheres are outside.
         """
         rise = dot(self.ray, at(normals, self.point))
         up, down = self.farthest(rise), self.farthest(-rise)
@@ -112,6 +115,8 @@ class Poles:
         if abs(around) < 2 * ENCLOSED - 1:  # an open surface faces up
             around = outward @ normals[:, -1].numpy()
         turn = 1.0 if around >= 0 else -1.0
+        if relations.contradicted(side) > ONE_SIDED * relations.weight[relations.against].sum():
+            side = np.full_like(side, turn)
         return turn * side, torch.from_numpy(turn * outward)
 
     def _touching(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
