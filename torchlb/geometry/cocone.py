@@ -18,7 +18,7 @@ from torch.nn.functional import normalize
 from torchlb.fits.polynomials import monomials
 from torchlb.fits.weights import window
 from torchlb.geometry.frames import complete_frames
-from torchlb.geometry.manifold import Faces, edges_of
+from torchlb.geometry.manifold import Faces, edges_of, face_vectors
 from torchlb.geometry.neighbors import AT_ONCE, admissible_neighbors
 from torchlb.geometry.vectors import dot
 
@@ -194,9 +194,17 @@ class Tetrahedra:
         tangent = alignment > TILTED
         for corner in triangles.T:
             tangent &= _leaves_cone(cloud.points[corner], cloud.normals[corner], ends)
-        parting = side[self.sides[0][kept]] != side[self.sides[1][kept]]
+        one, two = (side[number[kept]] for number in self.sides)
+        parting = one != two
+        out = (ends[0] - ends[1])[parting] * one[parting, None]
+        vector = face_vectors(cloud.points, triangles[parting])
+        vector *= np.sign((out * vector).sum(1, keepdims=True))
+        outward = np.zeros_like(cloud.points)
+        np.add.at(outward, triangles[parting], vector[:, None])
         cost = radius / np.maximum(alignment, TILTED) ** 2
-        return Candidates.of(triangles, tangent, parting, cost)
+        found = np.flatnonzero(tangent | parting)
+        found = found[np.argsort(cost[found], kind="stable")]
+        return Candidates(triangles, triangles[found], tangent[found], parting[found], outward)
 
 
 @dataclass(frozen=True)
@@ -209,25 +217,14 @@ class Candidates:
     triangles : (F, 3), of these the tangent and the parting ones.
     tangent : (F,), which pass the cocone test.
     parting : (F,), which have the outside on one side and the inside on the other.
+    outward : (N, 3), ℓ²: the sum of the normals of the small parting ones at each point, as long as their areas.
     """
 
     small: Faces
     triangles: Faces
     tangent: Bool[np.ndarray, " F"]
     parting: Bool[np.ndarray, " F"]
-
-    @classmethod
-    def of(
-        cls,
-        triangles: Faces,
-        tangent: Bool[np.ndarray, " P"],
-        parting: Bool[np.ndarray, " P"],
-        cost: Float[np.ndarray, " P"],
-    ) -> Candidates:
-        """The least cost first."""
-        found = np.flatnonzero(tangent | parting)
-        found = found[np.argsort(cost[found], kind="stable")]
-        return cls(triangles, triangles[found], tangent[found], parting[found])
+    outward: Float[np.ndarray, "N 3"]
 
     def best(self, points: Float[np.ndarray, "N 3"], first: Bool[np.ndarray, " F"]) -> Faces:
         """The manifold of those that are `first`, and of the others what fits to it."""

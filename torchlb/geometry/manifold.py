@@ -14,8 +14,6 @@ from scipy import sparse
 from scipy.sparse import csgraph
 
 Faces = Int[np.ndarray, "_ 3"]
-VOTE, EDGE = 100, 30
-"""Of a corner whose normal is that of its face, and of an edge: flows are whole numbers."""
 CLOSED = 1000
 """A closed fan comes before an open one of up to so many triangles."""
 
@@ -208,50 +206,15 @@ def wound_alike(
 
 
 def facing_out(
-    points: Float[np.ndarray, "N 3"],
-    faces: Faces,
-    outward: Float[np.ndarray, "N 3"],
-    whole: bool = True,
+    points: Float[np.ndarray, "N 3"], faces: Faces, outward: Float[np.ndarray, "N 3"]
 ) -> Faces:
-    """The faces turned to the side of the outward normals at their corners: those of a patch all the same way.
-
-    Normals are zero where they are not known, and may be wrong at some points. If not `whole`, a part of a patch may be
-    turned by itself: that costs the edges around it, a face against the normals their cosines, and the least of it all
-    is a minimal cut. So a cavity whose wall the triangles have led into from the wrong side, such as a mouth between
-    lips that touch, faces out, too.
-    """
+    """The faces turned to the side of the outward vectors at their corners: those of a patch all the same way."""
     if len(faces) == 0:
         return faces
     vectors, patch = face_vectors(points, faces), patches(faces, len(points))
-    length = np.maximum(np.linalg.norm(vectors, axis=1), np.finfo(float).tiny)
-    vote = (outward[faces].sum(1) * vectors).sum(1) / length
+    vote = (outward[faces].sum(1) * vectors).sum(1)
     turned = (np.bincount(patch, vote) < 0)[patch]
-    vote = np.where(turned, -vote, vote)
-    if not whole and (vote < 0).any():
-        edges = edges_of(faces, len(points))
-        one, two = edges.twins
-        alike = edges.ends[0][one] != edges.ends[0][two]
-        turned = turned ^ _cut(one[alike] // 3, two[alike] // 3, vote)
     return np.where(turned[:, None], faces[:, ::-1], faces)
-
-
-def _cut(
-    i: Int[np.ndarray, " P"], j: Int[np.ndarray, " P"], vote: Float[np.ndarray, " F"]
-) -> Bool[np.ndarray, " F"]:
-    """Which of the nodes are to be turned: those with negative votes, unless more pairs than votes speak against it."""
-    count = len(vote)
-    kept, back = np.full(count, count), np.full(count, count + 1)  # source and sink
-    node, votes = np.arange(count), np.rint(VOTE * vote).astype(np.int32)
-    ends = np.concatenate([i, j, kept, node]), np.concatenate([j, i, node, back])
-    pairs = np.full(2 * len(i), EDGE, dtype=np.int32)
-    capacity = np.concatenate([pairs, np.maximum(votes, 0), np.maximum(-votes, 0)])
-    graph = sparse.csr_array((capacity, ends), shape=(count + 2, count + 2))
-    left = graph - csgraph.maximum_flow(graph, count, count + 1).flow
-    left = sparse.csr_array((left > 0).T)
-    found = csgraph.breadth_first_order(left, count + 1, return_predecessors=False)
-    turned = np.zeros(count + 2, dtype=bool)
-    turned[found] = True
-    return turned[:count]
 
 
 def boundary_loops(faces: Faces, count: int) -> list[list[int]]:

@@ -86,15 +86,13 @@ class Poles:
         short = along[self.farthest(along)] * LONG < length
         return torch.where(short[:, None], longest / length[:, None], normals)
 
-    def sides(
-        self, normals: Float[Tensor, "N 3"]
-    ) -> tuple[Float[np.ndarray, " S"], Float[Tensor, " N"]]:
-        """Which spheres are outside, 1, or inside, −1; which normals point out, 1, or in, −1; 0: it cannot be told.
+    def sides(self, normals: Float[Tensor, "N 3"]) -> tuple[Float[np.ndarray, " S"], bool]:
+        """(1 for the spheres outside of the surface, −1 for those inside; whether it has two sides at all).
 
         The two poles of a point lie on two sides, the surer the straighter they are opposed; two spheres that share a
         triangle lie on one side, the surer the deeper they intersect. Spheres have their sides by a tree of the surest
-        of these, if that contradicts them far less, as on an open surface, or by all with the convex hull outside. If
-        that contradicts much, too, as on a band with one side, all spheres are outside.
+        of these, if that contradicts them far less, as on an open surface, or by all with the convex hull outside. On
+        a band with one side that contradicts much, too.
         """
         rise = dot(self.ray, at(normals, self.point))
         up, down = self.farthest(rise), self.farthest(-rise)
@@ -110,14 +108,13 @@ class Poles:
         side, tree = relations.vote(), relations.tree()
         if OPEN * relations.contradicted(tree) < relations.contradicted(side):
             side = tree
-        outward = np.where(side[ends[0]] == side[ends[1]], 0.0, side[ends[0]])
+        total = float(relations.weight[relations.against].sum())
+        two_sided = relations.contradicted(side) <= ONE_SIDED * total
         around = side[first:].mean()
         if abs(around) < 2 * ENCLOSED - 1:  # an open surface faces up
-            around = outward @ normals[:, -1].numpy()
-        turn = 1.0 if around >= 0 else -1.0
-        if relations.contradicted(side) > ONE_SIDED * relations.weight[relations.against].sum():
-            side = np.full_like(side, turn)
-        return turn * side, torch.from_numpy(turn * outward)
+            upward = normals[:, -1].numpy()
+            around = ((side[ends[0]] - side[ends[1]]) * upward).sum()
+        return side if around >= 0 else -side, two_sided
 
     def _touching(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Spheres that share a triangle, or an edge of the convex hull; and the cosine of their radii there."""

@@ -20,6 +20,7 @@ from torchlb.geometry.manifold import (
     Faces,
     boundary_loops,
     components,
+    face_vectors,
     facing_out,
     with_single_fans,
     without_specks,
@@ -146,19 +147,18 @@ def cloud_surface(
         poles = Poles.of(tetrahedra)
         if given is None:
             normals = corrected_normals(points, normals, candidates, poles)
-        side, sign = poles.sides(normals)
-        outward = normals * sign[:, None] if given is None else given
+        side, two_sided = poles.sides(normals)
         cloud = Cloud(places, normals.numpy(), near, reach, rim)
         found = tetrahedra.surface(cloud, side)
     else:
-        cloud = Cloud(places, normals.numpy(), near, reach, rim)
+        two_sided, cloud = True, Cloud(places, normals.numpy(), near, reach, rim)
+        up = normals * (normals @ normals[0]).sign()[:, None] * normals[0, 2].sign()
         small = cloud.small(planar)
-        found = Candidates(small, small, *np.ones((2, len(small)), dtype=bool))
-        outward = normals
-        if given is None:  # all up
-            outward = normals * (normals @ normals[0]).sign()[:, None] * normals[0, 2].sign()
-    outward, pairs = outward.numpy(), _kin(cloud)
-    faces, seam = wound_alike(places, _chosen(cloud, found, pairs))
+        every = np.ones(len(small), dtype=bool)
+        found = Candidates(small, small, every, every, up.numpy())
+    outward = found.outward if given is None else given.numpy()
+    pairs = _kin(cloud)
+    faces, seam = wound_alike(places, _chosen(cloud, found, two_sided, pairs))
     faces = facing_out(places, _clean(faces[~seam], count) if seam.any() else faces, outward)
     cloud = _oriented(cloud, faces)
     bare, faces = faces, _without_gaps(cloud, faces, found.small)
@@ -166,7 +166,9 @@ def cloud_surface(
     faces = with_left_points(cloud, faces)
     if faces is not bare:
         faces = facing_out(places, wound_alike(places, faces)[0], outward)
-    cloud = _oriented(cloud, facing_out(places, faces, outward, whole=False))
+    cloud = _oriented(cloud, faces)
+    away = (cloud.normals * outward).sum(1) < 0  # as in a mouth that faces led into from outside
+    cloud = replace(cloud, normals=np.where(away[:, None], -cloud.normals, cloud.normals))
     stars = stars_in_gaps(cloud, faces, pairs)
     loops = boundary_loops(faces, count)
     pieces = pieces_of(np.concatenate([faces, stars]), count)
@@ -188,23 +190,31 @@ def _upright(
     return torch.stack([first, torch.linalg.cross(normals, first)], -1)
 
 
-def _chosen(cloud: Cloud, found: Candidates, pairs: tuple[np.ndarray, np.ndarray]) -> Faces:
-    """The faces, clean: those first that part the outside from the inside.
+def _chosen(
+    cloud: Cloud, found: Candidates, two_sided: bool, pairs: tuple[np.ndarray, np.ndarray]
+) -> Faces:
+    """The faces, clean: those first that part the outside from the inside, if there are two sides.
 
-    But not at points that belong together and would then be of different pieces, as of lips that touch: the mouth is
-    inside. There, those that are tangent come first.
+    But not where a cavity would be cut off from points that belong to it, as a mouth whose lips touch: there, those
+    that are tangent come first.
     """
-    i, j = pairs
-    faces = _clean(found.best(cloud.points, found.parting), len(cloud.points))
-    piece = pieces_of(faces, len(cloud.points))
-    used = np.bincount(faces.ravel(), minlength=len(cloud.points)) > 0
-    across = (piece[i] != piece[j]) & used[i] & used[j]
+    points, (i, j) = cloud.points, pairs
+    first = found.parting if two_sided else found.tangent
+    faces = _clean(found.best(points, first), len(points))
+    piece = pieces_of(faces, len(points))
+    across = piece[i] != piece[j]
     if not across.any():
         return faces
-    torn = np.zeros_like(used)
+    vectors, size = face_vectors(points, faces), np.bincount(piece)
+    centers = np.stack([np.bincount(piece, x) / size for x in points.T], 1)
+    height = ((points[faces[:, 0]] - centers[piece[faces[:, 0]]]) * vectors).sum(1)
+    out = np.sign((found.outward[faces].sum(1) * vectors).sum(1))
+    cavity = np.bincount(piece[faces[:, 0]], height * out, len(size)) < 0
+    across &= cavity[piece[i]] | cavity[piece[j]]
+    torn = np.zeros(len(points), dtype=bool)
     torn[i[across]] = torn[j[across]] = True
-    first = np.where(torn[found.triangles].any(1), found.tangent, found.parting)
-    return _clean(found.best(cloud.points, first), len(cloud.points))
+    first = np.where(torn[found.triangles].any(1), found.tangent, first)
+    return _clean(found.best(points, first), len(points)) if torn.any() else faces
 
 
 def _without_gaps(cloud: Cloud, faces: Faces, pool: Faces) -> Faces:
