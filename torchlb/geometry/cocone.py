@@ -1,7 +1,8 @@
 """Triangles for a cloud (`method.md`, section 12): normals, Delaunay triangles near the surface, the best of them.
 
-A triangle of the Delaunay tetrahedra belongs to the surface where its dual edge, between the circumcentres of the two
-tetrahedra beside it, comes close to the tangent planes of its corners: leaves their double cone, the *cocone*.
+A triangle of the Delaunay tetrahedra belongs to the surface where one of the two beside it is outside and the other
+inside, or else where its dual edge, between their circumcentres, comes close to the tangent planes of its corners:
+leaves their double cone, the *cocone*.
 """
 
 from __future__ import annotations
@@ -184,7 +185,7 @@ class Tetrahedra:
         second[hull] = len(cells) + np.arange(hull.sum())
         return cls(points, cells, centers, triangles, ends, (first, second), hull)
 
-    def surface(self, cloud: Cloud, side: Float[np.ndarray, " S"]) -> Candidates:
+    def candidates(self, cloud: Cloud, side: Float[np.ndarray, " S"]) -> Candidates:
         """Small triangles that may be of the surface; `side` tells the spheres outside of it from those inside."""
         radius, normal = cloud.circles(self.triangles)
         kept = radius <= cloud.limits(self.triangles)

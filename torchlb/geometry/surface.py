@@ -20,7 +20,6 @@ from torchlb.geometry.manifold import (
     Faces,
     boundary_loops,
     components,
-    face_vectors,
     facing_out,
     with_single_fans,
     without_specks,
@@ -149,7 +148,7 @@ def cloud_surface(
             normals = corrected_normals(points, normals, candidates, poles)
         side, two_sided = poles.sides(normals)
         cloud = Cloud(places, normals.numpy(), near, reach, rim)
-        found = tetrahedra.surface(cloud, side)
+        found = tetrahedra.candidates(cloud, side)
     else:
         two_sided, cloud = True, Cloud(places, normals.numpy(), near, reach, rim)
         up = normals * (normals @ normals[0]).sign()[:, None] * normals[0, 2].sign()
@@ -166,9 +165,8 @@ def cloud_surface(
     faces = with_left_points(cloud, faces)
     if faces is not bare:
         faces = facing_out(places, wound_alike(places, faces)[0], outward)
-    cloud = _oriented(cloud, faces)
-    away = (cloud.normals * outward).sum(1) < 0  # as in a mouth that faces led into from outside
-    cloud = replace(cloud, normals=np.where(away[:, None], -cloud.normals, cloud.normals))
+    # not by the faces where these lead into a mouth from outside
+    cloud = _along(_oriented(cloud, faces), outward)
     stars = stars_in_gaps(cloud, faces, pairs)
     loops = boundary_loops(faces, count)
     pieces = pieces_of(np.concatenate([faces, stars]), count)
@@ -205,12 +203,10 @@ def _chosen(
     across = piece[i] != piece[j]
     if not across.any():
         return faces
-    vectors, size = face_vectors(points, faces), np.bincount(piece)
-    centers = np.stack([np.bincount(piece, x) / size for x in points.T], 1)
-    height = ((points[faces[:, 0]] - centers[piece[faces[:, 0]]]) * vectors).sum(1)
-    out = np.sign((found.outward[faces].sum(1) * vectors).sum(1))
-    cavity = np.bincount(piece[faces[:, 0]], height * out, len(size)) < 0
-    across &= cavity[piece[i]] | cavity[piece[j]]
+    centers = np.stack([np.bincount(piece, x) for x in points.T], 1) / np.bincount(piece)[:, None]
+    volume = np.bincount(piece, ((points - centers[piece]) * found.outward).sum(1))
+    cavity = (volume < 0)[piece]
+    across &= cavity[i] | cavity[j]
     torn = np.zeros(len(points), dtype=bool)
     torn[i[across]] = torn[j[across]] = True
     first = np.where(torn[found.triangles].any(1), found.tangent, first)
@@ -245,9 +241,14 @@ def _clean(faces: Faces, count: int) -> Faces:
 
 def _oriented(cloud: Cloud, faces: Faces) -> Cloud:
     """The cloud with its normals on the side of the faces, where there are any."""
-    points, normals = torch.from_numpy(cloud.points), torch.from_numpy(cloud.normals)
-    away = (vertex_normals(points, torch.from_numpy(faces)) * normals).sum(1) < 0
-    return replace(cloud, normals=torch.where(away[:, None], -normals, normals).numpy())
+    points, triangles = torch.from_numpy(cloud.points), torch.from_numpy(faces)
+    return _along(cloud, vertex_normals(points, triangles).numpy())
+
+
+def _along(cloud: Cloud, vectors: Float[np.ndarray, "N 3"]) -> Cloud:
+    """The cloud with its normals on the side of the vectors, where these have one."""
+    away = (cloud.normals * vectors).sum(1) < 0
+    return replace(cloud, normals=np.where(away[:, None], -cloud.normals, cloud.normals))
 
 
 def _planar_triangles(points: Float[np.ndarray, "N 3"]) -> Faces | None:
