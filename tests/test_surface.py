@@ -211,16 +211,21 @@ def test_normals_point_out(shape, kind):
     assert (found > 0).all()
 
 
+def row_of_ellipsoids(size, apart, seed):
+    """Three of so many random points each, their centres `apart`; and their normals, of any length."""
+    points = torch.randn(3 * size, 3, generator=torch.Generator().manual_seed(seed)).double()
+    points = points / points.norm(dim=1, keepdim=True)
+    axes = torch.tensor([1.0, 1.0, 1.5], dtype=torch.float64)
+    places = points * axes
+    places[:, 0] += apart * (torch.arange(3 * size) % 3)
+    return places, points / axes
+
+
 @pytest.mark.parametrize("seed", range(8))
 @pytest.mark.parametrize("size", [60, 100])
 def test_what_touches_does_not_turn_the_other(seed, size):
     """Three ellipsoids of random points in a row: 5 % of the normals on the wrong side at most, by a tree a half."""
-    points = torch.randn(3 * size, 3, generator=torch.Generator().manual_seed(seed)).double()
-    points = points / points.norm(dim=1, keepdim=True)
-    axes = torch.tensor([1.0, 1.0, 1.5], dtype=torch.float64)
-    normals = points / axes
-    points = points * axes
-    points[:, 0] += 2 * (torch.arange(3 * size) % 3)
+    points, normals = row_of_ellipsoids(size, 2.0, seed)
     wrong = (cloud_surface(points).normals * normals).sum(1) < 0
     assert wrong.double().mean() <= 0.05
 
@@ -247,11 +252,7 @@ def euler(faces):
 @pytest.mark.parametrize("seed", range(3))
 def test_bodies_that_nearly_touch_are_closed_each_for_itself(seed):
     """Three ellipsoids of random points in a row, a third of a spacing apart: no wall and no handle between them."""
-    points = torch.randn(3000, 3, generator=torch.Generator().manual_seed(seed)).double()
-    points = points / points.norm(dim=1, keepdim=True)
-    points = points * torch.tensor([1.0, 1.0, 1.5], dtype=torch.float64)
-    points[:, 0] += 2.03 * (torch.arange(3000) % 3)
-    surface = cloud_surface(points)
+    surface = cloud_surface(row_of_ellipsoids(1000, 2.03, seed)[0])
     assert surface.summary.reached == 3000
     assert surface.summary.boundary_loops == 0
     assert euler(surface.faces.numpy()) >= 4

@@ -106,10 +106,10 @@ class Poles:
             i, j, np.concatenate([sure, opposed]), np.arange(len(i)) >= len(one), outside
         )
         side, tree = relations.vote(), relations.tree()
-        if OPEN * relations.contradicted(tree) < relations.contradicted(side):
-            side = tree
-        total = float(relations.weight[relations.against].sum())
-        two_sided = relations.contradicted(side) <= ONE_SIDED * total
+        wrong, by_tree = relations.contradicted(side), relations.contradicted(tree)
+        if OPEN * by_tree < wrong:
+            side, wrong = tree, by_tree
+        two_sided = wrong <= ONE_SIDED * float(relations.weight[relations.against].sum())
         around = side[first:].mean()
         if abs(around) < 2 * ENCLOSED - 1:  # an open surface faces up
             upward = normals[:, -1].numpy()
