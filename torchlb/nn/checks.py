@@ -33,10 +33,15 @@ def check_shape(x: Tensor, lb: LaplaceBeltrami) -> None:
 
 
 def as_columns(f: Tensor, lb: LaplaceBeltrami) -> Tensor:
-    """(N, C) or (B, N, C) of the f of a user, which may be (N,), too; errors as for `check_shape`."""
+    """(N, C) or (B, N, C) of the f of a user, which may be (N,), too; integers and masks in the operator's type.
+
+    Errors as for `check_shape`, and InputError for complex numbers.
+    """
     x = f[:, None] if isinstance(f, Tensor) and f.ndim == 1 else f
     check_shape(x, lb)
-    return x
+    if x.is_complex():
+        raise InputError(f"expected real f, got {x.dtype}; torch.view_as_real(f) makes channels")
+    return x if x.is_floating_point() else x.to(lb.dtype)
 
 
 def as_times(t: float | Tensor, x: Tensor, dtype: torch.dtype) -> Tensor:

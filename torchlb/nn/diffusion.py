@@ -18,7 +18,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 from torch.nn.functional import softplus
 
-from torchlb.errors import DiffusionError
+from torchlb.errors import DiffusionError, InputError
 from torchlb.linalg.exponential import heat
 from torchlb.linalg.sparse import compute_dtype
 from torchlb.nn.checks import as_columns, as_times, check_choice, check_features
@@ -211,6 +211,8 @@ class LearnedTimes(nn.Module):
 
     def __init__(self, channels: int, init_time: float) -> None:
         super().__init__()
+        if not 0 < init_time < math.inf:
+            raise InputError(f"init_time: expected a positive time, got {init_time}")
         self.channels = channels
         self.raw_time = nn.Parameter(raw_of_time(torch.full((channels,), init_time)))
 

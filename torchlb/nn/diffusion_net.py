@@ -222,6 +222,12 @@ def _checked_corners(place: str, corners: Tensor | None, lb: LaplaceBeltrami) ->
     """The corners of faces or edges, where they are those of every shape."""
     if corners is None:
         raise InputError(f"outputs_at={place!r} needs {place}, got None")
+    expected = 3 if place == "faces" else 2
+    if not isinstance(corners, Tensor) or corners.ndim != 2 or corners.shape[1] != expected:
+        got = tuple(corners.shape) if hasattr(corners, "shape") else type(corners)
+        raise InputError(
+            f"{place}: expected a tensor of shape (·, {expected}), got {got}; PyG has the transpose"
+        )
     if corners.numel() == 0 or torch.compiler.is_compiling():
         return corners
     last, starts = int(corners.max()), lb.offsets

@@ -62,12 +62,17 @@ _flow: Any = uncompiled(_Flow.apply)
 def _summed(
     lb: LaplaceBeltrami, x: Tensor, time: Tensor, tolerance: float, transposed: bool
 ) -> tuple[Tensor, Tensor]:
-    """Σ c_k v_k and Σ c_k' v_k."""
+    """Σ c_k v_k and Σ c_k' v_k; at t = 0, of the transposed, x and −KM⁻¹x."""
     result, slope = torch.zeros_like(x), torch.zeros_like(x)
     times = time.detach().cpu().numpy()
     at_zero = torch.from_numpy(times == 0).to(x.device)
-    result[:, at_zero] = x[:, at_zero]
     solver = pair_system(lb)
+    x = solver.inside(x)
+    if bool(at_zero.any()):
+        result[:, at_zero] = start = x[:, at_zero]
+        if transposed:
+            still = solver.solve(start, torch.zeros_like(start[0]), tolerance)
+            slope[:, at_zero] = -solver.stiffness_product(still)
     level = np.floor(np.log10(np.where(times > 0, times / SHORTEST, 1.0)))
     for exponent in np.unique(level[times > 0]).tolist():
         chosen = (level == exponent) & (times > 0)
@@ -99,8 +104,6 @@ def _polynomials(
             return 2 * solver.mass_product(solver.solve(v, poles, tolerance)) - v
         return 2 * solver.solve(solver.mass_product(v), poles, tolerance) - v
 
-    if solver.free is not None and not transposed:
-        x = x * solver.free
     before, v = x, doubled(x)
     yield before
     for _ in range(count - 1):

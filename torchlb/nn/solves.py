@@ -34,7 +34,8 @@ def implicit_step(
 
     (M + tK)u = Mf + tB·flux with the weak pair, by conjugate gradients that the linear pair preconditions; without one
     (1 − tL)u = f with the stencil, by LU. Solved in float64; to a tolerance of 1e-5 or more steps are in float32, and
-    where f and the operator are, right-hand sides, too. The result has the type of f.
+    where f and the operator are, right-hand sides, too. The result has the type of f, or
+    the operator's where those are integers.
 
     Parameters
     ----------
@@ -73,7 +74,7 @@ def implicit_step(
     if given is not None:
         right = right - _product(lb, 1, given) - time * _product(medium, 0, given)
     u = _solve(right, time, conductivity, given, medium, tolerance)
-    return _shaped(u if given is None else u + given, f)
+    return _shaped(u if given is None else u + given, f, x.dtype)
 
 
 @uncompiled
@@ -111,7 +112,7 @@ def poisson_solve(
     if given is not None:
         right = right - _product(medium, 0, given)
     u = _solve(right, None, conductivity, given, medium, tolerance)
-    return _shaped(u if given is None else u + given, f)
+    return _shaped(u if given is None else u + given, f, x.dtype)
 
 
 @uncompiled
@@ -147,9 +148,8 @@ def potential(
     if source is None and field is not None:
         source = field[..., 0, :]
     assert source is not None, "neither field nor source"
-    return _shaped(
-        _solve(columns, None, None, None, lb, tolerance), source
-    )  # in its shape and type
+    u = _solve(columns, None, None, None, lb, tolerance)
+    return _shaped(u, source, source.dtype)
 
 
 def _columns(
@@ -162,11 +162,11 @@ def _columns(
     return x.to(dtype).transpose(0, 1).flatten(1), time.repeat(len(x))
 
 
-def _shaped(u: Tensor, f: Tensor) -> Tensor:
-    """Columns in the shape and type of f."""
+def _shaped(u: Tensor, f: Tensor, dtype: torch.dtype) -> Tensor:
+    """Columns in the shape of f."""
     if f.ndim == 3:
         u = u.view(f.shape[1], f.shape[0], f.shape[2]).transpose(0, 1)
-    return (u[:, 0] if f.ndim == 1 else u).to(f.dtype)
+    return (u[:, 0] if f.ndim == 1 else u).to(dtype)
 
 
 def _data(lb: LaplaceBeltrami, data: Tensor | float | None, kind: int, f: Tensor) -> Tensor | None:

@@ -166,7 +166,7 @@ class PairSystem:
             return self.solve(b[:, order], time[order], tolerance)[:, order.argsort()]
         if time is not None and bool(time[0] == time[-1]):
             time = time[:1]
-        b = self._inside(b.double())
+        b = self.inside(b.double())
         mean = self._mean(self.one, b)
         right = torch.addcmul(b, self.ones_mass, mean, value=-1)
         near = partial(self._near, self._levels(time, b.shape[1]))
@@ -177,6 +177,10 @@ class PairSystem:
     def mass_product(self, x: Float[Tensor, "N C"]) -> Float[Tensor, "N C"]:
         """M x, in float64."""
         return multiply(*self.pattern, self.mass.double(), x.double())
+
+    def stiffness_product(self, x: Float[Tensor, "N C"]) -> Float[Tensor, "N C"]:
+        """K x at the points that no condition holds, in float64."""
+        return self.inside(multiply(*self.pattern, self.stiffness.double(), x.double()))
 
     def _solved(
         self, right: Float[Tensor, "N C"], time: Tensor | None, tolerance: float, near: Linear
@@ -240,7 +244,7 @@ class PairSystem:
     def _product(self, terms: list[tuple[Tensor, Matrix]], x: Tensor) -> Tensor:
         """Of every column with its shares of the matrices."""
         parts = [share * multiply(*matrix, x) for share, matrix in terms]
-        return self._inside(sum(parts[1:], parts[0]))
+        return self.inside(sum(parts[1:], parts[0]))
 
     def _levels(self, time: Tensor | None, columns: int) -> list[tuple[float | None, int]]:
         """Times of factors, and for how many columns each: where there are several, the nearest powers of four.
@@ -260,7 +264,7 @@ class PairSystem:
         """The solution by linear elements."""
         blocks = r.split([count for _, count in levels], dim=1)
         solved = [self.factor(t).solve(block) for (t, _), block in zip(levels, blocks, strict=True)]
-        return self._inside(solved[0] if len(solved) == 1 else torch.cat(solved, dim=1))
+        return self.inside(solved[0] if len(solved) == 1 else torch.cat(solved, dim=1))
 
     def factor(self, t: float | None) -> Factor:
         """That of M₁ + tK₁, or of K₁ with a little of M₁ that makes it definite."""
@@ -284,7 +288,8 @@ class PairSystem:
         """Weighted sums over components that no Dirichlet point holds, by their areas; 0 on the others."""
         return torch.where(self.components.free, self.components.sums(weights, x) / self.area, 0.0)
 
-    def _inside(self, x: Tensor) -> Tensor:
+    def inside(self, x: Tensor) -> Tensor:
+        """x, zero at Dirichlet points."""
         return x if self.free is None else x * self.free.to(x)
 
 

@@ -56,7 +56,7 @@ def check_points(points: ArrayLike, what: str = "points") -> Float[Tensor, "N n"
         )
     if points.is_complex() or points.dtype == torch.bool:
         raise InputError(f"{what}: expected real numbers, got {points.dtype}")
-    points = points.detach().to("cpu", torch.float64)
+    points = points.detach().to("cpu", torch.float64, copy=True)  # it is kept
     bad = (~points.isfinite()).any(1).nonzero()[:, 0]
     if len(bad):
         raise InputError(
@@ -159,6 +159,13 @@ def mended_faces(vertices: Float[Tensor, "N n"], faces: Int[Tensor, "F v"]) -> I
             raise InputError(
                 f"faces: none of the {len(faces)} triangles has an area, since all have their corners on a line; pass "
                 "the vertices of a surface, or a curve by its edges, (F, 2)"
+            )
+    if faces.shape[1] == 2:
+        none = (vertices[faces[:, 0]] == vertices[faces[:, 1]]).all(1).nonzero()[:, 0]
+        if len(none):
+            raise InputError(
+                f"faces: {len(none)} segments ({first_few(none)}) have no length, their ends share a place; make one "
+                "vertex of the two"
             )
     first = first_of_each(faces)
     if not first.all():

@@ -59,6 +59,7 @@ class LaplaceBeltrami(StencilFace, WeakFace):
     """
 
     @classmethod
+    @torch.inference_mode(False)  # what is kept serves a training, too
     def from_points(
         cls,
         points: ArrayLike,
@@ -116,6 +117,7 @@ class LaplaceBeltrami(StencilFace, WeakFace):
         return cls._from_assembled(built, points)
 
     @classmethod
+    @torch.inference_mode(False)
     def from_mesh(
         cls,
         vertices: ArrayLike,
@@ -156,6 +158,7 @@ class LaplaceBeltrami(StencilFace, WeakFace):
         return cls._from_assembled(built, vertices)
 
     @classmethod
+    @torch.inference_mode(False)
     def from_cotangent(cls, vertices: ArrayLike, faces: ArrayLike) -> LaplaceBeltrami:
         """libigl's cotangent operator M⁻¹C with its Voronoi mass, behind the same interface: the baseline.
 
@@ -169,6 +172,7 @@ class LaplaceBeltrami(StencilFace, WeakFace):
         return cls._from_assembled(build.build_cotangent(vertices, faces), vertices)
 
     @classmethod
+    @torch.inference_mode(False)
     def batch(cls, shapes: Sequence[LaplaceBeltrami]) -> LaplaceBeltrami:
         """Several shapes as one block-diagonal operator, which every layer takes like any other.
 

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from scipy import sparse
 from torch import Tensor
 
 from torchlb.errors import InputError
+from torchlb.geometry.boundary import boundary_faces
 from torchlb.linalg.sparse import csr_product, csr_tensor, to_scipy
 from torchlb.operator.report import StencilReport
 from torchlb.operator.storage import REPORT_FIELDS, OperatorStorage
@@ -123,10 +124,18 @@ class StencilFace(OperatorStorage):
 
         Where rows of Δ hold a point of the boundary, and with it a condition that x does not satisfy, it is div ∇x.
         """
-        normal = self(self.points)
-        if self.boundary is None:
+        normal, rim = self(self.points), self._rim()
+        if not rim.any():
             return normal
         row = torch.arange(self.num_points, device=self.col.device)
-        row = row.repeat_interleave(self.crow.diff())[self.boundary[self.col]]
-        free = torch.ones_like(self.boundary).index_fill(0, row, False)[:, None]
+        row = row.repeat_interleave(self.crow.diff())[rim[self.col]]
+        free = torch.ones_like(rim).index_fill(0, row, False)[:, None]
         return torch.where(free, normal, self.divergence(self.gradient(self.points)))
+
+    def _rim(self) -> Bool[Tensor, " N"]:
+        """Points of the boundary, whether a condition holds there or not."""
+        rim = torch.zeros_like(self.mass, dtype=torch.bool)
+        if self.boundary is not None:
+            rim |= self.boundary
+        sides = boundary_faces(self.faces.cpu()).flatten()
+        return rim.index_fill(0, sides.to(rim.device), True)

@@ -106,8 +106,11 @@ class WeakFace(OperatorStorage):
         missing = self.basis_left.shape[-1] < min(k, max(self.sizes or (self.num_points,)))
         if missing or (tolerance is not None and (self.basis_relative_errors > tolerance).any()):
             pair = self.has_weak_form
-            solved = self._pair_eigenbasis(k, tolerance) if pair else self._stencil_eigenbasis(k)
-            self.keep_basis(solved)
+            with torch.inference_mode(False):  # it is kept, and a training may follow
+                solved = (
+                    self._pair_eigenbasis(k, tolerance) if pair else self._stencil_eigenbasis(k)
+                )
+                self.keep_basis(solved)
         if store:
             self.keep_basis(store=True)
         basis = self.basis

@@ -105,6 +105,7 @@ class Eigenbasis:
         """Coefficients Φᵀ(πf), ΦᵀMf for a symmetric pair, (…, k, C), or (…, S, k, C) for a batch of shapes."""
         if self.is_symmetric:
             return self._analyse(self.left, f)
+        f = self._real(f)
         return self._analyse(self.eigenvectors, self.mass.to(f.dtype)[:, None] * f)
 
     def to_basis_obliquely(self, f: Float[Tensor, "*B N C"]) -> Float[Tensor, "*S k C"]:
@@ -125,7 +126,12 @@ class Eigenbasis:
         parts = zip(functions.split(self.sizes), coefficients.unbind(-3), strict=True)
         return torch.cat([block @ c for block, c in parts], dim=-2)
 
+    def _real(self, f: Tensor) -> Tensor:
+        """Integers and masks in the type of the basis."""
+        return f if f.is_floating_point() or f.is_complex() else f.to(self.eigenvectors.dtype)
+
     def _analyse(self, functionals: Tensor, f: Tensor) -> Tensor:
+        f = self._real(f)
         functionals = functionals.to(f.dtype)
         if self.sizes is None:
             return functionals.mT @ f

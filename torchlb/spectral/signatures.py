@@ -111,11 +111,11 @@ def wave_kernel_signature(
 
 def spectral_wavelets(
     lb: Spectral,
-    f: Float[Tensor, "N C"],
+    f: Float[Tensor, "N C"] | Float[Tensor, " N"],
     scales: Float[Tensor, " T"],
     *,
     k: int = 128,
-) -> Float[Tensor, "N T_plus_1 C"]:
+) -> Float[Tensor, "N T_plus_1 *C"]:
     """Wavelet coefficients of f: one low-pass and T band-pass copies (Hammond, Vandergheynst, Gribonval 2011).
 
     The bands are g(sλ) with g(z) = z e^{1−z}, the low-pass e^{−λ s_max}, all divided by the root of the sum of their
@@ -126,11 +126,13 @@ def spectral_wavelets(
     ----------
     scales : s, ℓ²; a band sits at the eigenvalue 1/s.
     """
+    if f.ndim == 1:
+        return spectral_wavelets(lb, f[:, None], scales, k=k)[..., 0]
     basis = lb.eigenbasis(k)
     scales = torch.as_tensor(scales).to(basis.eigenvalues)
     gains = _wavelet_gains(basis.eigenvalues, scales)
     coefficients = basis.to_basis(f)
-    parts = [basis.from_basis(g[..., None] * coefficients) for g in gains.to(f.dtype).unbind(-1)]
+    parts = [basis.from_basis(g[..., None] * coefficients) for g in gains.to(coefficients.dtype).unbind(-1)]
     return torch.stack(parts, dim=-2)
 
 

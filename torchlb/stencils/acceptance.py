@@ -74,6 +74,10 @@ class Acceptance:
             failure = torch.where((failure == 0) & ~passed, reason, failure)
         return failure, weights.height_residual > resolvable
 
+    def follows(self, weights: Weights, candidate: Candidate) -> Bool[Tensor, " B"]:
+        """Whether the points resolve the surface for this candidate."""
+        return weights.height_residual <= self._resolved(candidate)[0]
+
     def _resolved(self, candidate: Candidate) -> tuple[float, float]:
         """Bounds on the residual of the heights: for this candidate, and for all of its degree.
 

@@ -8,6 +8,7 @@ for. What each point took, and why no better, is part of the result and never si
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import replace
 
 import torch
@@ -18,10 +19,15 @@ from tqdm import tqdm
 from torchlb.errors import StencilError, first_few
 from torchlb.fits.rules import WEIGHT_RULES
 from torchlb.fits.weights import MAX_RESIDUAL, Weights, least_squares_weights, positive_weights
-from torchlb.geometry.candidates import Candidate, Search, stencil_candidates
+from torchlb.geometry.candidates import (
+    Candidate,
+    Search,
+    list_candidates,
+    stencil_candidates,
+)
 from torchlb.geometry.frames import local_heights, local_offsets
 from torchlb.geometry.neighbors import AT_ONCE
-from torchlb.stencils.acceptance import Acceptance
+from torchlb.stencils.acceptance import WIDEST_AT_BOUNDARY, Acceptance
 from torchlb.stencils.rows import Reason, Rows, matrix_rows, stencil_rows
 from torchlb.stencils.shape import Shape
 
@@ -52,6 +58,7 @@ class Stencils:
     ) -> None:
         dim, on_mesh = shape.frames.shape[-1], shape.on_mesh
         self.shape, self.order, self.projection = shape, order, projection
+        self.num_neighbors = num_neighbors
         self.candidates = stencil_candidates(dim, order, weights, num_neighbors, on_mesh)
         self.acceptance = Acceptance(dim, on_mesh, projection)
 
@@ -84,7 +91,7 @@ class Stencils:
         left = torch.ones(len(centers), dtype=torch.bool)
         left[torch.cat([*taken, torch.empty(0, dtype=torch.int64)])] = False
         if left.any():
-            blocks.append(self._low_order_rows(centers[left]))
+            blocks.append(self._low_order_rows(centers[left], reason[left]))
             taken.append(left.nonzero()[:, 0])
         rows = Rows.stack(blocks)[torch.cat(taken).argsort()]
         if self.shape.boundary is not None:
@@ -135,8 +142,7 @@ class Stencils:
         free = part = least_squares_weights(coords, degree, heights=heights)
         gradient, left = free.gradient.clone(), torch.arange(len(centers))
         for lower in range(degree - 1, 0, -1):
-            slope = part.radius * part.gradient.abs().sum(1).amax(1)
-            left = left[~((part.residual <= MAX_RESIDUAL) & (slope <= GRADIENT_GROWTH))]
+            left = left[~_good_slope(part)]
             if len(left) == 0:
                 break
             part = least_squares_weights(coords[left], lower)
@@ -154,7 +160,7 @@ class Stencils:
             coords = local_offsets(points, frames, centers, neighbors, "tangent")
         return local_heights(points, frames, centers, neighbors, coords)
 
-    def _low_order_rows(self, centers: Int[Tensor, " B"]) -> Rows:
+    def _low_order_rows(self, centers: Int[Tensor, " B"], reason: Int[Tensor, " B"]) -> Rows:
         assert self.shape.low_order is not None
         matrix = self.shape.low_order.rows(centers)
         rows = matrix_rows(matrix, self.shape.points, self.shape.frames, centers)
@@ -165,7 +171,39 @@ class Stencils:
                 f"{first_few(bad)}. Nothing admissible lies around them; remove them, or merge them with their "
                 "neighbours"
             )
-        return replace(rows, candidate=torch.full_like(centers, len(self.candidates)))
+        rows = replace(rows, candidate=torch.full_like(centers, len(self.candidates)))
+        fitted = ((reason == Reason.RATIO) | (reason == Reason.GROWTH)).nonzero()[:, 0]
+        for local, index, gradient in self._gradients(centers[fitted]):
+            rows = rows.with_gradient(fitted[local], index, gradient)
+        return rows
+
+    def _gradients(
+        self, centers: Int[Tensor, " B"]
+    ) -> Iterator[tuple[Int[Tensor, " b"], Int[Tensor, "b K"], Float[Tensor, "b K d"]]]:
+        """First derivatives where only Δ has no good stencil, as at a boundary: of the highest degree that has good ones.
+
+        Batches of (places in `centers`, points, weights). Of degree 1 those of the low-order row are as good.
+        """
+        dim = self.shape.frames.shape[-1]
+        degrees = range(self.order + 1, 1, -1)
+        candidates = [
+            c
+            for c in list_candidates(dim, degrees, num_neighbors=self.num_neighbors)
+            if c.factor <= WIDEST_AT_BOUNDARY
+        ]
+        search = Search(self.shape.balls, centers, candidates)
+        for number, tried, index in search:
+            weights = self._free_weights(centers[tried], index, candidates[number])
+            passed = _good_slope(weights) & self.acceptance.follows(weights, candidates[number])
+            search.settle(tried[passed])
+            if passed.any():
+                yield tried[passed], index[passed], weights.gradient[passed]
+
+
+def _good_slope(weights: Weights) -> Bool[Tensor, " B"]:
+    """Whether the points determine first derivatives, and well."""
+    growth = weights.radius * weights.gradient.abs().sum(1).amax(1)
+    return (weights.residual <= MAX_RESIDUAL) & (growth <= GRADIENT_GROWTH)
 
 
 def assemble(stencils: Stencils, *, progress: bool = True) -> Rows:

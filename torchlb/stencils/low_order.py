@@ -1,12 +1,14 @@
 """Low-order rows, for points where no stencil passes: positive weights, stable, and first order at best.
 
-On triangles, those of a mesh or of the surface through a cloud, they are robust_laplacian's. On other clouds they are
-finite volumes of the Voronoi cell in the tangent plane, built from admissible neighbours alone.
+On triangles, those of a mesh or of the surface through a cloud, they are robust_laplacian's, on the segments of a curve
+those of linear elements. Elsewhere they are finite volumes of the Voronoi cell in the tangent plane, built from
+admissible neighbours alone.
 """
 
 from __future__ import annotations
 
 from functools import cached_property
+from math import factorial
 
 import numpy as np
 import torch
@@ -19,6 +21,44 @@ from torchlb.baseline.robust import LEAST_AREA, robust_rows
 from torchlb.geometry.boundary import Boundary
 from torchlb.geometry.neighbors import GraphBalls, nearest_neighbors
 from torchlb.geometry.voronoi import cell_laplacian, cell_volume, unrolled
+
+
+def simplex_shares(
+    vertices: Float[Tensor, "N n"], faces: Int[Tensor, "F v"]
+) -> Float[Tensor, " N"]:
+    """Of each vertex an equal share of the length, area or volume of its simplices, ℓ^d: half, a third, a quarter.
+
+    >>> simplex_shares(torch.tensor([[0.0], [1.0], [3.0]]), torch.tensor([[0, 1], [1, 2]])).tolist()
+    [0.5, 1.5, 1.0]
+    """
+    dim = faces.shape[1] - 1
+    edges = vertices[faces[:, 1:]] - vertices[faces[:, :1]]
+    upper = torch.linalg.qr(edges.mT).R
+    volume = torch.diagonal(upper, dim1=-2, dim2=-1).prod(-1).abs() / factorial(dim)
+    share = (volume / (dim + 1)).repeat_interleave(dim + 1)
+    return torch.zeros_like(vertices[:, 0]).index_add_(0, faces.reshape(-1), share)
+
+
+class CurveLowOrder:
+    """Linear elements on the segments of a curve with lumped mass; where several meet, what flows in flows out."""
+
+    def __init__(self, vertices: Float[Tensor, "N n"], segments: Int[Tensor, "F 2"]) -> None:
+        self.vertices, self.segments = vertices, segments
+
+    def rows(self, centers: Int[Tensor, " B"]) -> sparse.csr_array:
+        """Rows (B, N) of Δ, 1/ℓ²."""
+        return sparse.csr_array(self._matrix[centers.numpy()])
+
+    @cached_property
+    def _matrix(self) -> sparse.csr_array:
+        i, j = self.segments.T.numpy()
+        length = (self.vertices[self.segments[:, 1]] - self.vertices[self.segments[:, 0]]).norm(dim=1)
+        count = len(self.vertices)
+        weights = sparse.csr_array((1 / length.numpy(), (i, j)), shape=(count, count))
+        weights = sparse.csr_array(weights + weights.T)
+        strong = weights - sparse.diags_array(weights.sum(axis=1))
+        half = simplex_shares(self.vertices, self.segments).numpy()
+        return sparse.csr_array(sparse.diags_array(1 / half) @ strong)
 
 
 class MeshLowOrder:

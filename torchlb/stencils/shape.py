@@ -36,8 +36,14 @@ from torchlb.geometry.orientation import (
 from torchlb.geometry.surface import CloudSurface
 from torchlb.geometry.vertex_fits import VertexFits, fit_size
 from torchlb.stencils.conditions import Condition, Neumann
-from torchlb.stencils.low_order import CloudLowOrder, MeshLowOrder
+from torchlb.stencils.low_order import (
+    CloudLowOrder,
+    CurveLowOrder,
+    MeshLowOrder,
+    simplex_shares,
+)
 
+LowOrder = CloudLowOrder | CurveLowOrder | MeshLowOrder
 NEUMANN = Neumann()
 CANDIDATES = {1: 12, 2: 24, 3: 64}
 """Nearest points from which the frames and the graph of a cloud start, by dimension."""
@@ -68,7 +74,7 @@ class Shape:
     normal_order: Int[Tensor, " N"]
     balls: GraphBalls
     areas: Float[Tensor, " N"]
-    low_order: CloudLowOrder | MeshLowOrder | None
+    low_order: LowOrder | None
     boundary: Boundary | None
     condition: Condition
     on_mesh: bool = False
@@ -144,9 +150,14 @@ def mesh_shape(
         edge = _part(edge, boundary)
     low_order = None
     if areas is None:
-        triangles = faces.shape[1] == 3 and vertices.shape[1] <= 3
-        low_order = MeshLowOrder(vertices, faces) if triangles else CloudLowOrder(balls, edge)
-        areas = low_order.areas()
+        if faces.shape[1] == 2:
+            low_order = CurveLowOrder(vertices, faces)
+        elif faces.shape[1] == 3 and vertices.shape[1] <= 3:
+            low_order = MeshLowOrder(vertices, faces)
+        else:
+            low_order = CloudLowOrder(balls, edge)
+        of_mesh = isinstance(low_order, MeshLowOrder)
+        areas = low_order.areas() if of_mesh else simplex_shares(vertices, faces)
     shape = _oriented(balls, reference, order, areas, low_order, edge, condition)
     fits = None if fits is None else fits.complete(start)
     return replace(shape, on_mesh=isinstance(low_order, MeshLowOrder), fits=fits)
@@ -251,7 +262,7 @@ def _oriented(
     reference: Tensor | None,
     order: Tensor,
     areas: Tensor,
-    low_order: CloudLowOrder | MeshLowOrder | None,
+    low_order: LowOrder | None,
     boundary: Boundary | None,
     condition: Condition | None,
 ) -> Shape:
