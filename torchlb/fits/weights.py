@@ -161,7 +161,6 @@ class CenteredFit:
     ----------
     coefficients : (B, M − 1, K − 1). Their rows of |α| = 1, over the radius, are the weights of the gradient.
     radius : (B,), ℓ: distance ρ of the farthest neighbour in local coordinates.
-    condition : (B,), as in `Weights`.
     residual : (B,): largest violation of the moment equations of the first derivatives.
     values : (B, K − 1, M − 1), the monomials V at the neighbours.
     root : (B, K − 1), √ω.
@@ -170,7 +169,6 @@ class CenteredFit:
 
     coefficients: Float[Tensor, "B M neighbors"]
     radius: Float[Tensor, " B"]
-    condition: Float[Tensor, " B"]
     residual: Float[Tensor, " B"]
     values: Float[Tensor, "B neighbors M"]
     root: Float[Tensor, "B neighbors"]
@@ -207,7 +205,7 @@ def centered_fit(
     dim = coords.shape[-1]
     first = coefficients[:, :dim] @ values - torch.eye(r.shape[-1])[:dim].to(r)
     residual = first.abs().amax((1, 2))
-    return CenteredFit(coefficients, radius, _condition(inverse), residual, values, root, degree)
+    return CenteredFit(coefficients, radius, residual, values, root, degree)
 
 
 def cardinal(

@@ -14,6 +14,7 @@ from torchlb.galerkin.assembly import CHUNK, area_element, flat_metric, metric
 from torchlb.galerkin.elements import EDGES, lattice, triangle
 from torchlb.galerkin.nodes import Nodes
 from torchlb.galerkin.rim import RimCurves, rim_curves
+from torchlb.geometry.stars import pieces_of
 from torchlb.geometry.vectors import at, dot
 from torchlb.geometry.vertex_fits import VertexFits
 
@@ -210,10 +211,16 @@ def _met(
     return torch.where(t.isfinite() & (fits.degree[vertex] > 0), t, torch.inf)
 
 
-def mollified(sides: Float[Tensor, "F 3"]) -> Float[Tensor, "F 3"]:
-    """Lengths of edges, all longer by so much that no triangle is without area."""
-    lack = SLACK * sides.mean() - (sides.sum(1) - 2 * sides.amax(1))
-    return sides + lack.clamp_min(0).max()
+def mollified(sides: Float[Tensor, "F 3"], faces: Int[Tensor, "F 3"]) -> Float[Tensor, "F 3"]:
+    """Lengths of edges, all of a component longer by so much that none of its triangles is without area."""
+    spare = sides.sum(1) - 2 * sides.amax(1)
+    if bool((spare >= SLACK * sides.amax()).all()):
+        return sides
+    piece = torch.from_numpy(pieces_of(faces.numpy(), int(faces.max()) + 1))[faces[:, 0]]
+    number = torch.bincount(piece).clamp_min(1)
+    mean = torch.zeros(len(number), dtype=sides.dtype).index_add_(0, piece, sides.mean(1)) / number
+    lack = torch.zeros_like(mean).scatter_reduce_(0, piece, SLACK * mean[piece] - spare, "amax")
+    return sides + lack[piece, None]
 
 
 def _flattened(
@@ -229,7 +236,7 @@ def _flattened(
     """
     corners = at(points, nodes.faces)
     sides = (corners.roll(-1, dims=1) - corners).norm(dim=2)
-    lengths = mollified(sides)
+    lengths = mollified(sides, nodes.faces)
     plane, shape = flat_metric(lengths), triangle(nodes.degree)
     area = area_element(plane)
     curved = curved.clone()

@@ -17,19 +17,20 @@ ALIGNED = 0.5
 """Least cosine between a triangle's normal and those of its vertices."""
 GOOD = 0.1
 """Least quality 4√3 area/Σℓ² of a triangle; 1 if it is equilateral."""
-ROUNDS = 50
 
 
 def flipped(vertices: Tensor, faces: Tensor) -> Tensor:
     """The faces, with an edge flipped of every folded triangle or sliver that gains by it and is not folded then.
 
-    Only edges of two triangles, and only where the new edge is not there yet. The normals are renewed each round.
+    Only edges of two triangles, and only where the new edge is not there yet. The normals are renewed each round; an
+    edge that was flipped away does not come back, or two flips could gain in turn for ever.
     """
     faces, normals = faces.clone(), vertex_normals(vertices, faces)
     alignment, quality = _scores(vertices, normals, faces)
-    for _ in range(ROUNDS):
+    gone, size = faces.new_zeros(0), len(vertices)
+    while True:
         bad = ((alignment < ALIGNED) | (quality < GOOD)).nonzero()[:, 0]
-        pairs = _flips(faces, bad) if len(bad) else None
+        pairs = _flips(faces, bad, gone, size) if len(bad) else None
         if pairs is None:
             return faces
         left, right, after = pairs
@@ -40,11 +41,16 @@ def flipped(vertices: Tensor, faces: Tensor) -> Tensor:
         if len(chosen) == 0:
             return faces
         faces[left[chosen]], faces[right[chosen]] = after[chosen, 0], after[chosen, 1]
+        gone = torch.cat([gone, _keys(after[chosen, 0, 2], after[chosen, 1, 2], size)])
         part = _touching(faces, after[chosen])
         renewed = torch.unique(after[chosen])
         normals[renewed] = vertex_normals(vertices, faces[part])[renewed]
         alignment[part], quality[part] = _scores(vertices, normals, faces[part])
-    return faces
+
+
+def _keys(one: Tensor, other: Tensor, size: int) -> Tensor:
+    """A number for each edge, in either direction."""
+    return torch.minimum(one, other) * size + torch.maximum(one, other)
 
 
 def _touching(faces: Tensor, corners: Tensor) -> Tensor:
@@ -71,17 +77,22 @@ def _value(vertices: Tensor, normals: Tensor, pairs: Tensor) -> Tensor:
     return 1e3 * alignment.amin(1).clamp_max(ALIGNED) + quality.amin(1)
 
 
-def _flips(faces: Tensor, bad: Tensor) -> tuple[Tensor, Tensor, Tensor] | None:
-    """Flips of the edges of the bad faces: the two faces (a, b, c), (b, a, d) and (c, d, b), (d, c, a) instead."""
-    around, size = bad, int(faces.max()) + 1
+def _flips(
+    faces: Tensor, bad: Tensor, gone: Tensor, size: int
+) -> tuple[Tensor, Tensor, Tensor] | None:
+    """Flips of the edges of the bad faces: the two faces (a, b, c), (b, a, d) and (c, d, b), (d, c, a) instead.
+
+    None that makes an edge which is there, or is gone.
+    """
+    around = bad
     for _ in range(2):  # all that the edges of their flips can belong to
         around = _touching(faces, faces[around])
     faces, bad = faces[around], torch.searchsorted(around, bad)
     count = len(faces)
     half = torch.cat([faces[:, list(edge)] for edge in EDGES])  # h is of face h mod F
     opposite = torch.cat([faces[:, 2], faces[:, 0], faces[:, 1]])
-    low, high = half.amin(1), half.amax(1)
-    unique, edge, uses = torch.unique(low * size + high, return_inverse=True, return_counts=True)
+    keys = _keys(half[:, 0], half[:, 1], size)
+    unique, edge, uses = torch.unique(keys, return_inverse=True, return_counts=True)
     order = edge.argsort(stable=True)
     first = uses.cumsum(0) - uses
     twin = torch.full_like(edge, -1)
@@ -91,7 +102,7 @@ def _flips(faces: Tensor, bad: Tensor) -> tuple[Tensor, Tensor, Tensor] | None:
     sides = sides[twin[sides] >= 0]
     other = twin[sides]
     c, d = opposite[sides], opposite[other]
-    known = torch.isin(torch.minimum(c, d) * size + torch.maximum(c, d), unique)
+    known = torch.isin(_keys(c, d, size), torch.cat([unique, gone]))
     wound = half[sides, 0] == half[other, 1]
     keep = wound & (c != d) & ~known
     sides, other, c, d = sides[keep], other[keep], c[keep], d[keep]
@@ -118,8 +129,7 @@ def _independent(
         far.scatter_reduce_(0, face, rank, "amin")
     free = (far[left[order]] == rank) & (far[right[order]] == rank)
     order = order[free]
-    one, two = after[order, 0, :2].unbind(1)
-    made = torch.minimum(one, two) * (int(after.max()) + 1) + torch.maximum(one, two)
+    made = _keys(after[order, 0, 0], after[order, 0, 1], int(after.max()) + 1)
     _, place = torch.unique(made, return_inverse=True)
     best = torch.full((int(place.max()) + 1 if len(place) else 0,), len(order))
     best.scatter_reduce_(0, place, torch.arange(len(order)), "amin")

@@ -172,7 +172,7 @@ def _linear(lengths: Tensor, faces: Tensor, count: int) -> sparse.csr_array:
 def _star_pair(points: Tensor, stars: Int[Tensor, "S 3"]) -> sparse.csr_array:
     """A third of the linear elements on local stars: each triangle is in those of its three corners."""
     lengths = (points[stars[:, [1, 2, 0]]] - points[stars]).norm(dim=2)
-    return _linear(mollified(lengths), stars, len(points)) / 3
+    return _linear(mollified(lengths, stars), stars, len(points)) / 3
 
 
 def positive_mass(

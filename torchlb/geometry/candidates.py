@@ -61,20 +61,27 @@ def list_candidates(
 
 
 def stencil_candidates(
-    dim: int, order: int, weights: str, num_neighbors: int | None, on_mesh: bool
+    dim: int,
+    order: int,
+    weights: str,
+    num_neighbors: int | None,
+    *,
+    on_mesh: bool,
+    triangles: bool,
 ) -> list[Candidate]:
     """The candidates for a row of order p: degree p + 1, then the even degrees below; then positive weights of order 1.
 
-    Rows of an even order are no better on evenly spread points than those of the odd order below, and rows of order 1
-    no better on a mesh than its triangles: there they are tried only if asked for. Least squares follow splines.
+    Rows of an even order are no better on evenly spread points than those of the odd order below. Rows of order 1 are
+    no better on a mesh than its triangles, and positive ones no better than those of a surface through a cloud: there
+    they are tried only if asked for. Least squares follow splines.
 
-    >>> [c.degree for c in stencil_candidates(2, 5, "least_squares", 60, on_mesh=False)]
+    >>> [c.degree for c in stencil_candidates(2, 5, "least_squares", 60, on_mesh=False, triangles=False)]
     [6, 4, 2, 2]
     """
     rules = list(dict.fromkeys([weights, "least_squares"]))
     lowest = 4 if on_mesh else 2
     degrees = [order + 1, *range(order // 2 * 2, lowest - 1, -2)]
-    positive = [2] if order == 1 or not on_mesh else []
+    positive = [2] if order == 1 or not triangles else []
     return [
         *list_candidates(dim, degrees, rules, num_neighbors),
         *list_candidates(dim, positive, ["positive"], num_neighbors),

@@ -20,7 +20,7 @@ from scipy.spatial import KDTree
 from torch import Tensor
 
 from torchlb.geometry.vectors import at, dot
-from torchlb.geometry.voronoi import natural_neighbors
+from torchlb.geometry.voronoi import natural_neighbors, unit_directions
 
 MIN_ALIGNMENT = 0.5
 """Admission: smallest singular value of E_kᵀE_i, the cosine of the largest angle between two tangent planes."""
@@ -46,7 +46,7 @@ def nearest_neighbors(points: Float[Tensor, "N n"], size: int) -> Int[Tensor, "N
     [[0, 1], [1, 0], [2, 1]]
     """
     tree = KDTree(points.numpy())
-    _, index = tree.query(points.numpy(), k=size, workers=-1)
+    _, index = tree.query(points.numpy(), k=size, workers=torch.get_num_threads())
     found = torch.from_numpy(np.asarray(index, dtype=np.int64).reshape(len(points), size))
     own = torch.arange(len(points))[:, None]
     others = found != own
@@ -160,7 +160,8 @@ def nearest_graph(
     good = admissible(points, planes, centers, flat) & admissible(points, planes, flat, centers)
     good = good.view(num_rows, size)
     chosen = good & (good.cumsum(1) <= wanted)
-    for rows in torch.arange(num_rows).split(2**24 // (size * 128)):
+    at_once = max(1, 2**24 // (size * len(unit_directions(frames.shape[-1]))))
+    for rows in torch.arange(num_rows).split(at_once):
         offset = points[others[rows]] - points[rows, None]
         distance = offset.norm(dim=-1)
         reach = VOID * (distance * chosen[rows]).amax(1, keepdim=True)

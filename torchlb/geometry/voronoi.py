@@ -7,6 +7,7 @@ over all directions is its volume; and the flux through the faces is a finite-vo
 
 from __future__ import annotations
 
+from functools import cache
 from math import gamma, pi
 
 import torch
@@ -14,6 +15,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 
+@cache
 def unit_directions(dim: int) -> Float[Tensor, "u d"]:
     """Evenly spread unit vectors: 2, 128 or 1024 of them for d = 1, 2, more."""
     if dim == 1:

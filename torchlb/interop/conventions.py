@@ -27,8 +27,8 @@ def weak_matrices(
 
     For the cotangent operator C is that library's, entry by entry, on a mesh without boundary trouble or degenerate
     triangles; M is Voronoi, as igl has it by default, where potpourri3d and LaPy's `lump=True` give a third of the
-    triangles' areas. For the stencil C is not symmetric, its rows and its columns sum to zero, and its symmetric part
-    is semidefinite: for solvers that need symmetry (Cholesky, eigsh) take ½(C + Cᵀ), at the price of a lower order.
+    triangles' areas. For the stencil C is not symmetric; with certify=True its columns sum to zero like its rows, and
+    its symmetric part is semidefinite. What needs symmetry (Cholesky, eigsh) has the weak pair, `lb.stiffness`.
 
     Parameters
     ----------

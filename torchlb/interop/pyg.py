@@ -1,8 +1,10 @@
 """PyTorch Geometric (`pip install torchlb[pyg]`): operators as keys of its `Data`, which its loaders batch.
 
-transform = LaplaceBeltramiTransform(order=3, k=64, cache="operators")
-for batch in torch_geometric.loader.DataLoader([transform(data) for data in shapes], batch_size=8):
-lb = to_operator(batch)  # block diagonal: every layer of torchlb takes it
+Shapes get theirs once, then loaders batch them::
+
+    transform = LaplaceBeltramiTransform(order=3, k=64, cache="operators")
+    for batch in torch_geometric.loader.DataLoader([transform(data) for data in shapes], batch_size=8):
+        lb = to_operator(batch)  # block diagonal: every layer of torchlb takes it
 """
 
 from __future__ import annotations
@@ -58,7 +60,7 @@ class LaplaceBeltramiTransform(BaseTransform):
     lb_info            str          source, options, certificate, bounds as JSON
     =================  ===========  ============================================================================
 
-    Every key has a last or first axis that concatenates, and the one whose name contains "index" is shifted by the
+    Every key has a last or first axis that concatenates, and those whose names contain "index" are shifted by the
     number of nodes; nothing depends on a subclass of `Data`. The report is left out. A translation of `pos` changes
     nothing; rotation, scaling, jitter and sampling belong before the transform.
 

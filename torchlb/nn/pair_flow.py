@@ -104,11 +104,11 @@ def _polynomials(
             return 2 * solver.mass_product(solver.solve(v, poles, tolerance)) - v
         return 2 * solver.solve(solver.mass_product(v), poles, tolerance) - v
 
-    before, v = x, doubled(x)
-    yield before
-    for _ in range(count - 1):
+    yield x
+    before, v = x, x
+    for k in range(1, count):
+        before, v = v, doubled(v) if k == 1 else 2 * doubled(v) - before
         yield v
-        before, v = v, 2 * doubled(v) - before
 
 
 @lru_cache(maxsize=4096)

@@ -104,15 +104,17 @@ def _starts(counts: Sequence[int]) -> list[int]:
 def split_buffers(joined: Buffers, sizes: Sequence[int]) -> list[Buffers]:
     """The inverse of `join_buffers`."""
     shapes = []
-    for start, size in zip(_starts(sizes), sizes, strict=True):
+    first, starts = joined["faces"][:, 0].contiguous(), joined["faces"].new_tensor(_starts(sizes))
+    of_shape = torch.bucketize(first, starts[1:], right=True)
+    faces = joined["faces"].split(torch.bincount(of_shape, minlength=len(sizes)).tolist())
+    for start, size, corners in zip(_starts(sizes), sizes, faces, strict=True):
         point = slice(start, start + size)
         first, last = joined["crow"][[start, start + size]].tolist()
         entry = slice(first, last)
         by_point = [n for n in joined if n in BY_POINT or n.startswith("report_")]
         shape = {n: joined[n][point] for n in by_point} | {n: joined[n][entry] for n in BY_ENTRY}
         shape["gradient_values"] = joined["gradient_values"][:, entry]
-        own = (joined["faces"] >= start) & (joined["faces"] < start + size)
-        shape["faces"] = joined["faces"][own.all(1)] - start
+        shape["faces"] = corners - start
         for name, shift in (("col", start), ("col_t", start), ("order_t", first)):
             shape[name] = shape[name] - shift
         for name in ("crow", "crow_t"):

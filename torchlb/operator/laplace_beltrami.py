@@ -40,7 +40,7 @@ class LaplaceBeltrami(StencilFace, WeakFace):
     ----------
     crow, col, values : the matrix of Δ in CSR; values in 1/ℓ², where ℓ is the unit of the points.
     gradient_values : (d, nnz), 1/ℓ: tangential derivatives in the frame of each row's point, on the same pattern.
-    mass : (N,), ℓ^d: positive quadrature weights that sum to the area; π of the certificate.
+    mass : (N,), ℓ^d: positive quadrature weights that sum to the area; π of the certificate where there is one.
     certificate : what is proved of the stability of Δ; None where it was not asked for, and for the cotangent.
     points : (N, n), ℓ.  frames : (N, n, d), orthonormal tangent vectors.
     normals : (N, n), unit normals of a hypersurface, empty (0, n) otherwise.

@@ -201,13 +201,18 @@ class OperatorStorage(nn.Module):
         assert self._bounds is not None
         return self._bounds
 
+    @property
+    def linear_pair(self) -> tuple[Tensor, Tensor, Tensor]:
+        """(crow, col, values (2, nnz)) of the pair of linear elements, close to (K, M) and 20 times sparser."""
+        pair = "linear" if len(self.linear_crow) else "weak"
+        return tuple(getattr(self, f"{pair}_{part}") for part in ("crow", "col", "values"))  # type: ignore[return-value]
+
     def _flow_bounds(self) -> Bounds:
         """Of the matrix that Chebyshev series expand: Δ, or −D⁻¹K₁ beside a weak pair."""
         if len(self.weak_crow) == 0:
             matrix = to_scipy(self.crow, self.col, self.values.double(), self.shape)
             return spectral_bounds(matrix, self.mass.detach().cpu().double().numpy())
-        pair = "linear" if len(self.linear_crow) else "weak"
-        crow, col, values = (getattr(self, f"{pair}_{part}") for part in ("crow", "col", "values"))
+        crow, col, values = self.linear_pair
         stiffness, mass = (to_scipy(crow, col, v.double(), self.shape) for v in values[:2])
         lumped: Any = mass.sum(axis=1)
         return interval_bounds(stiffness, lumped)

@@ -58,21 +58,20 @@ class WeakFace(OperatorStorage):
         return csr_tensor(self.weak_crow, self.weak_col, self.weak_values[number], self.num_points)
 
     @property
-    def linear_pair(self) -> tuple[Tensor, Tensor, Tensor]:
-        """(crow, col, values (2, nnz)) of the pair of linear elements, close to (K, M) and 20 times sparser."""
-        pair = "linear" if len(self.linear_crow) else "weak"
-        return tuple(getattr(self, f"{pair}_{part}") for part in ("crow", "col", "values"))  # type: ignore[return-value]
-
-    @property
     def fixed(self) -> Bool[Tensor, " N"] | None:
         """Mask of the points where a Dirichlet condition holds; None if there are none."""
         if len(self.on_boundary) == 0:
             return None
-        states = self.parts or [self.get_extra_state()]
-        holds = [state["options"].get("condition") == "dirichlet" for state in states]
+        holds = [condition == "dirichlet" for condition in self._conditions]
         sizes = self.sizes or (self.num_points,)
         mask = torch.tensor(holds).repeat_interleave(torch.tensor(sizes)).to(self.on_boundary)
         return mask & self.on_boundary if any(holds) else None
+
+    @property
+    def _conditions(self) -> list[str | None]:
+        """What holds at the boundary of each shape."""
+        states = [{"options": self.options}] if self.parts is None else self.parts
+        return [state["options"].get("condition") for state in states]
 
     def eigenbasis(
         self, k: int, *, tolerance: float | None = None, store: bool = False
@@ -120,8 +119,7 @@ class WeakFace(OperatorStorage):
     def _stencil_eigenbasis(self, k: int) -> Eigenbasis:
         """From the rows of Δ, in the inner product of the mass."""
         matrix = to_scipy(self.crow, self.col, self.values, self.shape)
-        states = self.parts or [self.get_extra_state()]
-        conditions = [CONDITIONS.get(state["options"].get("condition")) for state in states]
+        conditions = [CONDITIONS.get(condition or "") for condition in self._conditions]
         outflow = not all(c is None or c.conserves for c in conditions)
         options = {"outflow": outflow, "rounding": torch.finfo(self.dtype).eps}
         return blockwise_eigenbasis(matrix, self.mass, k, self.sizes, **options)

@@ -1,4 +1,4 @@
-r"""What is computed from the eigenbasis: signatures, wavelets, diffusion maps, and a learned convolution.
+r"""What is computed from the eigenbasis: signatures, wavelets, diffusion maps.
 
 Every function takes the operator, whose basis is solved once and kept, and `k`, the number of pairs to use. A batch of
 shapes gives what its shapes give one by one.
@@ -132,7 +132,10 @@ def spectral_wavelets(
     scales = torch.as_tensor(scales).to(basis.eigenvalues)
     gains = _wavelet_gains(basis.eigenvalues, scales)
     coefficients = basis.to_basis(f)
-    parts = [basis.from_basis(g[..., None] * coefficients) for g in gains.to(coefficients.dtype).unbind(-1)]
+    parts = [
+        basis.from_basis(g[..., None] * coefficients)
+        for g in gains.to(coefficients.dtype).unbind(-1)
+    ]
     return torch.stack(parts, dim=-2)
 
 

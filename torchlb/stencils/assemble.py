@@ -28,6 +28,7 @@ from torchlb.geometry.candidates import (
 from torchlb.geometry.frames import local_heights, local_offsets
 from torchlb.geometry.neighbors import AT_ONCE
 from torchlb.stencils.acceptance import WIDEST_AT_BOUNDARY, Acceptance
+from torchlb.stencils.low_order import MeshLowOrder
 from torchlb.stencils.rows import Reason, Rows, matrix_rows, stencil_rows
 from torchlb.stencils.shape import Shape
 
@@ -59,7 +60,10 @@ class Stencils:
         dim, on_mesh = shape.frames.shape[-1], shape.on_mesh
         self.shape, self.order, self.projection = shape, order, projection
         self.num_neighbors = num_neighbors
-        self.candidates = stencil_candidates(dim, order, weights, num_neighbors, on_mesh)
+        triangles = isinstance(shape.low_order, MeshLowOrder)
+        self.candidates = stencil_candidates(
+            dim, order, weights, num_neighbors, on_mesh=on_mesh, triangles=triangles
+        )
         self.acceptance = Acceptance(dim, on_mesh, projection)
 
     def rows(self, centers: Int[Tensor, " B"], start: Int[Tensor, " B"] | None = None) -> Rows:
@@ -180,7 +184,7 @@ class Stencils:
     def _gradients(
         self, centers: Int[Tensor, " B"]
     ) -> Iterator[tuple[Int[Tensor, " b"], Int[Tensor, "b K"], Float[Tensor, "b K d"]]]:
-        """First derivatives where only Δ has no good stencil, as at a boundary: of the highest degree that has good ones.
+        """First derivatives where only Δ has no good stencil, as at a boundary: of the highest degree that has.
 
         Batches of (places in `centers`, points, weights). Of degree 1 those of the low-order row are as good.
         """
@@ -209,7 +213,7 @@ def _good_slope(weights: Weights) -> Bool[Tensor, " B"]:
 def assemble(stencils: Stencils, *, progress: bool = True) -> Rows:
     """Rows of all points, in chunks.
 
-    Memory beyond the result: about 0.1 GB whatever N (`candidates.PIECE_BYTES`). The result takes 16 + 8 d + 4 d(d + 1)
+    Memory beyond the result: about 0.1 GB whatever N (`candidates.PIECE_BYTES`). The result takes 16 + 8 d
     bytes an entry.
     """
     shape = stencils.shape

@@ -20,7 +20,12 @@ from torch.nn.functional import pad
 from torchlb.baseline.robust import LEAST_AREA, robust_rows
 from torchlb.geometry.boundary import Boundary
 from torchlb.geometry.neighbors import GraphBalls, nearest_neighbors
-from torchlb.geometry.voronoi import cell_laplacian, cell_volume, unrolled
+from torchlb.geometry.voronoi import (
+    cell_laplacian,
+    cell_volume,
+    unit_directions,
+    unrolled,
+)
 
 
 def simplex_shares(
@@ -52,7 +57,9 @@ class CurveLowOrder:
     @cached_property
     def _matrix(self) -> sparse.csr_array:
         i, j = self.segments.T.numpy()
-        length = (self.vertices[self.segments[:, 1]] - self.vertices[self.segments[:, 0]]).norm(dim=1)
+        length = (self.vertices[self.segments[:, 1]] - self.vertices[self.segments[:, 0]]).norm(
+            dim=1
+        )
         count = len(self.vertices)
         weights = sparse.csr_array((1 / length.numpy(), (i, j)), shape=(count, count))
         weights = sparse.csr_array(weights + weights.T)
@@ -102,6 +109,7 @@ class CloudLowOrder:
         dim = balls.frames.shape[-1]
         self.size = min(6 * 2**dim + 1, len(balls.points))
         self.few = min(4 * dim + 1, len(balls.points))
+        self.at_once = max(1, 2**24 // (self.size * len(unit_directions(dim))))
 
     def areas(self) -> Float[Tensor, " N"]:
         """Volumes of the Voronoi cells, ℓ^d: second order in the spacing."""
@@ -110,7 +118,7 @@ class CloudLowOrder:
     @cached_property
     def _volumes(self) -> Float[Tensor, " N"]:
         volumes = []
-        for centers in torch.arange(len(self.balls.points)).split(4096):
+        for centers in torch.arange(len(self.balls.points)).split(self.at_once):
             _, coords, valid = self._cells(centers)
             outward = torch.zeros_like(coords[:, 0])
             if self.boundary is not None:
@@ -129,7 +137,7 @@ class CloudLowOrder:
 
         So these rows alone are an M-matrix, symmetric in m. A flux that one end alone knows is its own.
         """
-        chunks = torch.arange(len(self._volumes)).split(4096)
+        chunks = torch.arange(len(self._volumes)).split(self.at_once)
         rows = sparse.vstack([self._one_sided(chunk) for chunk in chunks], format="csr")
         volumes = self._volumes.numpy()
         flux = sparse.csr_array(sparse.diags_array(volumes) @ rows)

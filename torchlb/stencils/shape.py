@@ -137,7 +137,7 @@ def mesh_shape(
     reference = sides = None
     if faces.shape[1] == vertices.shape[1] and faces.shape[1] < 4:
         reference = vertex_normals(vertices, faces)
-        if consistently_wound(faces):
+        if areas is None and consistently_wound(faces):
             candidates = nearest_neighbors(vertices, min(CANDIDATES[2], len(vertices)))
             sides = thin_sides(vertices, reference, nearest_pairs(candidates))
     start = GraphBalls(vertices, graph, initial, sides)
