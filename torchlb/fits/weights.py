@@ -19,6 +19,8 @@ from torchlb.fits.polynomials import (
     monomials,
 )
 
+ON_LINE = 1e-5
+"""Spread of points across over that along their longest direction, below which they lie on a line, or in a plane."""
 MAX_RESIDUAL = 1e-10
 """Moment equations are met if nothing larger is left; what a system without full rank leaves is."""
 
@@ -269,6 +271,11 @@ def least_squares_weights(
     inverse = _inverse(r)
     solution = root[..., None] * (q @ (inverse.mT @ right))
     residual = (values.mT @ solution - functionals).abs().amax((1, 2)) / functionals.abs().max()
+    if (
+        flux is not None
+    ):  # what the data add would hide that points on a line say nothing of what is across
+        spread = torch.linalg.svdvals(scaled)
+        residual = torch.where(spread[:, -1] < ON_LINE * spread[:, 0], torch.inf, residual)
     center = -(constant[..., None] * solution).sum(1, keepdim=True)
     weights = torch.cat([center, solution[:, : coords.shape[1]]], dim=1)
     left = (

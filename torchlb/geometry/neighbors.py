@@ -28,7 +28,8 @@ MAX_SLOPE = 0.5
 """Admission: largest share of the distance |e| that may be height over the centre's tangent plane. On a sphere the
 two bounds meet, at 60°."""
 VOID = 1.5
-"""A natural neighbour may be this many times farther than the nearest ones; at an open end all else would be."""
+"""A natural neighbour on a surface or beyond may be this many times farther than the nearest ones; at an open end all
+else would be. A curve has two, and one at its end."""
 AT_ONCE = 2**13
 """Points whose neighbours are looked at together: of small arrays the memory is used again."""
 PAIRS_AT_ONCE = 2**16
@@ -149,7 +150,8 @@ def nearest_graph(
     its natural neighbours in the tangent plane, which bridge the voids of an uneven cloud. `candidates`
     come from `nearest_neighbors`; an edge must be admissible from both its ends.
     """
-    wanted = 2 ** (frames.shape[-1] + 1)
+    dim = frames.shape[-1]
+    wanted = 2 ** (dim + 1)
     others = candidates[:, 1:]
     num_rows, size = others.shape
     if size == 0:  # a single point
@@ -160,12 +162,14 @@ def nearest_graph(
     good = admissible(points, planes, centers, flat) & admissible(points, planes, flat, centers)
     good = good.view(num_rows, size)
     chosen = good & (good.cumsum(1) <= wanted)
-    at_once = max(1, 2**24 // (size * len(unit_directions(frames.shape[-1]))))
+    at_once = max(1, 2**24 // (size * len(unit_directions(dim))))
     for rows in torch.arange(num_rows).split(at_once):
         offset = points[others[rows]] - points[rows, None]
         distance = offset.norm(dim=-1)
-        reach = VOID * (distance * chosen[rows]).amax(1, keepdim=True)
-        near = good[rows] & (distance <= reach)
+        near = good[rows]
+        if dim > 1:
+            reach = VOID * (distance * chosen[rows]).amax(1, keepdim=True)
+            near &= distance <= reach
         chosen[rows] |= natural_neighbors(offset @ frames[rows], near)
     pick = chosen.reshape(-1).numpy()
     return _graph(centers.numpy()[pick], flat.numpy()[pick], num_rows)

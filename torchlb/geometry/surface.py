@@ -34,6 +34,10 @@ NEAREST = 24
 """Nearest points from which normals, stars and neighbourhoods are made."""
 SPACING, REACH = 8, 2.0
 """The reach of a point is so many times the distance to its neighbour of this number."""
+IN_ROW = 0.2
+"""Spread across over that along it, below which points lie in a row."""
+ASKEW = 0.7
+"""Cosine with the normal of the faces below which another one is none: those of points in a row are any across it."""
 SPECK = 4
 """Patches of fewer triangles are left out."""
 PLACES = 3
@@ -128,18 +132,20 @@ def cloud_surface(
 ) -> CloudSurface:
     """The surface through all points, as far as they resolve one; `boundary` marks points of a real boundary."""
     candidates = nearest_neighbors(points, min(NEAREST, len(points)))
-    given, frames = normals, cloud_frames(points, candidates, 2)
-    if normals is None:
+    given, frames, noise = normals, cloud_frames(points, candidates, 2), 0.0
+    planar = _planar_triangles(points.numpy())
+    if normals is None and planar is not None:
+        normals = torch.from_numpy(planar[1]).expand_as(points)
+    elif normals is None:
         first = torch.linalg.cross(*frames.unbind(-1))
         normals = refined_normals(points, first, candidates, rounds=2)
-    points, noise = denoised(points, normals, candidates)
-    if noise and given is None:
-        normals = refined_normals(points, normals, candidates, rounds=2)
+    if planar is None:
+        points, noise = denoised(points, normals, candidates)
+        if noise and given is None:
+            normals = refined_normals(points, normals, candidates, rounds=2)
     places, near, count = points.numpy(), candidates.numpy(), len(points)
-    far = near[:, min(SPACING, near.shape[1] - 1)]
-    reach = REACH * np.linalg.norm(places[far] - places, axis=1)
+    reach = _reaches(places, near)
     rim = np.zeros(count, dtype=bool) if boundary is None else boundary.numpy()
-    planar = _planar_triangles(places)
     if planar is None:
         nearest = np.linalg.norm(places[near[:, 1]] - places, axis=1)
         tetrahedra = Tetrahedra.of(places, normals.numpy(), nearest)
@@ -152,7 +158,7 @@ def cloud_surface(
     else:
         two_sided, cloud = True, Cloud(places, normals.numpy(), near, reach, rim)
         up = normals * (normals @ normals[0]).sign()[:, None] * normals[0, 2].sign()
-        small = cloud.small(planar)
+        small = cloud.small(planar[0])
         every = np.ones(len(small), dtype=bool)
         found = Candidates(small, small, every, every, up.numpy())
     outward = found.outward if given is None else given.numpy()
@@ -167,6 +173,8 @@ def cloud_surface(
         faces = facing_out(places, wound_alike(places, faces)[0], outward)
     # not by the faces where these lead into a mouth from outside
     cloud = _along(_oriented(cloud, faces), outward)
+    if given is None:
+        cloud = _righted(cloud, faces)
     stars = stars_in_gaps(cloud, faces, pairs)
     loops = boundary_loops(faces, count)
     pieces = pieces_of(np.concatenate([faces, stars]), count)
@@ -177,6 +185,21 @@ def cloud_surface(
     return CloudSurface(
         points, triangles, torch.from_numpy(stars), normals, frames, candidates, summary
     )
+
+
+def _reaches(
+    points: Float[np.ndarray, "N 3"], near: Int[np.ndarray, "N K"]
+) -> Float[np.ndarray, " N"]:
+    """The largest circumradius of a triangle at each point, by the `SPACING` nearest; by all where these lie in a row.
+
+    Rings of a scan may be many times farther apart than the points along them.
+    """
+    few = near[:, : SPACING + 1]
+    offset = points[few] - points[few].mean(1, keepdims=True)
+    length = np.linalg.eigvalsh(offset.transpose(0, 2, 1) @ offset)
+    in_row = length[:, 1] < IN_ROW**2 * length[:, 2]
+    far = np.where(in_row, near[:, -1], few[:, -1])
+    return REACH * np.linalg.norm(points[far] - points, axis=1)
 
 
 def _upright(
@@ -251,13 +274,25 @@ def _along(cloud: Cloud, vectors: Float[np.ndarray, "N 3"]) -> Cloud:
     return replace(cloud, normals=np.where(away[:, None], -cloud.normals, cloud.normals))
 
 
-def _planar_triangles(points: Float[np.ndarray, "N 3"]) -> Faces | None:
-    """Delaunay triangles of a cloud in a plane; None if it is in none."""
+def _righted(cloud: Cloud, faces: Faces) -> Cloud:
+    """The cloud with the normals of its faces where its own are askew to them, on the side that these had."""
+    points, triangles = torch.from_numpy(cloud.points), torch.from_numpy(faces)
+    of_faces = vertex_normals(points, triangles).numpy()
+    cosine = (cloud.normals * of_faces).sum(1)
+    askew = (np.abs(cosine) < ASKEW) & of_faces.any(1)
+    righted = of_faces * np.where(cosine < 0, -1.0, 1.0)[:, None]
+    return replace(cloud, normals=np.where(askew[:, None], righted, cloud.normals))
+
+
+def _planar_triangles(
+    points: Float[np.ndarray, "N 3"],
+) -> tuple[Faces, Float[np.ndarray, " 3"]] | None:
+    """Delaunay triangles of a cloud in a plane and the plane's normal; None if it is in none."""
     centered = points - points.mean(0)
     _, spread, axes = np.linalg.svd(centered, full_matrices=False)
     if spread[2] > FLAT * spread[0]:
         return None
-    return Delaunay(centered @ axes[:2].T).simplices.astype(np.int64)
+    return Delaunay(centered @ axes[:2].T).simplices.astype(np.int64), axes[2]
 
 
 def _contacts(cloud: Cloud, faces: Faces) -> tuple[int, tuple[tuple[float, float, float], ...]]:

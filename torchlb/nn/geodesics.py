@@ -8,6 +8,7 @@ triangles (Novotni, Klein 2002) need neither: their mean error is 0.2 to 0.6 of 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 import torch
@@ -17,10 +18,13 @@ from scipy.sparse import csgraph
 from torch import Tensor
 
 from torchlb.errors import InputError
+from torchlb.geometry.neighbors import mesh_graph
 from torchlb.operator.laplace_beltrami import LaplaceBeltrami
 
 TOLERANCE = 1e-6
 """Of the sweeps, in mean edge lengths."""
+FROM_MESH = ("mesh", "cotangent")
+"""Sources of operators whose faces are all there is."""
 Triangles = tuple[np.ndarray, np.ndarray, np.ndarray]
 
 
@@ -30,12 +34,13 @@ def geodesic_distance(
     """Distance along the surface to the nearest of the sources, ℓ; infinite where no path leads to one.
 
     On surfaces the error falls a little faster than the spacing: on a sphere of 2,000 vertices it is 0.4 % in the mean.
-    On curves and in more dimensions, and where points are not joined by triangles, paths follow edges. Computed on the
+    On curves and in more dimensions, and where there are no triangles, paths follow edges. Computed on the
     CPU, without derivatives.
 
     Parameters
     ----------
-    lb : operator of one shape or of a batch. Edges are those of its mesh; of a cloud, those of its stencils.
+    lb : operator of one shape or of a batch. Edges and triangles are those of its mesh, or of the surface through a
+        cloud; where there is none, edges are those of its stencils.
     sources : number of a point, numbers of several, or a mask (N,).
 
     Raises
@@ -59,7 +64,7 @@ def geodesic_distance(
     distance = csgraph.dijkstra(graph, indices=start.cpu().numpy(), min_only=True)
     if lb.dim == 2 and len(row):
         enough = TOLERANCE * float(length.mean())
-        distance = _straightened(distance, points, _triangles(lb, points, row, col), enough)
+        distance = _straightened(distance, points, _triangles(lb), enough)
     return torch.from_numpy(distance).to(lb.values)
 
 
@@ -78,11 +83,14 @@ def _sources(lb: LaplaceBeltrami, sources: int | Sequence[int] | Tensor) -> Int[
 
 
 def _edges(lb: LaplaceBeltrami) -> tuple[np.ndarray, np.ndarray]:
-    """Pairs of neighbours, each in both directions, sorted by the first."""
-    crow, col = lb.linear_pair[:2] if lb.has_weak_form else (lb.crow, lb.col)
-    where = (np.ones(len(col)), col.cpu().numpy(), crow.cpu().numpy())
-    matrix = sparse.csr_array(where, shape=lb.shape)
-    row, column = sparse.coo_array(sparse.csr_array(matrix + matrix.T)).coords
+    """Pairs of neighbours, each in both directions: of faces and local stars; where there are none, of the stencils."""
+    matrix: Any = mesh_graph(lb.faces.cpu(), lb.num_points)
+    if len(lb.faces) == 0 or lb.source not in FROM_MESH:
+        crow, col = lb.linear_pair[:2] if lb.has_weak_form else (lb.crow, lb.col)
+        where = (np.ones(len(col)), col.cpu().numpy(), crow.cpu().numpy())
+        near = sparse.csr_array(where, shape=lb.shape)
+        matrix = matrix + near + near.T
+    row, column = sparse.coo_array(matrix).coords
     return row[row != column], column[row != column]
 
 
@@ -90,22 +98,12 @@ def _distances(points: np.ndarray, a: np.ndarray, b: np.ndarray) -> np.ndarray:
     return np.linalg.norm(points[a] - points[b], axis=1)
 
 
-def _triangles(
-    lb: LaplaceBeltrami, points: np.ndarray, row: np.ndarray, col: np.ndarray
-) -> Triangles:
-    """(i, j, k), sorted by i: neighbours j, k of i that follow each other around it and are neighbours, too."""
-    frames = lb.frames.detach().cpu().double().numpy()
-    x, y = np.einsum("en,end->de", points[col] - points[row], frames[row])
-    order = np.lexsort((np.arctan2(y, x), row))
-    i, j = row[order], col[order]
-    last = np.flatnonzero(np.diff(i, append=-1))
-    following = np.arange(len(i)) + 1
-    following[last] = np.append(0, last[:-1] + 1)
-    k = j[following]
-    closed = np.isin(
-        j * len(points) + k, row * len(points) + col
-    )  # else a hole may lie between them
-    return i[closed], j[closed], k[closed]
+def _triangles(lb: LaplaceBeltrami) -> Triangles:
+    """(i, j, k), sorted by i: each face from all its corners."""
+    faces = lb.faces.cpu().numpy()
+    i, j, k = (np.concatenate([faces[:, (c + shift) % 3] for c in range(3)]) for shift in range(3))
+    order = np.argsort(i, kind="stable")
+    return i[order], j[order], k[order]
 
 
 def _straightened(

@@ -6,6 +6,7 @@ import sys
 from dataclasses import asdict, dataclass, replace
 from typing import Any, get_args
 
+import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
@@ -41,6 +42,11 @@ from torchlb.stencils.conditions import CONDITIONS, Condition, ConditionName
 from torchlb.stencils.rows import Reason, Rows, matrix_rows
 from torchlb.stencils.shape import Shape, cloud_shape, mesh_shape, surface_shape
 
+NOWHERE = "condition='dirichlet' holds nowhere: no boundary, or `boundary` has none of it; leave the condition out"
+LONG, WALL = 3.0, 0.03
+"""Of an edge, over the usual ones of its ends; and of the area that triangles with such edges may be."""
+ASTRAY = 0.02
+"""Of the points of a declared boundary: how many may lie inside."""
 MANY = 0.5
 """Share of low-order rows from which on a warning names them."""
 DOUBTFUL = 0.1
@@ -180,6 +186,11 @@ def build_cloud(
         normals = check_normals(normals, points)
     progress = progress and sys.stderr.isatty()
     on_surface = d == 2 and ambient <= 3 and len(points) > 3
+    if d == ambient and where is None and not on_surface:
+        warn(
+            f"boundary: a shape of {d} dimensions in R^{d} ends somewhere, and without the mask of its boundary points "
+            "areas and Δ are wrong there; pass boundary=mask"
+        )
     if on_surface:
         check_spread(points)
     numbering = Numbering.along_tree(points)
@@ -197,6 +208,8 @@ def build_cloud(
             options = options.settled(triangles=False)
             shape = cloud_shape(here, d, options.q, boundary=where, **settings)
             built = _finished(shape, "points", options, REMEDY.format(d), progress)
+        if options.condition == "dirichlet" and built.on_boundary is None:
+            warn(NOWHERE)
     return replace(built.restored(numbering), points=points)
 
 
@@ -224,6 +237,7 @@ def _build_on_surface(
         assert pair.mass is not None
         shape = replace(shape, areas=pair.mass)
         _warn_of_doubts(surface, fits, pair.mass)
+    _warn_of_walls(surface, where)
     built = _finished(shape, "points", options, REMEDY.format(2), settings["progress"], pair)
     return replace(built, faces=numbering.given[surface.faces], surface=surface.summary)
 
@@ -255,6 +269,40 @@ def _warn_of_doubts(surface: CloudSurface, fits: VertexFits, mass: Float[Tensor,
             f"points: {surface.summary.contact}; the surface may join what only touches there, or cut it. Add points "
             "there, or give the mesh if there is one"
         )
+
+
+def _warn_of_walls(surface: CloudSurface, boundary: Bool[Tensor, " N"] | None) -> None:
+    """Warnings where triangles may close what is open: many long ones, or some around points of a declared boundary."""
+    points, faces = surface.points, surface.faces
+    corners = points[faces]
+    length = (corners - corners.roll(-1, 1)).norm(dim=2)
+    ends = torch.stack([faces, faces.roll(-1, 1)]).flatten()
+    order = torch.from_numpy(np.lexsort((length.flatten().repeat(2).numpy(), ends.numpy())))
+    number = torch.bincount(ends, minlength=len(points))
+    middle = (number.cumsum(0) - (number + 1) // 2 - (number == 0).long()).clamp_min(0)
+    usual = (
+        length.flatten().repeat(2)[order][middle] if len(order) else points.new_zeros(len(points))
+    )
+    long = (length > LONG * torch.maximum(usual[faces], usual[faces.roll(-1, 1)])).any(1)
+    area = torch.linalg.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]).norm(
+        dim=1
+    )
+    share = float(area[long].sum() / area.sum())
+    if share >= WALL:
+        warn(
+            f"points: triangles with an edge of more than {LONG:g} spacings are {share:.0%} of the surface "
+            f"({first_few(faces[long].unique())}); where they wall up a gap between parts that belong apart, build "
+            "each part by itself (LaplaceBeltrami.batch), or give the mesh"
+        )
+    if boundary is not None:
+        rim = torch.zeros_like(boundary).index_fill(0, boundary_faces(faces).flatten(), True)
+        inside = (boundary & ~rim & torch.isin(torch.arange(len(points)), faces)).nonzero()[:, 0]
+        if len(inside) > ASTRAY * int(boundary.sum()):
+            warn(
+                f"boundary: {len(inside)} of its points ({first_few(inside)}) lie inside the surface through the "
+                "cloud, as around a hole that was closed because it is hardly wider than the spacing; add points "
+                "around it, or give the mesh"
+            )
 
 
 def numbered_mesh(
@@ -308,10 +356,7 @@ def build_mesh(
             progress=progress,
         )
         if options.condition == "dirichlet" and shape.boundary is None:
-            warn(
-                "condition='dirichlet' holds nowhere: the mesh has no boundary, or `boundary` none of it; leave the "
-                "condition out"
-            )
+            warn(NOWHERE)
         pair = None
         if shape.fits is not None:
             pair = mesh_pair(here, corners, shape.fits, degree, numbering=numbering)

@@ -24,8 +24,8 @@ from torchlb.operator.cleaning import (
     turned_faces,
 )
 
-MAX_EXTENT = 1e70
-"""Largest extent of the points, and the inverse of the smallest: fourth powers of it must stay finite."""
+MAX_EXTENT = 1e16
+"""Largest extent of the points, and the inverse of the smallest, with which all that is called keeps its digits."""
 COARSE = 1e-3
 """Step of single precision over the spacing of the points above which Δ is rounding."""
 ON_LINE = 1e-9
@@ -81,6 +81,7 @@ def check_distinct(points: Float[Tensor, "N n"]) -> None:
     """ValueError that names points which coincide."""
     spacing, other, bad = coincident(points)
     if len(bad):
+        _warn_of_rounding(points, spacing)
         pair = sorted((int(bad[0]), int(other[bad[0]])))
         raise InputError(
             f"points: {len(bad)} points share a place with another, such as {pair[0]}, {pair[1]} (all: "
@@ -305,9 +306,10 @@ def check_options(
         raise InputError(
             f"num_neighbors: {num_neighbors} are more than the {num_points} points; lower it, or leave it out"
         )
-    if num_points < (min(needed, 4) if dim == 2 and ambient_dim == 3 else needed):
+    of_surface = dim == 2 and ambient_dim == 3
+    least = min(needed, 4) if of_surface else needed
+    if num_points < least:
+        what = "a surface in R^3 needs" if of_surface else f"a stencil of order {order} needs"
         fits = [p for p in range(1, order) if num_monomials(dim, p + 1) <= num_points]
         remedy = f"lower `order` to {max(fits)}" if fits else "add points"
-        raise InputError(
-            f"{num_points} points are fewer than the {needed} that a stencil of order {order} needs; {remedy}"
-        )
+        raise InputError(f"{num_points} points are fewer than the {least} that {what}; {remedy}")

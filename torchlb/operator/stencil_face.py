@@ -114,6 +114,8 @@ class StencilFace(OperatorStorage):
         """
         if f.ndim == 1:
             return self.hessian(f[:, None])[..., 0]
+        if f.ndim != 2:
+            raise InputError(f"expected f of shape (N,) or (N, C), got {tuple(f.shape)}")
         slope = self.gradient(f)  # (N, n, C)
         change = self.local_gradient(slope.flatten(1)).unflatten(-1, slope.shape[1:])
         result = torch.einsum("inb,ianc->iabc", self.frames.to(change.dtype), change)

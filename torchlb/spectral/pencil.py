@@ -265,8 +265,8 @@ def _correction(
     w, p, square = np.zeros_like(r), np.zeros_like(r), np.ones(r.shape[1], dtype=r.dtype)
     for step in range(steps):
         z = z - u @ (mu.T @ z)
-        before, square = square, _dots(r, z)
-        p = z + p * (square / before)
+        before, square = square, np.maximum(_dots(r, z), 0)  # below zero by rounding alone
+        p = z + p * np.divide(square, before, out=np.zeros_like(square), where=before > 0)
         product = shifted(p, shifts)
         curvature = _dots(p, product)
         length = np.where(curvature > 0, square / np.where(curvature > 0, curvature, 1), 0)

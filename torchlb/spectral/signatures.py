@@ -170,9 +170,14 @@ def diffusion_distance(
     """Diffusion distance of every point to each source: (Σ_k e^{−2λ_k t}(φ_k(x) − φ_k(y))²)^{1/2}, ℓ^{−d/2}.
 
     The distance in L² between the heat that spreads from x and from y in the time t, ℓ². Raises ValueError for a
-    batch, whose shapes have no distance from each other.
+    batch, whose shapes have no distance from each other, and for numbers that no point has.
     """
     if lb.sizes is not None:
         raise InputError("diffusion_distance: got a batch; ask each shape by itself")
+    index = torch.as_tensor(sources)
+    if index.ndim != 1 or bool(((index < 0) | (index >= lb.num_points)).any()):
+        raise InputError(
+            f"sources: expected numbers of points from 0 to {lb.num_points - 1}, in a list or tensor, got {sources!r}"
+        )
     coordinates = diffusion_map(lb, time, dim=min(k, lb.num_points) - 1, k=k)
-    return torch.cdist(coordinates, coordinates[sources])
+    return torch.cdist(coordinates, coordinates[index])

@@ -9,7 +9,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 from tqdm import tqdm
 
-from torchlb.errors import InputError, first_few
+from torchlb.errors import InputError, first_few, warn
 from torchlb.geometry.boundary import Boundary, boundary_of_cloud, boundary_of_mesh, detect_boundary
 from torchlb.geometry.candidates import list_candidates
 from torchlb.geometry.frames import (
@@ -45,7 +45,7 @@ from torchlb.stencils.low_order import (
 
 LowOrder = CloudLowOrder | CurveLowOrder | MeshLowOrder
 NEUMANN = Neumann()
-CANDIDATES = {1: 12, 2: 24, 3: 64}
+CANDIDATES = {1: 32, 2: 24, 3: 64}
 """Nearest points from which the frames and the graph of a cloud start, by dimension."""
 
 
@@ -110,9 +110,20 @@ def cloud_shape(
     )
     frames = balls.frames
     mask = detect_boundary(points, frames, balls) if isinstance(boundary, str) else boundary
+    if mask is None and dim == 2:
+        _warn_of_open_surface(detect_boundary(points, frames, balls))
     edge = None if mask is None else boundary_of_cloud(points, mask, frames, normal_order)
     low_order = CloudLowOrder(balls, edge)
     return _oriented(balls, normals, order, low_order.areas(), low_order, edge, condition)
+
+
+def _warn_of_open_surface(rim: Bool[Tensor, " N"]) -> None:
+    index = rim.nonzero()[:, 0]
+    if len(index) > len(rim) ** 0.5:
+        warn(
+            f"boundary: {len(index)} points ({first_few(index)}) look like those of an open surface's, and without a "
+            "condition areas and Δ are wrong there; pass boundary='detect', or a mask"
+        )
 
 
 def mesh_shape(
