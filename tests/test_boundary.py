@@ -317,3 +317,52 @@ def test_a_robin_condition_is_one_class(order):
     assert values.real.min() > 0
     values = values[values.real.argsort()][:10].real
     assert ((values - exact) / exact).abs().max() < {3: 1e-3, 5: 1e-4}[order]
+
+
+@pytest.mark.parametrize("condition", ["neumann", "dirichlet", None])
+def test_first_derivatives_and_curvature_hold_at_a_rim_whatever_the_condition(condition):
+    """∇f, ∇²f and Δx use no condition, and where Δ has no stencil those of ∇ are of the highest degree there is."""
+    vertices, faces = UnitDisk().mesh(1200)
+    vertices = vertices[:, :2]
+    lb = LaplaceBeltrami.from_mesh(vertices, faces, condition=condition)
+    x, y = vertices.T
+    f = x.exp() * (2 * y).sin()
+    gradient = torch.stack([f, 2 * x.exp() * (2 * y).cos()], 1)
+    assert (lb.gradient(f) - gradient).abs().max() < 5e-3
+    assert (lb.hessian(f).diagonal(dim1=1, dim2=2).sum(1) + 3 * f).abs().max() < 0.2
+    assert lb.mean_curvature_normal().abs().max() < 1e-10
+
+
+def test_curvature_at_the_rim_of_the_cotangent_operator():
+    """Where its rows are those of a Neumann condition, which positions do not satisfy."""
+    lb = LaplaceBeltrami.from_cotangent(*UnitDisk().mesh(500))
+    assert lb.mean_curvature_normal().norm(dim=1).max() < 1e-10
+
+
+def test_points_on_a_line_along_the_rim_have_no_stencil():
+    """20 rings of 200 points: the nearest of a rim's points are on its ring, and ∂_ν f = 0 alone looks across."""
+    angle = 2 * math.pi * torch.arange(200, dtype=torch.float64) / 200
+    height = torch.linspace(0, 3, 20, dtype=torch.float64)
+    circle = torch.stack([angle.cos(), angle.sin()], 1)
+    points = torch.cat([circle.repeat(20, 1), height.repeat_interleave(200)[:, None]], 1)
+    lb = LaplaceBeltrami.from_points(points)
+    f = torch.cos(math.pi / 3 * points[:, 2])
+    assert (lb(f) + (math.pi / 3) ** 2 * f).abs().max() < 0.05
+    assert (lb.gradient(points[:, 2]) - torch.tensor([0.0, 0, 1])).abs().max() < 1e-3
+    rim = lb.boundary
+    conormals = boundary_of_mesh(points, lb.faces, lb.frames, 4).conormals[rim]
+    assert (conormals[:, 2] * (points[rim, 2] - 1.5)).min() > 1
+
+
+def test_a_condition_that_holds_nowhere_is_told():
+    with pytest.warns(UserWarning, match="holds nowhere"):
+        LaplaceBeltrami.from_points(Sphere().points(300), condition="dirichlet", boundary="detect")
+
+
+def test_shapes_that_must_be_open_and_have_no_mask_are_told():
+    line = torch.linspace(0, 1, 6, dtype=torch.float64)
+    with pytest.warns(UserWarning, match=r"3 dimensions in R\^3 ends somewhere"):
+        LaplaceBeltrami.from_points(torch.cartesian_prod(line, line, line), dim=3, order=1)
+    x, y = torch.cartesian_prod(torch.linspace(0, 1, 16), torch.linspace(0, 1, 16)).double().T
+    with pytest.warns(UserWarning, match="look like those of an open surface"):
+        LaplaceBeltrami.from_points(torch.stack([x, y, x**2, x * y], 1), dim=2, order=1)

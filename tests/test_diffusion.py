@@ -269,3 +269,24 @@ def test_what_cannot_work_is_said():
     two = torch.cat([Sphere().points(200), Sphere().points(200) + 5])
     with pytest.raises(DiffusionError, match="ask for another k"):
         heat_flow(stencil_of_cloud(two), rough(400), 1.0, k=1)
+
+
+@pytest.mark.parametrize("condition", ["neumann", "dirichlet"])
+def test_the_derivative_in_the_time_at_zero_is_that_from_above(condition):
+    """d/dt⟨w, e^{−tM⁻¹K}f⟩ at t = 0, by solves with M; and what a Dirichlet condition holds is zero from the start."""
+    lb = LaplaceBeltrami.from_mesh(*UnitDisk().mesh(200), condition=condition)
+    f, w = (torch.randn(200, generator=torch.Generator().manual_seed(s)).double() for s in (0, 1))
+    time = torch.zeros((), dtype=torch.float64, requires_grad=True)
+    start = heat_flow(lb, f, time)
+    (slope,) = torch.autograd.grad(w @ start, time)
+    step = 1e-9
+    after = heat_flow(lb, f, step, tolerance=1e-13)
+    torch.testing.assert_close(slope, w @ (after - start.detach()) / step, rtol=1e-3, atol=0.0)
+    if condition == "dirichlet":
+        assert not start[lb.fixed].any()
+
+
+@pytest.mark.parametrize("time", [0.0, -1.0, math.nan])
+def test_learned_times_start_above_zero(time):
+    with pytest.raises(InputError, match="init_time"):
+        Diffusion(3, init_time=time)

@@ -9,10 +9,12 @@ from scipy.sparse.linalg import eigsh
 
 from tolerances import TOLERANCE
 from torchlb import InputError, LaplaceBeltrami
+from torchlb.galerkin import flips
 from torchlb.galerkin.elements import lattice, segment, triangle
 from torchlb.galerkin.flips import flipped
 from torchlb.galerkin.pair import mesh_pair
 from torchlb.galerkin.rim import rim_curves
+from torchlb.geometry.boundary import boundary_faces
 from torchlb.geometry.frames import complete_frames, vertex_normals
 from torchlb.geometry.neighbors import GraphBalls, mesh_graph
 from torchlb.geometry.vertex_fits import VertexFits
@@ -353,3 +355,35 @@ def test_without_the_weak_form_the_stencil_is_certified():
     np.testing.assert_allclose(
         float(both.mass.sum()), float(both.mass_matrix.to_dense().sum()), rtol=1e-9
     )
+
+
+def test_lengths_are_mollified_by_component():
+    """A sphere beside one a million times as large, and a triangle without area: each keeps its own area."""
+    vertices, faces = Sphere().mesh(300)
+    small = 1e-6 * vertices + torch.tensor([3.0, 0, 0]).double()
+    flat = torch.tensor([[5.0, 0, 0], [5.5, 0, 0], [6.0, 0, 0], [5.5, 0.5, 0]]).double()
+    points = torch.cat([vertices, small, flat])
+    corners = torch.cat([faces, faces + 300, torch.tensor([[600, 601, 602], [600, 602, 603]])])
+    alone = LaplaceBeltrami.from_mesh(vertices, faces, order=2).mass.sum()
+    mass = LaplaceBeltrami.from_mesh(points, corners, order=2).mass
+    torch.testing.assert_close(mass[:300].sum(), alone)
+    torch.testing.assert_close(mass[300:600].sum() * 1e12, alone, rtol=1e-6, atol=0.0)
+
+
+def test_flips_end(monkeypatch):
+    """An edge that was flipped away does not come back, though normals change between: faces of a crumpled sheet."""
+    x, y = torch.cartesian_prod(torch.arange(20), torch.arange(20)).double().T
+    z = torch.randn(400, generator=torch.Generator().manual_seed(1)).double() / 2
+    number = torch.arange(400).view(20, 20)
+    low, right, up, far = (
+        part.flatten()
+        for part in (number[:-1, :-1], number[1:, :-1], number[:-1, 1:], number[1:, 1:])
+    )
+    faces = torch.cat([torch.stack([low, right, far], 1), torch.stack([low, far, up], 1)])
+    vertices = torch.stack([x, y, z], 1)
+    rounds = []
+    one_round = flips._flips
+    monkeypatch.setattr(flips, "_flips", lambda *a: rounds.append(a) or one_round(*a))
+    after = flipped(vertices, faces)
+    assert 1 < len(rounds) < 10
+    assert len(boundary_faces(after)) == len(boundary_faces(faces))

@@ -460,3 +460,46 @@ if __name__ == "__main__" and sys.argv[1] == "sizes":
 elif __name__ == "__main__":
     compiled, plain = compiled_and_not(sys.argv[1], "batched" in sys.argv)
     torch.testing.assert_close(compiled, plain, rtol=1e-3, atol=1e-4)
+
+
+def test_a_basis_found_without_gradients_serves_a_training():
+    """What is solved, and what is built, under `inference_mode` are tensors like any other."""
+    vertices, faces = Sphere().mesh(200)
+    x = vertices.float()
+    net = DiffusionNet(3, 2, width=8, num_blocks=1, k=12)
+    lb = LaplaceBeltrami.from_mesh(x, faces)
+    with torch.inference_mode():
+        net(x, lb)
+        inside = LaplaceBeltrami.from_mesh(x + 0, faces + 0)
+        batch = LaplaceBeltrami.batch([inside, inside])
+    net(x, lb).sum().backward()
+    net(x, inside).sum().backward()
+    net(torch.cat([x, x]), batch).sum().backward()
+
+
+def test_operators_keep_their_own_points():
+    vertices, faces = Sphere().mesh(200)
+    given = vertices.double().clone()
+    built = [LaplaceBeltrami.from_mesh(given, faces), LaplaceBeltrami.from_cotangent(given, faces)]
+    given.mul_(2)
+    for lb in built:
+        torch.testing.assert_close(lb.points, vertices.double())
+
+
+@pytest.mark.parametrize(("place", "corners"), [("faces", 3), ("edges", 2)])
+def test_faces_in_the_layout_of_pyg_are_refused(place, corners):
+    vertices, faces = Sphere().mesh(200)
+    net = DiffusionNet(3, 2, width=8, num_blocks=1, k=12, outputs_at=place)
+    lb = LaplaceBeltrami.from_cotangent(vertices.float(), faces)
+    net(vertices.float(), lb, **{place: faces[:, :corners]})
+    with pytest.raises(InputError, match="PyG has the transpose"):
+        net(vertices.float(), lb, **{place: faces[:, :corners].T})
+
+
+def test_wavelets_of_one_function():
+    lb = LaplaceBeltrami.from_cotangent(*Sphere().mesh(200))
+    scales = torch.tensor([0.1, 1.0])
+    f = lb.points[:, 2]
+    single = spectral_wavelets(lb, f, scales, k=20)
+    assert single.shape == (200, 3)
+    assert torch.equal(single, spectral_wavelets(lb, f[:, None], scales, k=20)[..., 0])

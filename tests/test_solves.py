@@ -419,3 +419,23 @@ def test_no_columns_are_no_problem():
     for empty in (f[:, :0], f.expand(2, -1, -1)[:0]):
         assert implicit_step(lb, empty, 0.1).shape == empty.shape
         assert poisson_solve(lb, empty).shape == empty.shape
+
+
+@pytest.mark.parametrize("kind", [torch.int64, torch.bool, torch.uint8])
+def test_integers_and_masks_are_functions(kind):
+    """In the type of the operator, not truncated to their own."""
+    lb = BUILDERS["pair"]()
+    f = (lb.points[:, 2] > 0).to(kind)
+    for solve in (
+        lambda f: implicit_step(lb, f, 0.1),
+        lambda f: poisson_solve(lb, f),
+        lambda f: heat_flow(lb, f, 0.1),
+        lambda f: lb.eigenbasis(10).to_basis(f[:, None]),
+    ):
+        assert torch.equal(solve(f), solve(f.double()))
+
+
+def test_complex_functions_are_refused():
+    lb = BUILDERS["pair"]()
+    with pytest.raises(InputError, match="real f"):
+        poisson_solve(lb, torch.complex(lb.mass, lb.mass))

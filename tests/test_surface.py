@@ -1,5 +1,6 @@
 """A surface through a cloud: a manifold that faces out, with its own boundary; noise; and the weak pair on it."""
 
+import warnings
 from functools import cache
 
 import numpy as np
@@ -369,3 +370,60 @@ def test_a_fan_for_each_point():
     """Two triangles that touch in a point are two fans; the larger one stays."""
     faces = np.array([[0, 1, 2], [0, 2, 3], [0, 3, 1], [0, 4, 5]])
     assert with_single_fans(faces, 6).tolist() == faces[:3].tolist()
+
+
+def grid_of(rows, columns):
+    """A lattice of the unit square in a plane of R³."""
+    x, y = np.meshgrid(np.linspace(0, 1, columns), np.linspace(0, 1, rows))
+    return np.c_[x.ravel(), y.ravel(), 0 * x.ravel()]
+
+
+def test_rings_of_a_scan_are_one_surface():
+    """A sphere by 100 meridians and 48 circles of latitude, whose nearest points near a pole lie on one ring."""
+    theta, phi = np.meshgrid(
+        np.linspace(0, np.pi, 50)[1:-1], np.linspace(0, 2 * np.pi, 100, endpoint=False)
+    )
+    points = np.c_[
+        (np.sin(theta) * np.cos(phi)).ravel(),
+        (np.sin(theta) * np.sin(phi)).ravel(),
+        np.cos(theta).ravel(),
+    ]
+    lb = LaplaceBeltrami.from_points(np.r_[points, [[0, 0, 1], [0, 0, -1]]])
+    exact = torch.tensor([0, 2, 2, 2, 6]).double()
+    torch.testing.assert_close(lb.eigenbasis(5).eigenvalues, exact, rtol=1e-3, atol=1e-9)
+
+
+def test_rings_in_a_plane_have_the_normal_of_the_plane():
+    """Eight times denser along one direction: eigenvalues are those of the square."""
+    turn = np.linalg.qr(np.random.default_rng(0).normal(size=(3, 3)))[0]
+    lb = LaplaceBeltrami.from_points(grid_of(20, 160) @ turn.T)
+    torch.testing.assert_close(
+        (lb.normals @ torch.from_numpy(turn[:, 2])).abs(),
+        torch.ones(3200).double(),
+        rtol=1e-9,
+        atol=0.0,
+    )
+    exact = np.pi**2 * torch.tensor([0, 1, 1, 2]).double()
+    torch.testing.assert_close(lb.eigenbasis(4).eigenvalues, exact, rtol=1e-3, atol=1e-9)
+
+
+def test_walls_between_parts_are_told():
+    """Two plates five spacings apart are closed to a box; one plate alone is not warned of."""
+    plate = grid_of(30, 30)
+    with pytest.warns(UserWarning, match="wall up a gap"):
+        LaplaceBeltrami.from_points(np.vstack([plate, plate + np.array([0, 0, 5 / 29])]), order=1)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        LaplaceBeltrami.from_points(plate, order=1)
+
+
+def test_a_declared_boundary_that_was_closed_is_told():
+    """A hole of four spacings with its rim in the mask."""
+    points = grid_of(30, 30)
+    distance = np.hypot(points[:, 0] - 0.5, points[:, 1] - 0.5) * 29
+    points, distance = points[distance > 1.6], distance[distance > 1.6]
+    edge = (points[:, :2] < 1e-9).any(1) | (points[:, :2] > 1 - 1e-9).any(1)
+    with pytest.warns(UserWarning, match="lie inside the surface"):
+        LaplaceBeltrami.from_points(
+            points, order=1, boundary=torch.from_numpy(edge | (distance < 2.6))
+        )

@@ -14,7 +14,7 @@ import warnings
 from typing import Literal, cast
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Shaped
 from torch import Tensor, nn
 from torch.nn.functional import softplus
 
@@ -35,7 +35,7 @@ SHARPNESS = 100.0
 
 def heat_flow(
     lb: LaplaceBeltrami,
-    f: Float[Tensor, "*B N C"] | Float[Tensor, " N"],
+    f: Shaped[Tensor, "*B N C"] | Shaped[Tensor, " N"],
     t: float | Tensor,
     *,
     method: Method | None = None,

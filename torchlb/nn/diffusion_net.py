@@ -143,7 +143,7 @@ class DiffusionNet(nn.Module):
         x: Float[Tensor, "*B N C"],
         lb: LaplaceBeltrami,
         faces: Int[Tensor, "F corners"] | None = None,
-        edges: Int[Tensor, "E 2"] | None = None,
+        edges: Int[Tensor, "E ends"] | None = None,
     ) -> Tensor:
         """Outputs (…, N, out_channels), or (…, F, ·), (…, E, ·), (…, ·) at the place asked for.
 

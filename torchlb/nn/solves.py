@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Shaped
 from torch import Tensor
 
 from torchlb.errors import InputError
@@ -22,7 +22,7 @@ TOLERANCE = 1e-10
 @uncompiled
 def implicit_step(
     lb: LaplaceBeltrami,
-    f: Float[Tensor, "*B N C"] | Float[Tensor, " N"],
+    f: Shaped[Tensor, "*B N C"] | Shaped[Tensor, " N"],
     t: float | Tensor,
     *,
     boundary_values: Tensor | float | None = None,
@@ -80,7 +80,7 @@ def implicit_step(
 @uncompiled
 def poisson_solve(
     lb: LaplaceBeltrami,
-    f: Float[Tensor, "*B N C"] | Float[Tensor, " N"],
+    f: Shaped[Tensor, "*B N C"] | Shaped[Tensor, " N"],
     *,
     boundary_values: Tensor | float | None = None,
     flux: Tensor | float | None = None,

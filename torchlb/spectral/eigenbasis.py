@@ -6,7 +6,7 @@ from numbers import Integral
 from typing import Protocol, runtime_checkable
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Shaped
 from torch import Tensor
 
 from torchlb.errors import InputError
@@ -101,14 +101,14 @@ class Eigenbasis:
         symmetric = {"is_symmetric": self.is_symmetric, "relative_errors": errors}
         return Eigenbasis(*cut, sizes=self.sizes, **symmetric)
 
-    def to_basis(self, f: Float[Tensor, "*B N C"]) -> Float[Tensor, "*S k C"]:
+    def to_basis(self, f: Shaped[Tensor, "*B N C"]) -> Float[Tensor, "*S k C"]:
         """Coefficients Φᵀ(πf), ΦᵀMf for a symmetric pair, (…, k, C), or (…, S, k, C) for a batch of shapes."""
         if self.is_symmetric:
             return self._analyse(self.left, f)
         f = self._real(f)
         return self._analyse(self.eigenvectors, self.mass.to(f.dtype)[:, None] * f)
 
-    def to_basis_obliquely(self, f: Float[Tensor, "*B N C"]) -> Float[Tensor, "*S k C"]:
+    def to_basis_obliquely(self, f: Shaped[Tensor, "*B N C"]) -> Float[Tensor, "*S k C"]:
         """Coefficients Wᵀf: zero on every left-over eigenvector of Δ, which Φᵀ(πf) is not."""
         return self._analyse(self.left, f)
 

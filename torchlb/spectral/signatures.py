@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Float, Int, Shaped
 from torch import Tensor
 
 from torchlb.errors import EigenbasisError, InputError
@@ -111,7 +111,7 @@ def wave_kernel_signature(
 
 def spectral_wavelets(
     lb: Spectral,
-    f: Float[Tensor, "N C"] | Float[Tensor, " N"],
+    f: Shaped[Tensor, "N C"] | Shaped[Tensor, " N"],
     scales: Float[Tensor, " T"],
     *,
     k: int = 128,
