@@ -36,7 +36,7 @@ def spoiled(index, value):
         (POINTS * 0 + 1, "all 100 share one place; remove duplicates"),
         (POINTS * 1e160, "extend over .*rescale"),
         (POINTS * 1e-160, "extend over .*rescale"),
-        (POINTS[:3], "3 points are fewer than the 15 .*add points"),
+        (POINTS[:3], "3 points are fewer than the 4 that a surface .*add points"),
     ],
 )
 def test_bad_points(points, message):

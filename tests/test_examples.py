@@ -94,7 +94,7 @@ def test_demo_merges_the_corners_of_loose_triangles(demo, ellipsoid, tmp_path, c
         ("prose.txt", "no mesh", "not a file that trimesh reads"),
         ("prose.ply", "no mesh", "not a file that trimesh reads"),
         ("prose.obj", "no mesh", "not a file that trimesh reads"),
-        ("few.xyz", "0 0 0\n1 0 0\n0 1 0\n", "3 points are fewer than the 15"),
+        ("few.xyz", "0 0 0\n1 0 0\n0 1 0\n", "3 points are fewer than the 4"),
     ],
 )
 def test_demo_ends_with_1_and_a_message_for_a_file_that_is_no_use(

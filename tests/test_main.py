@@ -113,7 +113,7 @@ def test_info_of_a_shape_and_of_a_damaged_operator(mesh, tmp_path):
     [
         (["compare", "missing.ply"], 2, "does not exist"),
         (["compare", "prose.obj"], 1, "prose.obj: not a mesh or cloud that can be read"),
-        (["compare", "few.xyz"], 1, "3 points are fewer than the 15"),
+        (["compare", "few.xyz"], 1, "3 points are fewer than the 4"),
         (["compare", "few.xyz", "--order", "0"], 2, "0 is not in the range"),
         (["compare", "few.xyz", "--weights", "heavy"], 2, "'heavy' is not one of"),
         (["precompute", "."], 2, "Missing option '--out'"),

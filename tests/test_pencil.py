@@ -16,7 +16,7 @@ from torchlb.linalg.lanczos import inverse, lanczos
 from torchlb.spectral import pencil
 from torchlb.spectral.eigenbasis import stack_eigenbases, unstack_eigenbases
 from torchlb.spectral.pencil import pencil_eigenbasis
-from torchlb.surfaces import Ellipsoid
+from torchlb.surfaces import Ellipsoid, UnitDisk
 
 
 def path_matrix(size, shift):
@@ -233,3 +233,19 @@ def test_factors_take_over_where_sweeps_stall(monkeypatch):
     monkeypatch.setattr(pencil, "prefers_krylov", lambda size: True)
     with pytest.raises(EigenbasisError, match="ask for a larger tolerance"):
         LaplaceBeltrami.from_mesh(*Ellipsoid().mesh(900)).eigenbasis(10, tolerance=1e-10)
+
+
+@pytest.mark.parametrize("unit", [1e-20, 1e20])
+def test_eigenpairs_are_those_in_any_unit(unit):
+    """Masses that leave the range of float32, in which sweeps are taken; of an open shape, too."""
+    for surface, condition in ((Ellipsoid(), "neumann"), (UnitDisk(), "dirichlet")):
+        vertices, faces = surface.mesh(800)
+        one, other = (
+            LaplaceBeltrami.from_mesh(vertices * u, faces, condition=condition).eigenbasis(12)
+            for u in (1.0, unit)
+        )
+        torch.testing.assert_close(
+            other.eigenvalues * unit**2, one.eigenvalues, rtol=1e-5, atol=1e-9
+        )
+        identity = torch.eye(other.eigenvectors.shape[1], dtype=torch.float64)
+        torch.testing.assert_close(other.to_basis(other.eigenvectors), identity, rtol=0, atol=1e-8)

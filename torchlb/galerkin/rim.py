@@ -80,7 +80,7 @@ def _mates(points: Float[Tensor, "N n"], rim: Int[Tensor, "G 2"]) -> Int[Tensor,
     mate = torch.full_like(vertex, -1)
     mate[one], mate[two] = two, one
     away = points[torch.cat([rim[:, 1], rim[:, 0]])] - points[vertex]
-    away = torch.nn.functional.normalize(away)
+    away = torch.nn.functional.normalize(away, eps=torch.finfo(away.dtype).tiny)
     straight = torch.where(mate >= 0, -(away * away[mate]).sum(1), -1.0)  # cosine of the turn
     angle = straight.clamp(-1, 1).acos()
     far = torch.cat([angle[count:], angle[:count]])  # at the other end of the same edge

@@ -24,7 +24,7 @@ from torchlb.operator.cleaning import (
     turned_faces,
 )
 
-MAX_EXTENT = 1e16
+MAX_EXTENT = 1e30
 """Largest extent of the points, and the inverse of the smallest, with which all that is called keeps its digits."""
 COARSE = 1e-3
 """Step of single precision over the spacing of the points above which Δ is rounding."""

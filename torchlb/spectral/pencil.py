@@ -101,13 +101,23 @@ def pencil_eigenbasis(
             "eigenbasis: the mass matrix is not positive; a shape so small that areas are zero in float32 has to be "
             "scaled, or kept in float64"
         )
+    unit = 4.0 ** np.round(
+        np.log2(matrices[1].sum()) / 2
+    )  # of areas: float32 holds the masses, and nothing is rounded
+    matrices[1].data = matrices[1].data / unit
+    if linear is not None:
+        linear = linear[0], linear[1] / unit
     parts = _parts(matrices[0], matrices[1], linear, held)
     if linear is None:
         tolerance = EXACT**2
     elif tolerance is None:
         tolerance = min(TOLERANCE * k**2, LOOSEST)
     found = [_pairs(part, k, tolerance) for part in parts]
-    return _merged(parts, found, mass, k, tolerance)
+    basis = _merged(parts, found, mass, k, tolerance)
+    basis.eigenvalues /= unit
+    basis.eigenvectors /= unit**0.5
+    basis.left *= unit**0.5
+    return basis
 
 
 def _parts(
