@@ -101,9 +101,8 @@ def pencil_eigenbasis(
             "eigenbasis: the mass matrix is not positive; a shape so small that areas are zero in float32 has to be "
             "scaled, or kept in float64"
         )
-    unit = 4.0 ** np.round(
-        np.log2(matrices[1].sum()) / 2
-    )  # of areas: float32 holds the masses, and nothing is rounded
+    # A unit of areas with which float32 holds the masses, and nothing is rounded.
+    unit = 4.0 ** round(float(np.log2(matrices[1].sum())) / 2)
     matrices[1].data = matrices[1].data / unit
     if linear is not None:
         linear = linear[0], linear[1] / unit
