@@ -220,7 +220,7 @@ def test_a_batch_diffuses_in_blocks_of_shapes(eight, monkeypatch, cached):
     expected = results()
     monkeypatch.setattr("torchlb.linalg.exponential.CACHED", cached)
     for a, b in zip(results(), expected, strict=True):
-        torch.testing.assert_close(a, b, rtol=1e-5, atol=1e-6 * float(b.abs().max()))
+        torch.testing.assert_close(a, b, rtol=3e-5, atol=1e-6 * float(b.abs().max()))
 
 
 def test_a_batch_is_block_diagonal(eight):

@@ -103,7 +103,7 @@ def pencil_eigenbasis(
         )
     # A unit of areas with which float32 holds the masses, and nothing is rounded.
     unit = 4.0 ** round(float(np.log2(matrices[1].sum())) / 2)
-    matrices[1].data = matrices[1].data / unit
+    matrices[1] = matrices[1] / unit
     if linear is not None:
         linear = linear[0], linear[1] / unit
     parts = _parts(matrices[0], matrices[1], linear, held)
