@@ -147,11 +147,11 @@ def test_the_pair_is_symmetric_and_positive_on_anything(shape, order):
 
 @pytest.mark.parametrize("surface", [Sphere(), Torus(), UnitDisk()], ids=repr)
 def test_linear_elements_are_the_cotangent_with_its_full_mass(surface):
-    """Flat, r = 1: libigl's matrices to rounding, a test of the assembly."""
+    """The pair beside that of quadratic ones: libigl's matrices to rounding, a test of the assembly."""
     vertices, faces = surface.mesh(400)
     frames = complete_frames(vertex_normals(vertices, faces))
     fits = VertexFits(GraphBalls(vertices, mesh_graph(faces, len(vertices)), frames), (2,))
-    pair = mesh_pair(vertices, faces, fits, 1).matrices
+    pair = mesh_pair(vertices, faces, fits, 2).linear
     args = vertices.numpy(), faces.numpy()
     expected = -igl.cotmatrix(*args), igl.massmatrix(*args, igl.MASSMATRIX_TYPE_FULL)
     for values, matrix in zip(pair.values, expected, strict=True):

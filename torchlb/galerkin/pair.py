@@ -81,46 +81,17 @@ def mesh_pair(
     stars: Int[Tensor, "S 3"] | None = None,
     numbering: Numbering | None = None,
 ) -> WeakPair:
-    """The pair of a mesh in the plane or in space, from the fits of its vertices, with elements of degree r.
+    """The pair of a mesh in the plane or in space, from the fits of its vertices, with elements of degree r ≥ 2.
 
-    A third of the flat triangles `stars` is added. The matrices have the user's numbers where there is a numbering.
+    Symmetric, K1 = 0, K ≥ 0, M > 0 whatever the fits are: rows of P sum to one, and it has full column rank. A third of
+    the flat triangles `stars` is added. The matrices have the user's numbers where there is a numbering. What is large
+    is let go as soon as it was used.
     """
-    return weak_pair(fitted_surface(points, faces, fits), faces, degree, stars, numbering)
-
-
-def fitted_surface(
-    points: Float[Tensor, "N n"], faces: Int[Tensor, "F 3"], fits: VertexFits
-) -> Surface:
-    """A mesh in the plane or in space with the fits of its vertices, in space."""
-    if points.shape[1] == 2:
-        points, fits = pad(points, (0, 1)), copy(fits)
-        fits.frames, fits.heights = pad(fits.frames, (0, 0, 0, 1)), pad(fits.heights, (0, 1))
-    outward = vertex_normals(points, faces)
-    normals = normals_of_frames(fits.frames)
-    normals = normals * (normals * outward).sum(1, keepdim=True).sign()
-    return Surface(points, fits.frames, normals, fits)
-
-
-def weak_pair(
-    surface: Surface,
-    faces: Int[Tensor, "F 3"],
-    degree: int,
-    stars: Int[Tensor, "S 3"] | None = None,
-    numbering: Numbering | None = None,
-) -> WeakPair:
-    """The pair of a mesh with elements of degree r; r = 1 is the cotangent's, with its full mass.
-
-    Symmetric, K1 = 0, K ≥ 0, M > 0 whatever the fits are: rows of P sum to one, and it has full column rank. What is
-    large is let go as soon as it was used.
-    """
+    surface = fitted_surface(points, faces, fits)
     count = len(surface.points)
-    mesh, metric = curve(surface, lagrange_nodes(faces, count, max(degree, 2)))
+    mesh, metric = curve(surface, lagrange_nodes(faces, count, degree))
     del surface.fits.heights
     linear = _linear(mesh.lengths, faces, count)
-    if degree == 1:
-        return WeakPair(
-            stored(sparse.triu(linear), None, numbering), mass=torch.from_numpy(_row_sums(linear))
-        )
     p = prolongation(surface, mesh)
     blocks = element_matrices(metric, triangle(degree))
     del metric
@@ -141,6 +112,19 @@ def weak_pair(
     pair = stored(upper.pop(), rim, numbering)
     counts = torch.stack([surface.fits.degree, surface.fits.reason, *edges])
     return WeakPair(pair, near, torch.from_numpy(mass), counts)
+
+
+def fitted_surface(
+    points: Float[Tensor, "N n"], faces: Int[Tensor, "F 3"], fits: VertexFits
+) -> Surface:
+    """A mesh in the plane or in space with the fits of its vertices, in space."""
+    if points.shape[1] == 2:
+        points, fits = pad(points, (0, 1)), copy(fits)
+        fits.frames, fits.heights = pad(fits.frames, (0, 0, 0, 1)), pad(fits.heights, (0, 1))
+    outward = vertex_normals(points, faces)
+    normals = normals_of_frames(fits.frames)
+    normals = normals * (normals * outward).sum(1, keepdim=True).sign()
+    return Surface(points, fits.frames, normals, fits)
 
 
 def upper_product(p: Any, matrix: sparse.csr_array) -> sparse.csr_array:
