@@ -448,20 +448,6 @@ def test_on_cuda_it_gives_the_same(eight, name):
         assert all(p.grad.isfinite().all() for p in there.parameters())
 
 
-if __name__ == "__main__" and sys.argv[1] == "sizes":
-    kinds = [
-        ("net", False),
-        ("spectral", False),
-        ("chebyshev", False),
-        ("convolution", True),
-        ("classifier", True),
-    ]
-    print(json.dumps({name: graphs_of_sizes(name, batched) for name, batched in kinds}))
-elif __name__ == "__main__":
-    compiled, plain = compiled_and_not(sys.argv[1], "batched" in sys.argv)
-    torch.testing.assert_close(compiled, plain, rtol=1e-3, atol=1e-4)
-
-
 def test_a_basis_found_without_gradients_serves_a_training():
     """What is solved, and what is built, under `inference_mode` are tensors like any other."""
     vertices, faces = Sphere().mesh(200)
@@ -503,3 +489,17 @@ def test_wavelets_of_one_function():
     single = spectral_wavelets(lb, f, scales, k=20)
     assert single.shape == (200, 3)
     assert torch.equal(single, spectral_wavelets(lb, f[:, None], scales, k=20)[..., 0])
+
+
+if __name__ == "__main__" and sys.argv[1] == "sizes":
+    kinds = [
+        ("net", False),
+        ("spectral", False),
+        ("chebyshev", False),
+        ("convolution", True),
+        ("classifier", True),
+    ]
+    print(json.dumps({name: graphs_of_sizes(name, batched) for name, batched in kinds}))
+elif __name__ == "__main__":
+    compiled, plain = compiled_and_not(sys.argv[1], "batched" in sys.argv)
+    torch.testing.assert_close(compiled, plain, rtol=1e-3, atol=1e-4)
