@@ -271,9 +271,8 @@ def least_squares_weights(
     inverse = _inverse(r)
     solution = root[..., None] * (q @ (inverse.mT @ right))
     residual = (values.mT @ solution - functionals).abs().amax((1, 2)) / functionals.abs().max()
-    if (
-        flux is not None
-    ):  # what the data add would hide that points on a line say nothing of what is across
+    if flux is not None:
+        # What the data add would hide that points on a line say nothing of what is across.
         spread = torch.linalg.svdvals(scaled)
         residual = torch.where(spread[:, -1] < ON_LINE * spread[:, 0], torch.inf, residual)
     center = -(constant[..., None] * solution).sum(1, keepdim=True)

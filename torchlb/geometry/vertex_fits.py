@@ -133,11 +133,11 @@ class VertexFits:
         if degree not in self.degrees:
             return
         good = regular & (fit.misfit(heights) <= MAX_MISFIT.get(degree, FAITHFUL))
-        open_still = self.degree[vertices] == 0
+        vacant = self.degree[vertices] == 0
         if degree == self.degrees[0]:
             reason = torch.where(good, 0, torch.where(regular, 3, 2))
-            self.reason[vertices] = torch.where(open_still, reason, self.reason[vertices])
-        good &= open_still
+            self.reason[vertices] = torch.where(vacant, reason, self.reason[vertices])
+        good &= vacant
         if not good.any():
             return
         kept, coefficients, kind = vertices[good], fit.coefficients[good], (degree, index.shape[1])

@@ -51,6 +51,7 @@ class LaplaceBeltramiTransform(BaseTransform):
     lb_frames          (N, n, d)    orthonormal tangent vectors
     lb_pos             (N, n)       the points, by which `to_operator` sees whether `pos` was changed since
     lb_normals         (N, n)       unit normals of a hypersurface
+    lb_face_index      (d + 1, F)   faces of the mesh, or of the surface through the cloud, if any
     lb_boundary        (N,)         mask of the points where the boundary condition holds, if any
     lb_weak_index      (2, nnz)     [i; j] of every entry of the weak pair, where there is one; ascending
     lb_weak_values     (nnz, 3)     stiffness, mass matrix, mass matrix of the boundary
