@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -131,39 +131,12 @@ def cloud_surface(
     boundary: Bool[Tensor, " N"] | None = None,
 ) -> CloudSurface:
     """The surface through all points, as far as they resolve one; `boundary` marks points of a real boundary."""
-    candidates = nearest_neighbors(points, min(NEAREST, len(points)))
-    given, frames, noise = normals, cloud_frames(points, candidates, 2), 0.0
-    planar = _planar_triangles(points.numpy())
-    if normals is None and planar is not None:
-        normals = torch.from_numpy(planar[1]).expand_as(points)
-    elif normals is None:
-        first = torch.linalg.cross(*frames.unbind(-1))
-        normals = refined_normals(points, first, candidates, rounds=2)
-    if planar is None:
-        points, noise = denoised(points, normals, candidates)
-        if noise and given is None:
-            normals = refined_normals(points, normals, candidates, rounds=2)
-    places, near, count = points.numpy(), candidates.numpy(), len(points)
-    reach = _reaches(places, near)
-    rim = np.zeros(count, dtype=bool) if boundary is None else boundary.numpy()
-    if planar is None:
-        nearest = np.linalg.norm(places[near[:, 1]] - places, axis=1)
-        tetrahedra = Tetrahedra.of(places, normals.numpy(), nearest)
-        poles = Poles.of(tetrahedra)
-        if given is None:
-            normals = corrected_normals(points, normals, candidates, poles)
-        side, two_sided = poles.sides(normals)
-        cloud = Cloud(places, normals.numpy(), near, reach, rim)
-        found = tetrahedra.candidates(cloud, side)
-    else:
-        two_sided, cloud = True, Cloud(places, normals.numpy(), near, reach, rim)
-        up = normals * (normals @ normals[0]).sign()[:, None] * normals[0, 2].sign()
-        small = cloud.small(planar[0])
-        every = np.ones(len(small), dtype=bool)
-        found = Candidates(small, small, every, every, up.numpy())
+    start = _start(points, normals, boundary)
+    cloud, found, given, count = start.cloud, start.found, normals, len(points)
+    places = cloud.points
     outward = found.outward if given is None else given.numpy()
     pairs = _kin(cloud)
-    faces, seam = wound_alike(places, _chosen(cloud, found, two_sided, pairs))
+    faces, seam = wound_alike(places, _chosen(cloud, found, start.two_sided, pairs))
     faces = facing_out(places, _clean(faces[~seam], count) if seam.any() else faces, outward)
     cloud = _oriented(cloud, faces)
     bare, faces = faces, _without_gaps(cloud, faces, found.small)
@@ -179,12 +152,57 @@ def cloud_surface(
     loops = boundary_loops(faces, count)
     pieces = pieces_of(np.concatenate([faces, stars]), count)
     figures = len(np.unique(faces)), len(stars), len(done), len(loops), int(pieces.max()) + 1
-    summary = SurfaceSummary(count, *figures, noise, *_contacts(cloud, faces))
-    normals, triangles = torch.from_numpy(cloud.normals), torch.from_numpy(faces)
-    frames = _upright(frames, normals)
-    return CloudSurface(
-        points, triangles, torch.from_numpy(stars), normals, frames, candidates, summary
-    )
+    summary = SurfaceSummary(count, *figures, start.noise, *_contacts(cloud, faces))
+    parts = (places, faces, stars, cloud.normals, cloud.neighbors)
+    at, triangles, local, normals, near = (torch.from_numpy(part) for part in parts)
+    frames = _upright(start.frames, normals)
+    return CloudSurface(at, triangles, local, normals, frames, near, summary)
+
+
+class _Start(NamedTuple):
+    """What triangles are chosen from: the cloud without its noise, the candidates, and whether they have two sides."""
+
+    cloud: Cloud
+    found: Candidates
+    two_sided: bool
+    frames: Float[Tensor, "N 3 2"]
+    noise: float
+
+
+def _start(
+    points: Float[Tensor, "N 3"],
+    given: Float[Tensor, "N 3"] | None,
+    boundary: Bool[Tensor, " N"] | None,
+) -> _Start:
+    """Normals, those of the plane if the points are in one, else refined; and candidates from Delaunay's triangles."""
+    candidates = nearest_neighbors(points, min(NEAREST, len(points)))
+    frames, near = cloud_frames(points, candidates, 2), candidates.numpy()
+    rim = np.zeros(len(points), dtype=bool) if boundary is None else boundary.numpy()
+    planar = _planar_triangles(points.numpy())
+    if planar is not None:
+        faces, normal = planar
+        normals = torch.from_numpy(normal).expand_as(points) if given is None else given
+        places = points.numpy()
+        cloud = Cloud(places, normals.numpy(), near, _reaches(places, near), rim)
+        up = normals * (normals @ normals[0]).sign()[:, None] * normals[0, 2].sign()
+        small = cloud.small(faces)
+        every = np.ones(len(small), dtype=bool)
+        return _Start(cloud, Candidates(small, small, every, every, up.numpy()), True, frames, 0.0)
+    normals = torch.linalg.cross(*frames.unbind(-1)) if given is None else given
+    if given is None:
+        normals = refined_normals(points, normals, candidates, rounds=2)
+    points, noise = denoised(points, normals, candidates)
+    if noise and given is None:
+        normals = refined_normals(points, normals, candidates, rounds=2)
+    places = points.numpy()
+    nearest = np.linalg.norm(places[near[:, 1]] - places, axis=1)
+    tetrahedra = Tetrahedra.of(places, normals.numpy(), nearest)
+    poles = Poles.of(tetrahedra)
+    if given is None:
+        normals = corrected_normals(points, normals, candidates, poles)
+    side, two_sided = poles.sides(normals)
+    cloud = Cloud(places, normals.numpy(), near, _reaches(places, near), rim)
+    return _Start(cloud, tetrahedra.candidates(cloud, side), two_sided, frames, noise)
 
 
 def _reaches(

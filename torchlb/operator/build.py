@@ -6,22 +6,20 @@ import sys
 from dataclasses import asdict, dataclass, replace
 from typing import Any, get_args
 
-import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 from torch.nn.functional import pad
 
 from torchlb.baseline.cotangent import cotangent_laplacian
-from torchlb.errors import InputError, first_few, renumbered, warn
+from torchlb.errors import InputError, renumbered, warn
 from torchlb.fits.rules import WeightsName
 from torchlb.galerkin.flips import flipped
 from torchlb.galerkin.pair import ELEMENTS, SparsePair, WeakPair, mesh_pair
 from torchlb.geometry.boundary import boundary_faces
 from torchlb.geometry.frames import Projection
 from torchlb.geometry.numbering import Numbering
-from torchlb.geometry.surface import CloudSurface, SurfaceSummary, cloud_surface
-from torchlb.geometry.vertex_fits import REASONS, VertexFits
+from torchlb.geometry.surface import SurfaceSummary, cloud_surface
 from torchlb.operator.checks import (
     check_boundary,
     check_dimension,
@@ -35,6 +33,7 @@ from torchlb.operator.checks import (
     mended_faces,
 )
 from torchlb.operator.cleaning import ArrayLike
+from torchlb.operator.doubts import warn_of_doubts, warn_of_walls
 from torchlb.stability.certificate import Certificate
 from torchlb.stability.enforce import certify
 from torchlb.stencils.assemble import Stencils, assemble
@@ -43,19 +42,8 @@ from torchlb.stencils.rows import Reason, Rows, matrix_rows
 from torchlb.stencils.shape import Shape, cloud_shape, mesh_shape, surface_shape
 
 NOWHERE = "condition='dirichlet' holds nowhere: no boundary, or `boundary` has none of it; leave the condition out"
-LONG, WALL = 3.0, 0.03
-"""Of an edge, over the usual ones of its ends; and of the area that triangles with such edges may be."""
-ASTRAY = 0.02
-"""Of the points of a declared boundary: how many may lie inside."""
 MANY = 0.5
 """Share of low-order rows from which on a warning names them."""
-DOUBTFUL = 0.1
-"""Share of the points that do not resolve the surface of a cloud, or of the area that those without a fit hold, from
-which on a warning names them."""
-OUTLYING = 5.0
-"""Times the spacing of its neighbours that an outlier, in no triangle of the surface, is away from all of them."""
-TOUCHING = 0.005
-"""Share of the points at which sheets of a cloud touch from which on a warning says where."""
 REMEDY = "do the points lie on a manifold of dimension {}? If not, pass its dimension as `dim`; else add points"
 
 
@@ -236,73 +224,10 @@ def _build_on_surface(
         pair = mesh_pair(places, surface.faces, fits, degree, surface.stars, numbering)
         assert pair.mass is not None
         shape = replace(shape, areas=pair.mass)
-        _warn_of_doubts(surface, fits, pair.mass)
-    _warn_of_walls(surface, where)
+        warn_of_doubts(surface, fits, pair.mass)
+    warn_of_walls(surface, where)
     built = _finished(shape, "points", options, REMEDY.format(2), settings["progress"], pair)
     return replace(built, faces=numbering.given[surface.faces], surface=surface.summary)
-
-
-def _warn_of_doubts(surface: CloudSurface, fits: VertexFits, mass: Float[Tensor, " N"]) -> None:
-    """Warnings that name points where a cloud does not resolve its surface, if they are many or hold much of it."""
-    apart = ~torch.isin(torch.arange(len(surface.points)), surface.faces)
-    doubtful = (fits.reason == REASONS.index("points do not resolve the surface")) | apart
-    flat = (fits.degree == 0) | apart
-    large = float(mass[flat].sum() / mass.sum()) >= DOUBTFUL
-    doubtful |= flat & large
-    if large or float(doubtful.double().mean()) >= DOUBTFUL:
-        index = doubtful.nonzero()[:, 0]
-        warn(
-            f"points: at {len(index)} of {len(doubtful)} the cloud is too coarse or noisy for the surface through it "
-            f"to be trusted ({first_few(index)}); add points there, remove outliers, or give the mesh if there is one"
-        )
-    nearest = surface.neighbors[:, 1]
-    gap = (surface.points[nearest] - surface.points).norm(dim=1)
-    outlying = (apart & (gap > OUTLYING * gap[nearest])).nonzero()[:, 0]
-    if len(outlying):
-        warn(
-            f"points: {len(outlying)} lie {OUTLYING:g} spacings and more away from all others "
-            f"({first_few(outlying)}), joined to the surface by triangles that add to its area; remove them if they "
-            "are outliers"
-        )
-    if surface.summary.contacts >= TOUCHING * len(doubtful):
-        warn(
-            f"points: {surface.summary.contact}; the surface may join what only touches there, or cut it. Add points "
-            "there, or give the mesh if there is one"
-        )
-
-
-def _warn_of_walls(surface: CloudSurface, boundary: Bool[Tensor, " N"] | None) -> None:
-    """Warnings where triangles may close what is open: many long ones, or some around points of a declared boundary."""
-    points, faces = surface.points, surface.faces
-    corners = points[faces]
-    length = (corners - corners.roll(-1, 1)).norm(dim=2)
-    ends = torch.stack([faces, faces.roll(-1, 1)]).flatten()
-    order = torch.from_numpy(np.lexsort((length.flatten().repeat(2).numpy(), ends.numpy())))
-    number = torch.bincount(ends, minlength=len(points))
-    middle = (number.cumsum(0) - (number + 1) // 2 - (number == 0).long()).clamp_min(0)
-    usual = (
-        length.flatten().repeat(2)[order][middle] if len(order) else points.new_zeros(len(points))
-    )
-    long = (length > LONG * torch.maximum(usual[faces], usual[faces.roll(-1, 1)])).any(1)
-    area = torch.linalg.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]).norm(
-        dim=1
-    )
-    share = float(area[long].sum() / area.sum())
-    if share >= WALL:
-        warn(
-            f"points: triangles with an edge of more than {LONG:g} spacings are {share:.0%} of the surface "
-            f"({first_few(faces[long].unique())}); where they wall up a gap between parts that belong apart, build "
-            "each part by itself (LaplaceBeltrami.batch), or give the mesh"
-        )
-    if boundary is not None:
-        rim = torch.zeros_like(boundary).index_fill(0, boundary_faces(faces).flatten(), True)
-        inside = (boundary & ~rim & torch.isin(torch.arange(len(points)), faces)).nonzero()[:, 0]
-        if len(inside) > ASTRAY * int(boundary.sum()):
-            warn(
-                f"boundary: {len(inside)} of its points ({first_few(inside)}) lie inside the surface through the "
-                "cloud, as around a hole that was closed because it is hardly wider than the spacing; add points "
-                "around it, or give the mesh"
-            )
 
 
 def numbered_mesh(
