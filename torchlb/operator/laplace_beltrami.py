@@ -59,7 +59,6 @@ class LaplaceBeltrami(StencilFace, WeakFace):
     """
 
     @classmethod
-    @torch.inference_mode(False)  # what is kept serves a training, too
     def from_points(
         cls,
         points: ArrayLike,
@@ -111,13 +110,13 @@ class LaplaceBeltrami(StencilFace, WeakFace):
         options = build.Options(
             order, normal_order, projection, weights, num_neighbors, condition, weak_form, certify
         )
-        built = build.build_cloud(
-            points, dim, options, normals=normals, boundary=boundary, progress=progress
-        )
-        return cls._from_assembled(built, points)
+        with torch.inference_mode(False):  # what is kept serves a training, too
+            built = build.build_cloud(
+                points, dim, options, normals=normals, boundary=boundary, progress=progress
+            )
+            return cls._from_assembled(built, points)
 
     @classmethod
-    @torch.inference_mode(False)
     def from_mesh(
         cls,
         vertices: ArrayLike,
@@ -154,11 +153,11 @@ class LaplaceBeltrami(StencilFace, WeakFace):
         options = build.Options(
             order, normal_order, projection, weights, num_neighbors, condition, weak_form, certify
         )
-        built = build.build_mesh(vertices, faces, options, boundary=boundary, progress=progress)
-        return cls._from_assembled(built, vertices)
+        with torch.inference_mode(False):
+            built = build.build_mesh(vertices, faces, options, boundary=boundary, progress=progress)
+            return cls._from_assembled(built, vertices)
 
     @classmethod
-    @torch.inference_mode(False)
     def from_cotangent(cls, vertices: ArrayLike, faces: ArrayLike) -> LaplaceBeltrami:
         """libigl's cotangent operator M⁻¹C with its Voronoi mass, behind the same interface: the baseline.
 
@@ -169,10 +168,10 @@ class LaplaceBeltrami(StencilFace, WeakFace):
         Its gradient is the first-order fit to the vertices around each point, and ∂_ν f = 0 at a boundary.
         Raises InputError for bad input and for vertices without area.
         """
-        return cls._from_assembled(build.build_cotangent(vertices, faces), vertices)
+        with torch.inference_mode(False):
+            return cls._from_assembled(build.build_cotangent(vertices, faces), vertices)
 
     @classmethod
-    @torch.inference_mode(False)
     def batch(cls, shapes: Sequence[LaplaceBeltrami]) -> LaplaceBeltrami:
         """Several shapes as one block-diagonal operator, which every layer takes like any other.
 
@@ -199,8 +198,9 @@ class LaplaceBeltrami(StencilFace, WeakFace):
         _ = [shape.bounds for shape in shapes]  # of one from an old state they are found here, once
         state = join_states([shape.get_extra_state() for shape in shapes], sizes)
         bases = [shape.basis for shape in shapes if shape.basis and not shape.sizes]
-        basis = stack_eigenbases(bases) if len(bases) == len(shapes) else None
-        joined = cls.from_buffers(join_buffers([s.tensors for s in shapes]), state, basis)
+        with torch.inference_mode(False):
+            basis = stack_eigenbases(bases) if len(bases) == len(shapes) else None
+            joined = cls.from_buffers(join_buffers([s.tensors for s in shapes]), state, basis)
         remember_shapes(joined, shapes)
         return joined
 
