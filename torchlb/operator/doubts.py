@@ -57,19 +57,15 @@ def warn_of_doubts(surface: CloudSurface, fits: VertexFits, mass: Float[Tensor, 
 def warn_of_walls(surface: CloudSurface, boundary: Bool[Tensor, " N"] | None) -> None:
     """Warnings where triangles may close what is open: many long ones, or some around points of a declared boundary."""
     points, faces = surface.points, surface.faces
-    corners = points[faces]
-    length = (corners - corners.roll(-1, 1)).norm(dim=2)
-    ends = torch.stack([faces, faces.roll(-1, 1)]).flatten()
-    order = torch.from_numpy(np.lexsort((length.flatten().repeat(2).numpy(), ends.numpy())))
+    sides = points[faces.roll(-1, 1)] - points[faces]
+    length = sides.norm(dim=2)
+    both, ends = length.flatten().repeat(2), torch.stack([faces, faces.roll(-1, 1)]).flatten()
+    order = torch.from_numpy(np.lexsort((both.numpy(), ends.numpy())))
     number = torch.bincount(ends, minlength=len(points))
     middle = (number.cumsum(0) - (number + 1) // 2 - (number == 0).long()).clamp_min(0)
-    usual = (
-        length.flatten().repeat(2)[order][middle] if len(order) else points.new_zeros(len(points))
-    )
+    usual = both[order][middle] if len(order) else torch.zeros_like(points[:, 0])
     long = (length > LONG * torch.maximum(usual[faces], usual[faces.roll(-1, 1)])).any(1)
-    area = torch.linalg.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]).norm(
-        dim=1
-    )
+    area = torch.linalg.cross(sides[:, 0], sides[:, 1]).norm(dim=1)
     share = float(area[long].sum() / area.sum())
     if share >= WALL:
         warn(
