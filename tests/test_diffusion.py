@@ -286,6 +286,20 @@ def test_the_derivative_in_the_time_at_zero_is_that_from_above(condition):
         assert not start[lb.fixed].any()
 
 
+def test_derivatives_where_a_dirichlet_condition_holds_and_f_does_not_vanish():
+    """Values there count for nothing: not in ∂/∂t, and ∂/∂f is zero at these points."""
+    lb = LaplaceBeltrami.from_mesh(*UnitDisk().mesh(200), condition="dirichlet")
+    f, w = (torch.randn(200, generator=torch.Generator().manual_seed(s)).double() for s in (0, 1))
+    f.requires_grad_()
+    time = torch.tensor(0.03, dtype=torch.float64, requires_grad=True)
+    flow = heat_flow(lb, f, time, tolerance=1e-11)
+    of_f, slope = torch.autograd.grad(w @ flow, (f, time))
+    step = 1e-5
+    before, after = (heat_flow(lb, f, 0.03 + s, tolerance=1e-12) for s in (-step, step))
+    torch.testing.assert_close(slope, w @ (after - before) / (2 * step), rtol=1e-5, atol=0.0)
+    assert not of_f[lb.fixed].any()
+
+
 @pytest.mark.parametrize("time", [0.0, -1.0, math.nan])
 def test_learned_times_start_above_zero(time):
     with pytest.raises(InputError, match="init_time"):

@@ -90,7 +90,7 @@ def _summed(
         ):
             result[:, columns] += c[k] * v
             slope[:, columns] += derivative[k] / pole * v
-    return result, slope
+    return solver.inside(result), solver.inside(slope)  # Zᵀ leads out to Dirichlet points
 
 
 def _polynomials(

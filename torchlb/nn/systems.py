@@ -179,8 +179,8 @@ class PairSystem:
         return multiply(*self.pattern, self.mass.double(), x.double())
 
     def stiffness_product(self, x: Float[Tensor, "N C"]) -> Float[Tensor, "N C"]:
-        """K x at the points that no condition holds, in float64."""
-        return self.inside(multiply(*self.pattern, self.stiffness.double(), x.double()))
+        """K x, in float64."""
+        return multiply(*self.pattern, self.stiffness.double(), x.double())
 
     def _solved(
         self, right: Float[Tensor, "N C"], time: Tensor | None, tolerance: float, near: Linear
