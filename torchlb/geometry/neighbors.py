@@ -20,7 +20,7 @@ from scipy.spatial import KDTree
 from torch import Tensor
 
 from torchlb.geometry.vectors import at, dot
-from torchlb.geometry.voronoi import natural_neighbors, unit_directions
+from torchlb.geometry.voronoi import natural_neighbors, rows_at_once
 
 MIN_ALIGNMENT = 0.5
 """Admission: smallest singular value of E_kᵀE_i, the cosine of the largest angle between two tangent planes."""
@@ -162,8 +162,7 @@ def nearest_graph(
     good = admissible(points, planes, centers, flat) & admissible(points, planes, flat, centers)
     good = good.view(num_rows, size)
     chosen = good & (good.cumsum(1) <= wanted)
-    at_once = max(1, 2**24 // (size * len(unit_directions(dim))))
-    for rows in torch.arange(num_rows).split(at_once):
+    for rows in torch.arange(num_rows).split(rows_at_once(size, dim)):
         offset = points[others[rows]] - points[rows, None]
         distance = offset.norm(dim=-1)
         near = good[rows]

@@ -181,16 +181,16 @@ def _start(
     planar = _planar_triangles(points.numpy())
     if planar is not None:
         faces, normal = planar
-        normals = torch.from_numpy(normal).expand_as(points) if given is None else given
-        places = points.numpy()
+        up = torch.from_numpy(normal if normal[2] >= 0 else -normal).expand_as(points)
+        normals, places = up if given is None else given, points.numpy()
         cloud = Cloud(places, normals.numpy(), near, _reaches(places, near), rim)
-        up = normals * (normals @ normals[0]).sign()[:, None] * normals[0, 2].sign()
         small = cloud.small(faces)
         every = np.ones(len(small), dtype=bool)
         return _Start(cloud, Candidates(small, small, every, every, up.numpy()), True, frames, 0.0)
-    normals = torch.linalg.cross(*frames.unbind(-1)) if given is None else given
-    if given is None:
-        normals = refined_normals(points, normals, candidates, rounds=2)
+    normals = given
+    if normals is None:
+        first = torch.linalg.cross(*frames.unbind(-1))
+        normals = refined_normals(points, first, candidates, rounds=2)
     points, noise = denoised(points, normals, candidates)
     if noise and given is None:
         normals = refined_normals(points, normals, candidates, rounds=2)

@@ -29,6 +29,11 @@ def unit_directions(dim: int) -> Float[Tensor, "u d"]:
     return normal / normal.norm(dim=1, keepdim=True)
 
 
+def rows_at_once(size: int, dim: int) -> int:
+    """Points whose cells among `size` neighbours are looked at together: (points, neighbours, directions) in 0.1 GB."""
+    return max(1, 2**24 // (size * len(unit_directions(dim))))
+
+
 def _directions(
     coords: Float[Tensor, "B K d"], valid: Bool[Tensor, "B K"]
 ) -> Float[Tensor, "B u d"]:

@@ -34,8 +34,8 @@ def implicit_step(
 
     (M + tK)u = Mf + tB·flux with the weak pair, by conjugate gradients that the linear pair preconditions; without one
     (1 − tL)u = f with the stencil, by LU. Solved in float64; to a tolerance of 1e-5 or more steps are in float32, and
-    where f and the operator are, right-hand sides, too. The result has the type of f, or
-    the operator's where those are integers.
+    where f and the operator are, right-hand sides, too. The result has the type of f, that of the operator where f are
+    integers.
 
     Parameters
     ----------

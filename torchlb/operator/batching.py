@@ -104,8 +104,8 @@ def _starts(counts: Sequence[int]) -> list[int]:
 def split_buffers(joined: Buffers, sizes: Sequence[int]) -> list[Buffers]:
     """The inverse of `join_buffers`."""
     shapes = []
-    first, starts = joined["faces"][:, 0].contiguous(), joined["faces"].new_tensor(_starts(sizes))
-    of_shape = torch.bucketize(first, starts[1:], right=True)
+    corner, starts = joined["faces"][:, 0].contiguous(), joined["faces"].new_tensor(_starts(sizes))
+    of_shape = torch.bucketize(corner, starts[1:], right=True)
     faces = joined["faces"].split(torch.bincount(of_shape, minlength=len(sizes)).tolist())
     for start, size, corners in zip(_starts(sizes), sizes, faces, strict=True):
         point = slice(start, start + size)

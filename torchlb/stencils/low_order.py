@@ -23,7 +23,7 @@ from torchlb.geometry.neighbors import GraphBalls, nearest_neighbors
 from torchlb.geometry.voronoi import (
     cell_laplacian,
     cell_volume,
-    unit_directions,
+    rows_at_once,
     unrolled,
 )
 
@@ -109,7 +109,7 @@ class CloudLowOrder:
         dim = balls.frames.shape[-1]
         self.size = min(6 * 2**dim + 1, len(balls.points))
         self.few = min(4 * dim + 1, len(balls.points))
-        self.at_once = max(1, 2**24 // (self.size * len(unit_directions(dim))))
+        self.at_once = rows_at_once(self.size, dim)
 
     def areas(self) -> Float[Tensor, " N"]:
         """Volumes of the Voronoi cells, ℓ^d: second order in the spacing."""
