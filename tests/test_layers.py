@@ -271,6 +271,34 @@ def test_a_batch_takes_bases_over_solves_what_is_missing_and_is_stored():
     torch.testing.assert_close(heat_flow(nested, f, 0.1, k=K), heat_flow(ready, f, 0.1, k=K))
 
 
+def test_a_batch_asks_for_the_pairs_that_one_of_its_shapes_lacks():
+    """Bases of 40 and of 10 pairs are one of 10; asked for more the short shape is solved, and keeps it."""
+    long, short = (LaplaceBeltrami.from_mesh(*s.mesh(100)) for s in (Sphere(), Torus()))
+    long.eigenbasis(40), short.eigenbasis(10)
+    batch, f = LaplaceBeltrami.batch([long, short]), torch.randn(200, 2, dtype=torch.float64)
+    assert batch.num_pairs == 10
+    for method in ("deflated", "spectral"):
+        for k in (10, 30):
+            alone = [
+                heat_flow(lb, g, 0.1, method=method, k=k)
+                for lb, g in zip((long, short), f.split(100), strict=True)
+            ]
+            flowed = heat_flow(batch, f, 0.1, method=method, k=k)
+            torch.testing.assert_close(flowed, torch.cat(alone), rtol=1e-6, atol=1e-6)
+    assert (long.num_pairs, short.num_pairs, batch.num_pairs) == (40, 30, 30)
+
+
+def test_a_batch_does_not_follow_what_becomes_of_its_shapes():
+    """A state that is loaded into a shape afterwards, or a cast, leaves the batch's solves as they were."""
+    shapes = [LaplaceBeltrami.from_mesh(*s.mesh(60)) for s in (Sphere(), Torus())]
+    batch, f = LaplaceBeltrami.batch(shapes), torch.randn(120, 1, dtype=torch.float64)
+    expected = implicit_step(batch, f, 0.1)
+    vertices, faces = Sphere().mesh(60)
+    with pytest.warns(UserWarning, match="is replaced by one on 60 others"):
+        shapes[0].load_state_dict(LaplaceBeltrami.from_mesh(2 * vertices, faces).state_dict())
+    torch.testing.assert_close(implicit_step(batch, f, 0.1), expected, rtol=1e-9, atol=1e-9)
+
+
 def test_shapes_that_do_not_go_together_are_refused():
     sphere = LaplaceBeltrami.from_points(Sphere().points(60))
     with pytest.raises(ValueError, match="got no shapes"):

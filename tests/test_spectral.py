@@ -9,6 +9,7 @@ from scipy import linalg
 
 from builders import stencil_of_cloud, stencil_of_mesh
 from torchlb import (
+    Diffusion,
     EigenbasisError,
     InputError,
     LaplaceBeltrami,
@@ -169,6 +170,33 @@ def test_kept_sliced_stored_and_read_back():
     assert lb.float().eigenbasis(30).eigenvectors.dtype == torch.float32
     other.load_state_dict(stencil_of_cloud(Torus().points(300)).state_dict())
     assert other.eigenbasis(20).eigenvectors.shape == (300, 20)
+
+
+def test_a_smaller_tolerance_is_that_of_the_pairs_asked_for_and_none_is_lost():
+    lb = LaplaceBeltrami.from_mesh(*Torus().mesh(60))
+    lb.eigenbasis(20)
+    lb.basis_relative_errors[10:] = 1e-3
+    rough = lb.basis_left
+    lb.eigenbasis(8, tolerance=1e-6)
+    assert lb.basis_left is rough
+    lb.eigenbasis(12, tolerance=1e-6)
+    assert lb.basis.relative_errors.max() < 1e-6
+    assert lb.num_pairs == rough.shape[1]
+
+
+@pytest.mark.filterwarnings("error:the operator holds a basis")
+def test_all_that_a_dirichlet_condition_leaves_is_solved_once(monkeypatch):
+    """Also in a batch, where a layer asks for more, and out of a file."""
+    lb = LaplaceBeltrami.from_mesh(*UnitDisk().mesh(60), condition="dirichlet")
+    free = int((~lb.fixed).sum())
+    assert lb.eigenbasis(1000).eigenvectors.shape == (60, free)
+    monkeypatch.setattr("torchlb.operator.weak_face.pencil_eigenbasis", None)
+    again = LaplaceBeltrami()
+    lb.eigenbasis(1000, store=True)
+    again.load_state_dict(lb.state_dict())
+    for one in (again, LaplaceBeltrami.batch([lb, again])):
+        assert one.eigenbasis(1000).eigenvectors.shape == (one.num_points, free)
+        Diffusion(1, k=free + 1).double()(torch.ones(one.num_points, 1, dtype=torch.float64), one)
 
 
 def test_basis_of_a_float32_operator():

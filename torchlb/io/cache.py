@@ -79,7 +79,7 @@ def load_or_build(
     if path.parent.exists() and not path.parent.is_dir():
         raise InputError(f"cache: expected a folder, {path.parent} is a file")
     lb = None if overwrite else _cached(path, key)
-    if lb is None or _num_eigenpairs(lb) < min(k, lb.num_points):
+    if lb is None or not lb.has_pairs(k):
         if lb is None:
             lb = build_operator(points, corners, operator=operator, progress=progress, **options)
         if k > 0:
@@ -128,10 +128,6 @@ def _key(operator: str, points: Tensor, faces: Tensor | None, options: dict[str,
             digest.update(f"\n{name} {kind} {data.shape}\n".encode())
             digest.update(np.ascontiguousarray(data).tobytes())
     return digest.hexdigest()
-
-
-def _num_eigenpairs(lb: LaplaceBeltrami) -> int:
-    return lb.basis_eigenvectors.shape[-1] if len(lb.basis_left) else 0
 
 
 def _cached(path: Path, key: str) -> LaplaceBeltrami | None:

@@ -82,14 +82,12 @@ def check_features(
             f"expected features of the type of the layer's parameters, {parameter.dtype}, got {x.dtype}: cast one of "
             "them, x.to(…) or layer.to(…); the operator may have any type"
         )
-    if k and not torch.compiler.is_compiling():
-        held = lb.basis_left.shape[-1]
-        if 0 < held < min(k, max(lb.sizes or (lb.num_points,))):
-            warnings.warn(
-                f"the operator holds a basis of {held} pairs, a layer asks for k = {k}: it is solved anew, for each "
-                f"operator that is made; store k = {k} pairs, or give the layer k = {held}",
-                stacklevel=2,
-            )
+    if k and not torch.compiler.is_compiling() and lb.num_pairs and not lb.has_pairs(k):
+        warnings.warn(
+            f"the operator holds a basis of {lb.num_pairs} pairs, a layer asks for k = {k}: it is solved anew, for "
+            f"each operator that is made; store k = {k} pairs, or give the layer k = {lb.num_pairs}",
+            stacklevel=2,
+        )
     return torch.promote_types(x.dtype, torch.float32)
 
 

@@ -97,7 +97,14 @@ def checked_method(method: str) -> Method:
 def _flow(
     lb: LaplaceBeltrami, x: Tensor, time: Tensor, method: str, k: int, tolerance: float
 ) -> Tensor:
-    """e^{tΔ}x in the type of x, which is float32 or float64; autocast has to be off."""
+    """e^{tΔ}x in the type of x, which is float32 or float64; autocast has to be off.
+
+    The surfaces of a stack (B, N, C) become channels.
+    """
+    if x.ndim == 3:
+        columns, times = x.transpose(0, 1).flatten(1), time.repeat(len(x))
+        y = _flow(lb, columns, times, method, k, tolerance)
+        return y.view(x.shape[1], x.shape[0], x.shape[2]).transpose(0, 1)
     if method == "spectral":
         return _spectral(lb.eigenbasis(k), x, time)
     if method == "deflated":
@@ -105,7 +112,7 @@ def _flow(
         deflated = _deflated_pair if basis.is_symmetric else _deflated
         return deflated(lb, basis, x, time, tolerance)
     if lb.has_weak_form:
-        return _solved(lb, x, time, tolerance)
+        return pair_flow(lb, x, time, tolerance).to(x.dtype)
     return _expanded(lb, x, time, method, tolerance)
 
 
@@ -131,14 +138,13 @@ def _deflated(
     flowed = decay * (frequencies * time).cos() * (inverse @ coefficients)
     flowed = v @ (flowed + decay * (frequencies * time).sin() * (turned @ coefficients))
     slow = basis.from_basis(flowed)
-    k = basis.eigenvectors.shape[1]
-    if max(basis.sizes or (lb.num_points,)) <= k:
+    if lb.has_pairs(lb.num_points):
         return slow
     rest = x - basis.from_basis(coefficients)
     fastest = rates.amax((-2, -1))
     if basis.sizes is not None:  # a shape whose basis is complete has no rest
-        incomplete = torch.tensor([size > k for size in basis.sizes], device=x.device)
-        fastest = torch.where(incomplete, fastest, torch.inf).amin()
+        incomplete = [size > lb.num_pairs for size in basis.sizes]
+        fastest = torch.where(torch.tensor(incomplete, device=x.device), fastest, torch.inf).amin()
     enough = math.log(1 / tolerance) / fastest
     return slow + _expanded(lb, rest, torch.minimum(time, enough), "either", tolerance)
 
@@ -151,22 +157,17 @@ def _deflated_pair(
         x = x * ~lb.fixed[:, None]
     values, coefficients = basis.eigenvalues.to(x.dtype), basis.to_basis(x)
     slow = basis.from_basis(torch.exp(-values[..., None] * time) * coefficients)
-    k = basis.eigenvectors.shape[1]
-    if max(basis.sizes or (lb.num_points,)) <= k:
+    if lb.has_pairs(lb.num_points):
         return slow
     fastest = values.amax(-1)
     if basis.sizes is not None:  # a shape whose basis is complete has no rest
-        incomplete = torch.tensor([size > k for size in basis.sizes], device=x.device)
-        fastest = torch.where(incomplete, fastest, torch.inf).amin()
+        incomplete = [size > lb.num_pairs for size in basis.sizes]
+        fastest = torch.where(torch.tensor(incomplete, device=x.device), fastest, torch.inf).amin()
     whole, time = time, torch.minimum(time, math.log(1 / tolerance) / fastest)
     pattern, matrix, root = _linear_flow(lb)
     options = lb.bounds, "either", tolerance, lb.sizes or (lb.num_points,)
     rest = root.to(x.dtype)[:, None] * (x - basis.from_basis(coefficients))
-    columns = rest if x.ndim == 2 else rest.transpose(0, 1).flatten(1)
-    times = time if x.ndim == 2 else time.repeat(len(x))
-    rest = heat(pattern, matrix.to(x.dtype), columns, times, *options)
-    if x.ndim == 3:
-        rest = rest.view(x.shape[1], x.shape[0], x.shape[2]).transpose(0, 1)
+    rest = heat(pattern, matrix.to(x.dtype), rest, time, *options)
     rest = rest / root.to(x.dtype)[:, None] * torch.exp(-fastest * (whole - time))
     return slow + rest - basis.from_basis(basis.to_basis(rest))
 
@@ -184,26 +185,14 @@ def _linear_flow(lb: LaplaceBeltrami) -> tuple[list[Tensor], Tensor, Tensor]:
     return [crow, col, crow, col, torch.arange(len(col), device=col.device)], values, root
 
 
-def _solved(lb: LaplaceBeltrami, x: Tensor, time: Tensor, tolerance: float) -> Tensor:
-    """The exact flow of the pair; the surfaces of a stack (B, N, C) become channels."""
-    if x.ndim == 2:
-        return pair_flow(lb, x, time, tolerance).to(x.dtype)
-    y = pair_flow(lb, x.transpose(0, 1).flatten(1), time.repeat(len(x)), tolerance)
-    return y.view(x.shape[1], x.shape[0], x.shape[2]).transpose(0, 1).to(x.dtype)
-
-
 def _expanded(
     lb: LaplaceBeltrami, x: Tensor, time: Tensor, expansion: str, tolerance: float
 ) -> Tensor:
-    """e^{tΔ}x by one of the expansions; the surfaces of a stack (B, N, C) become channels."""
+    """e^{tΔ}x by one of the expansions."""
     pattern = [lb.crow, lb.col, lb.crow_t, lb.col_t, lb.order_t]
     values = lb.values.to(x.dtype)
     options = lb.bounds, expansion, tolerance, lb.sizes or (lb.num_points,)
-    if x.ndim == 2:
-        return heat(pattern, values, x, time, *options)
-    columns = x.transpose(0, 1).flatten(1)
-    y = heat(pattern, values, columns, time.repeat(len(x)), *options)
-    return y.view(x.shape[1], x.shape[0], x.shape[2]).transpose(0, 1)
+    return heat(pattern, values, x, time, *options)
 
 
 class LearnedTimes(nn.Module):

@@ -89,12 +89,14 @@ def _join_pairs(shapes: Sequence[Buffers]) -> Buffers:
 
 def remember_shapes(batch: Any, shapes: Sequence[Any]) -> None:
     """So that what is kept of the shapes (factors, say) serves their batch, too."""
-    _SHAPES[batch.values] = tuple(shapes)
+    _SHAPES[batch.values] = tuple((shape, shape.values) for shape in shapes)
 
 
 def shapes_of(batch: Any) -> tuple[Any, ...]:
-    """The operators that a batch was made of, as long as it has not been copied, cast or moved; else none."""
-    return _SHAPES.get(batch.values, ())
+    """The operators that a batch was made of, as long as neither has been copied, cast, moved or loaded; else none."""
+    known = _SHAPES.get(batch.values, ())
+    same = all(shape.values is values for shape, values in known)
+    return tuple(shape for shape, _ in known) if same else ()
 
 
 def _starts(counts: Sequence[int]) -> list[int]:

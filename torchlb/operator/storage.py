@@ -8,6 +8,7 @@ from math import isnan
 from typing import Any, TypeVar
 
 import torch
+from jaxtyping import Bool
 from torch import Tensor, nn
 
 from torchlb.errors import InputError, first_few, warn
@@ -82,6 +83,7 @@ class OperatorStorage(nn.Module):
         self._sizes: list[Tensor] | None = None
         self.parts: list[dict[str, Any]] | None = None  # the extra states of the shapes of a batch
         self._bounds: Tensor | None = None
+        self._pairs = torch.empty(0, 0)  # as many rows as `num_pairs`
         for name in BUFFERS:
             self.register_buffer(name, torch.zeros(0))
         self.register_buffer("on_boundary", torch.zeros(0, dtype=torch.bool))
@@ -162,6 +164,22 @@ class OperatorStorage(nn.Module):
     def boundary(self) -> Tensor | None:
         """(N,), mask of the points where `condition` holds; None on a closed shape."""
         return self.on_boundary if len(self.on_boundary) else None
+
+    @property
+    def fixed(self) -> Bool[Tensor, " N"] | None:
+        """Mask of the points where a Dirichlet condition holds; None if there are none."""
+        if len(self.on_boundary) == 0:
+            return None
+        holds = [condition == "dirichlet" for condition in self._conditions]
+        sizes = self.sizes or (self.num_points,)
+        mask = torch.tensor(holds).repeat_interleave(torch.tensor(sizes)).to(self.on_boundary)
+        return mask & self.on_boundary if any(holds) else None
+
+    @property
+    def _conditions(self) -> list[str | None]:
+        """What holds at the boundary of each shape."""
+        states = [{"options": self.options}] if self.parts is None else self.parts
+        return [state["options"].get("condition") for state in states]
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -249,6 +267,27 @@ class OperatorStorage(nn.Module):
             value = self.values.new_zeros(0) if value is None else value.to(self.values)
             outside = key in self._non_persistent_buffers_set
             self.register_buffer(key, value, persistent=not outside if store is None else store)
+        self._pairs = torch.empty(self._count_pairs(), 0)
+
+    @property
+    def num_pairs(self) -> int:
+        """Number of eigenpairs that are stored of each shape of a batch, but for those that have no more."""
+        return self._pairs.shape[0]
+
+    def has_pairs(self, k: int) -> bool:
+        """Whether k eigenpairs of each shape are stored, or all that it has."""
+        return min(k, max(self.sizes or (self.num_points,))) <= self.num_pairs
+
+    def _count_pairs(self) -> int:
+        """`num_pairs` of the basis in the buffers: a batch pads short ones, and a Dirichlet condition takes points."""
+        if len(self.basis_left) == 0:
+            return 0
+        sizes = self.sizes or (self.num_points,)
+        fixed = self.fixed if len(self.weak_crow) else None
+        free = torch.ones_like(self.mass, dtype=torch.bool) if fixed is None else ~fixed
+        parts = zip(self.basis_eigenvectors.split(sizes), free.split(sizes), strict=True)
+        counts = [(int((modes != 0).any(0).sum()), int(inside.sum())) for modes, inside in parts]
+        return min((held for held, most in counts if held < most), default=max(sizes))
 
     def check_points(self, points: Tensor) -> None:
         """InputError unless the operator was built from these points: as many, each in its place to float32 rounding.
@@ -341,3 +380,4 @@ class OperatorStorage(nn.Module):
             error_msgs,
         )
         self._transpose()
+        self.keep_basis()

@@ -3,13 +3,18 @@
 from __future__ import annotations
 
 import torch
-from jaxtyping import Bool
 from torch import Tensor
 
 from torchlb.errors import InputError
 from torchlb.linalg.sparse import csr_tensor, to_scipy
+from torchlb.operator.batching import shapes_of
 from torchlb.operator.storage import OperatorStorage
-from torchlb.spectral.eigenbasis import Eigenbasis, check_num_pairs, stack_eigenbases
+from torchlb.spectral.eigenbasis import (
+    Eigenbasis,
+    check_num_pairs,
+    stack_eigenbases,
+    unstack_eigenbases,
+)
 from torchlb.spectral.eigensolver import blockwise_eigenbasis
 from torchlb.spectral.pencil import pencil_eigenbasis
 from torchlb.stencils.conditions import CONDITIONS
@@ -57,29 +62,14 @@ class WeakFace(OperatorStorage):
             raise InputError(NO_PAIR.format(name))
         return csr_tensor(self.weak_crow, self.weak_col, self.weak_values[number], self.num_points)
 
-    @property
-    def fixed(self) -> Bool[Tensor, " N"] | None:
-        """Mask of the points where a Dirichlet condition holds; None if there are none."""
-        if len(self.on_boundary) == 0:
-            return None
-        holds = [condition == "dirichlet" for condition in self._conditions]
-        sizes = self.sizes or (self.num_points,)
-        mask = torch.tensor(holds).repeat_interleave(torch.tensor(sizes)).to(self.on_boundary)
-        return mask & self.on_boundary if any(holds) else None
-
-    @property
-    def _conditions(self) -> list[str | None]:
-        """What holds at the boundary of each shape."""
-        states = [{"options": self.options}] if self.parts is None else self.parts
-        return [state["options"].get("condition") for state in states]
-
     def eigenbasis(
         self, k: int, *, tolerance: float | None = None, store: bool = False
     ) -> Eigenbasis:
         """The k smallest eigenpairs of −Δ: real, ascending, orthonormal in the mass; min(k, N) of them.
 
         Solved once, in float64 on the CPU (`method.md`, sections 7 and 10), and kept: a smaller k is a slice of what
-        there is, a larger one or a smaller tolerance is solved anew. For a batch each shape has its own.
+        there is, a larger one or a smaller tolerance is solved anew. For a batch each shape has its own, solved where
+        that shape has too few.
 
         Parameters
         ----------
@@ -102,19 +92,27 @@ class WeakFace(OperatorStorage):
         k = check_num_pairs(k)
         if tolerance is not None and not 0 < tolerance < 1:
             raise InputError(f"tolerance: expected a number between 0 and 1, got {tolerance}")
-        missing = self.basis_left.shape[-1] < min(k, max(self.sizes or (self.num_points,)))
-        if missing or (tolerance is not None and (self.basis_relative_errors > tolerance).any()):
-            pair = self.has_weak_form
+        errors = self.basis_relative_errors[..., :k]
+        if not self.has_pairs(k) or (tolerance is not None and (errors > tolerance).any()):
             with torch.inference_mode(False):  # it is kept, and a training may follow
-                solved = (
-                    self._pair_eigenbasis(k, tolerance) if pair else self._stencil_eigenbasis(k)
-                )
-                self.keep_basis(solved)
+                self.keep_basis(self._solved_basis(max(k, self.num_pairs), tolerance))
         if store:
             self.keep_basis(store=True)
         basis = self.basis
         assert basis is not None
         return basis
+
+    def _solved_basis(self, k: int, tolerance: float | None) -> Eigenbasis:
+        """Of a batch those of its shapes, which keep them, as long as they are known."""
+        shapes = shapes_of(self)
+        if shapes and all(shape.has_weak_form == self.has_weak_form for shape in shapes):
+            bases = [shape.invariant_basis(k, tolerance=tolerance) for shape in shapes]
+            return stack_eigenbases([part for basis in bases for part in unstack_eigenbases(basis)])
+        return (
+            self._pair_eigenbasis(k, tolerance)
+            if self.has_weak_form
+            else self._stencil_eigenbasis(k)
+        )
 
     def _stencil_eigenbasis(self, k: int) -> Eigenbasis:
         """From the rows of Δ, in the inner product of the mass."""
