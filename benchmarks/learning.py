@@ -75,24 +75,26 @@ class Original:
         self.basis = Eigenbasis(
             tensor(values).clamp_min(0), evecs, self.mass, evecs * self.mass[:, None]
         )
-        self.basis_left = self.basis.left
-        self.gradients = tangent_gradients(points, None if faces is None else faces.numpy())
+        self.num_pairs = k
+        gradients = tangent_gradients(points, None if faces is None else faces.numpy())
+        self.gradient_values = torch.stack(gradients)
 
     def to(self, device: str) -> Original:
         """Itself, on another device."""
-        for name in ("points", "mass", "values"):
+        for name in ("points", "mass", "values", "gradient_values"):
             setattr(self, name, getattr(self, name).to(device))
         parts = (self.basis.eigenvalues, self.basis.eigenvectors, self.mass, self.basis.left)
         self.basis = Eigenbasis(*(part.to(device) for part in parts))
-        self.basis_left = self.basis.left
-        self.gradients = [matrix.to(device) for matrix in self.gradients]
         return self
 
     def eigenbasis(self, k: int) -> Eigenbasis:
         return self.basis.truncate(k)
 
-    def local_gradient(self, x: Tensor) -> Tensor:
-        return torch.stack([torch.mm(matrix, x) for matrix in self.gradients], dim=1)
+    def has_pairs(self, k: int) -> bool:
+        return k <= self.num_pairs
+
+    def _apply_rows(self, values: Tensor, x: Tensor) -> Tensor:
+        return torch.mm(values, x)
 
 
 def tensor(array: Any) -> Tensor:

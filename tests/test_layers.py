@@ -379,6 +379,37 @@ def test_autocast_to_bfloat16_stays_close(eight, name):
     assert all(p.grad is not None and p.grad.isfinite().all() for p in layer.parameters())
 
 
+@pytest.mark.parametrize("scale", [1e-3, 1e3])
+@pytest.mark.parametrize("name", ["poisson", "classifier"])
+def test_autocast_to_float16_bears_areas_beyond_its_range(name, scale):
+    """Of millimetres in metres, and the reverse; the mean over masses, the potential of sources."""
+    vertices, faces = Sphere().mesh(60)
+    lb = LaplaceBeltrami.from_cotangent(scale * vertices.float(), faces)
+    layer, x = layer_of(name), features(lb)
+    expected = layer(x, lb)
+    with torch.autocast("cpu", dtype=torch.float16):
+        y = layer(x, lb)
+    assert name == "classifier" or y.dtype == torch.float32
+    assert (y.float() - expected).abs().max() <= 1e-2 * expected.abs().max()
+
+
+@pytest.mark.parametrize("block", ["diffusion", "implicit", "poisson"])
+def test_under_autocast_gradients_are_of_features_that_were_not_rounded(eight, block):
+    layer, lb, seen = DiffusionNet(CHANNELS, 5, block=block, **SMALL), eight[3], []
+    for module in layer.modules():
+        if isinstance(module, GradientFeatures):
+            module.register_forward_pre_hook(lambda _, inputs: seen.append(inputs[0].dtype))
+    with torch.autocast("cpu", dtype=torch.bfloat16):
+        layer(features(lb), lb)
+    assert seen == 2 * [torch.float32]
+
+
+def test_gradient_features_compute_in_the_type_of_the_layer():
+    lb = stencil_of_mesh(*Torus().mesh(100))
+    layer, x = layer_of("gradients"), features(lb).float()
+    assert torch.equal(layer(x, lb), layer(x, copy.deepcopy(lb).float()))
+
+
 @every_layer
 def test_float32_is_close_to_float64(name):
     double = LaplaceBeltrami.from_points(Torus().points(150))

@@ -67,7 +67,8 @@ class DiffusionNetBlock(nn.Module):
 
     def forward(self, x: Float[Tensor, "*B N C"], lb: LaplaceBeltrami) -> Float[Tensor, "*B N C"]:
         """Features (N, width) or (B, N, width) in the shape of x."""
-        diffused = self.diffusion(x, lb)
+        # Under autocast, too, gradients are of what has not been rounded: an error of it grows by 1/h.
+        diffused = self.diffusion(x.to(self.diffusion.raw_time.dtype), lb)
         features = [x, diffused]
         if self.gradient_features is not None:
             features.append(self.gradient_features(diffused, lb))
@@ -245,8 +246,8 @@ def _checked_corners(place: str, corners: Tensor | None, lb: LaplaceBeltrami) ->
 
 def _global_mean(y: Tensor, lb: LaplaceBeltrami) -> Tensor:
     """Σ π y / Σ π over the surface, for each shape of a batch."""
-    mass = lb.mass.to(y.dtype)[:, None]
-    if lb.sizes is None:
-        return (mass * y).sum(-2) / mass.sum()
-    parts = zip(mass.split(lb.sizes), y.split(lb.sizes, dim=-2), strict=True)
-    return torch.stack([(m * part).sum(-2) / m.sum() for m, part in parts], dim=-2)
+    mass = lb.mass.to(torch.promote_types(y.dtype, torch.float32))[:, None]
+    sizes = lb.sizes or len(mass)
+    parts = zip(mass.split(sizes), y.split(sizes, dim=-2), strict=True)
+    means = torch.stack([(m / m.sum() * part).sum(-2) for m, part in parts], dim=-2).to(y.dtype)
+    return means[..., 0, :] if lb.sizes is None else means

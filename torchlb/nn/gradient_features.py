@@ -33,10 +33,11 @@ class TangentMap(nn.Module):
 
     def gradients(self, x: Tensor, lb: LaplaceBeltrami) -> tuple[Tensor, Tensor]:
         """∇x in the frames, and what the map makes of it, (…, N, d, C); x of (N, C) or (B, N, C)."""
-        check_features(x, lb, self.channels, next(self.parameters()))
+        dtype = check_features(x, lb, self.channels, next(self.parameters()))
         if self.rotations and lb.dim != 2:
             raise InputError(f"rotations need a surface, got dim={lb.dim}; use rotations=False")
-        gradient = lb.local_gradient(x).to(x.dtype)
+        rows = [lb._apply_rows(values, x) for values in lb.gradient_values.to(dtype)]
+        gradient = torch.stack(rows, dim=-2)
         if not self.rotations:
             return gradient, self.A(gradient)
         # z ↦ Az of complex numbers is a real map of both parts side by side

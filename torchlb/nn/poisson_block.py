@@ -56,12 +56,13 @@ class PoissonFeatures(nn.Module):
 
     def forward(self, x: Float[Tensor, "*B N C"], lb: LaplaceBeltrami) -> Float[Tensor, "*B N C"]:
         """The features of x, (N, C) or (B, N, C), in its shape and type."""
-        check_features(x, lb, self.channels, self.source.weight)
+        dtype = check_features(x, lb, self.channels, self.source.weight)
         field = None
         if self.map is not None and self.gate is not None:
             _, field = self.map.gradients(x, lb)
-            field = torch.sigmoid(self.gate(x))[..., None, :] * field
-        return potential(lb, field, self.source(x), tolerance=self.tolerance)
+            field = (torch.sigmoid(self.gate(x))[..., None, :] * field).to(dtype)
+        u = potential(lb, field, self.source(x).to(dtype), tolerance=self.tolerance)
+        return u.to(x.dtype)
 
 
 class PoissonBlock(nn.Module):
@@ -107,7 +108,7 @@ class PoissonBlock(nn.Module):
 
     def forward(self, x: Float[Tensor, "*B N C"], lb: LaplaceBeltrami) -> Float[Tensor, "*B N C"]:
         """Features (N, width) or (B, N, width) in the shape of x."""
-        solved = self.features(x, lb)
+        solved = self.features(x.to(self.features.source.weight.dtype), lb)
         features = [x, solved]
         if self.gradient_features is not None:
             features.append(self.gradient_features(solved, lb))

@@ -136,9 +136,9 @@ def potential(
     """
     products = []
     if source is not None:
-        products.append(lb.mass.to(source.dtype)[:, None] * source)
+        products.append(_weights(lb, source)[:, None] * source)
     if field is not None:
-        weighted = lb.mass.to(field.dtype)[:, None, None] * field
+        weighted = _weights(lb, field)[:, None, None] * field
         products += [
             lb._apply_rows(values, part, transposed=True)
             for values, part in zip(lb.gradient_values, weighted.unbind(-2), strict=True)
@@ -150,6 +150,11 @@ def potential(
     assert source is not None, "neither field nor source"
     u = _solve(columns, None, None, None, lb, tolerance)
     return _shaped(u, source, source.dtype)
+
+
+def _weights(lb: LaplaceBeltrami, x: Tensor) -> Tensor:
+    """The mass in the type of x, at least float32: areas leave the range of float16."""
+    return lb.mass.to(torch.promote_types(x.dtype, torch.float32))
 
 
 def _columns(
