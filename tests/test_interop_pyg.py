@@ -10,9 +10,9 @@ from torch_geometric.data import Batch, Data
 from torch_geometric.loader import DataLoader
 from torch_geometric.nn import MessagePassing
 
-from torchlb import Diffusion, DiffusionNet, LaplaceBeltrami
+from torchlb import Diffusion, DiffusionNet, LaplaceBeltrami, implicit_step
 from torchlb.interop.pyg import LaplaceBeltramiTransform, to_operator
-from torchlb.surfaces import Circle, Ellipsoid, Sphere, Torus
+from torchlb.surfaces import Circle, Ellipsoid, Sphere, Torus, UnitDisk
 
 MESHES = [Sphere().mesh(120), Ellipsoid().mesh(90), Torus().mesh(150)]
 SIZES = [120, 90, 150]
@@ -157,6 +157,34 @@ def test_clouds_their_normals_and_curves():
     curves = [data_of(Circle().points(n)) for n in (20, 30)]
     lb = to_operator(Batch.from_data_list([plain(curve) for curve in curves]))
     assert (lb.dim, lb.sizes) == (1, (20, 30))
+
+
+@pytest.mark.filterwarnings("ignore:condition='dirichlet' holds nowhere")
+def test_closed_and_open_shapes_in_either_order():
+    options = {"order": 1, "condition": "dirichlet"}
+    meshes = [Sphere().mesh(40), UnitDisk().mesh(40)]
+    shapes = [LaplaceBeltramiTransform(**options)(data_of(*mesh)) for mesh in meshes]
+    lbs = [to_operator(data) for data in shapes]
+    assert lbs[0].boundary is None
+    f = torch.ones(80, dtype=torch.float64)
+    for order in (slice(None), slice(None, None, -1)):
+        lb, theirs = (
+            to_operator(Batch.from_data_list(shapes[order])),
+            LaplaceBeltrami.batch(lbs[order]),
+        )
+        assert torch.equal(lb.boundary, theirs.boundary)
+        torch.testing.assert_close(implicit_step(lb, f, 0.1), implicit_step(theirs, f, 0.1))
+
+
+def test_a_batch_has_faces_and_pairs_as_its_shapes_have_them():
+    """Of a mesh and a cloud without either; the stencils then do the work of all."""
+    mesh = LaplaceBeltramiTransform(order=1)(DATA[0])
+    del mesh.face
+    cloud = LaplaceBeltramiTransform(order=1, weak_form=False)(data_of(Sphere().points(50)))
+    for order in ([mesh, cloud], [cloud, mesh]):
+        lb = to_operator(Batch.from_data_list(order))
+        assert not lb.has_weak_form
+        assert len(lb.faces) == sum(len(to_operator(data).faces) for data in order)
 
 
 def test_in_a_compose_and_from_a_cache(tmp_path):

@@ -51,9 +51,9 @@ class LaplaceBeltramiTransform(BaseTransform):
     lb_frames          (N, n, d)    orthonormal tangent vectors
     lb_pos             (N, n)       the points, by which `to_operator` sees whether `pos` was changed since
     lb_normals         (N, n)       unit normals of a hypersurface
-    lb_face_index      (d + 1, F)   faces of the mesh, or of the surface through the cloud, if any
-    lb_boundary        (N,)         mask of the points where the boundary condition holds, if any
-    lb_weak_index      (2, nnz)     [i; j] of every entry of the weak pair, where there is one; ascending
+    lb_face_index      (d + 1, F)   faces of the mesh, or of the surface through the cloud; F = 0 for other clouds
+    lb_boundary        (N,)         mask of the points where the boundary condition holds; of none on a closed shape
+    lb_weak_index      (2, nnz)     [i; j] of every entry of the weak pair, none where there is no pair; ascending
     lb_weak_values     (nnz, 3)     stiffness, mass matrix, mass matrix of the boundary
     lb_linear_…                     the same of the linear pair
     lb_basis           (…,)         with k > 0: all parts of the eigenbasis in one vector, for `to_operator`
@@ -138,6 +138,7 @@ class LaplaceBeltramiTransform(BaseTransform):
 def _keys(lb: LaplaceBeltrami, k: int) -> dict[str, Any]:
     """What is stored in the data of one shape."""
     row = torch.arange(lb.num_points).repeat_interleave(lb.crow.diff())
+    closed = torch.zeros(lb.num_points, dtype=torch.bool)
     keys: dict[str, Any] = {
         "lb_edge_index": torch.stack([lb.col, row]),
         "lb_values": lb.values,
@@ -146,19 +147,17 @@ def _keys(lb: LaplaceBeltrami, k: int) -> dict[str, Any]:
         "lb_mass": lb.mass,
         "lb_frames": lb.frames,
         "lb_pos": lb.points,
+        "lb_face_index": lb.faces.T.contiguous(),
+        "lb_boundary": closed if lb.boundary is None else lb.boundary,
         "lb_info": json.dumps(lb.get_extra_state()),
     }
-    for name, tensor in (("lb_normals", lb.normals), ("lb_boundary", lb.on_boundary)):
-        if len(tensor):
-            keys[name] = tensor
-    if len(lb.faces):
-        keys["lb_face_index"] = lb.faces.T.contiguous()
-    if lb.has_weak_form:
-        matrices = {"weak": (lb.weak_crow, lb.weak_col, lb.weak_values), "linear": lb.linear_pair}
-        for name, (crow, col, values) in matrices.items():
-            rows = torch.arange(lb.num_points).repeat_interleave(crow.diff())
-            keys[f"lb_{name}_index"] = torch.stack([rows, col])
-            keys[f"lb_{name}_values"] = pad(values, (0, 0, 0, 3 - len(values))).T.contiguous()
+    if len(lb.normals):
+        keys["lb_normals"] = lb.normals
+    matrices = {"weak": (lb.weak_crow, lb.weak_col, lb.weak_values), "linear": lb.linear_pair}
+    for name, (crow, col, values) in matrices.items():
+        rows = torch.arange(len(crow.diff())).repeat_interleave(crow.diff())
+        keys[f"lb_{name}_index"] = torch.stack([rows, col])
+        keys[f"lb_{name}_values"] = pad(values, (0, 0, 0, 3 - len(values))).T.contiguous()
     if k > 0:
         basis = lb.invariant_basis(k)
         parts = [getattr(basis, name) for name in BASIS]
@@ -201,12 +200,16 @@ def _buffers(data: Any, sizes: Int[Tensor, " S"]) -> dict[str, Tensor]:
     entries = torch.diff(ends, prepend=ends.new_zeros(1))
     order_t = data.lb_order_t + (ends - entries).repeat_interleave(entries)
     points = data.pos.to(data.lb_mass)
+    boundary = data.get("lb_boundary", points.new_zeros(0, dtype=torch.bool))
     pairs = {}
     for name in PAIRS if "lb_weak_index" in data else ():
         rows, columns = data[f"lb_{name}_index"]
         values = data[f"lb_{name}_values"].T.contiguous()
+        weak_crow = _starts(rows, len(data.pos))
+        if bool((weak_crow[pad(sizes.cumsum(0), (1, 0))].diff() == 0).any()):
+            break  # as in `LaplaceBeltrami.batch`, if one shape has no pair
         pairs |= {
-            f"{name}_crow": _starts(rows, len(data.pos)),
+            f"{name}_crow": weak_crow,
             f"{name}_col": columns.contiguous(),
             f"{name}_values": values if values[2].any() else values[:2],
         }
@@ -222,7 +225,7 @@ def _buffers(data: Any, sizes: Int[Tensor, " S"]) -> dict[str, Tensor]:
         "points": points,
         "frames": data.lb_frames,
         "normals": data.get("lb_normals", points[:0]),
-        "on_boundary": data.get("lb_boundary", points.new_zeros(0, dtype=torch.bool)),
+        "on_boundary": boundary[: None if boundary.any() else 0],
         "faces": data.get("lb_face_index", crow.new_zeros(data.lb_frames.shape[-1] + 1, 0)).T,
     }
 
