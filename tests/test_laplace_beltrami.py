@@ -4,6 +4,7 @@ import copy
 import functools
 import io
 import pickle
+from collections import namedtuple
 from functools import cache
 
 import igl
@@ -14,7 +15,7 @@ import torch
 from torch.autograd import gradcheck, gradgradcheck
 
 from builders import stencil_of_cloud
-from torchlb import LaplaceBeltrami, collate
+from torchlb import InputError, LaplaceBeltrami, collate
 from torchlb.operator.storage import BASIS
 from torchlb.surfaces import (
     Circle,
@@ -435,6 +436,20 @@ def test_collate_joins_operators_features_and_faces():
     assert y.shape == (2, 4)
     with pytest.raises(ValueError, match="collate: expected samples"):
         collate([(1, 2), (3, 4)])
+
+
+def test_collate_knows_rows_of_faces_and_edges_and_names_the_key_that_it_cannot_join():
+    Sample = namedtuple("Sample", "lb faces labels edges lengths")
+    shapes = [(built("mesh"), mesh_of(Torus(), 400)[1]), (disk(), mesh_of(UnitDisk(), 150)[1])]
+    samples = [Sample(lb, faces, faces[:, 0], faces[:9, :2], torch.ones(9)) for lb, faces in shapes]
+    batch = collate(samples)
+    assert isinstance(batch, Sample)
+    assert torch.equal(batch.labels, torch.cat([faces[:, 0] for _, faces in shapes]))
+    assert torch.equal(batch.edges, torch.cat([shapes[0][1][:9, :2], shapes[1][1][:9, :2] + 400]))
+    assert torch.equal(batch.lengths, torch.ones(18))
+    samples[1] = samples[1]._replace(lengths=torch.ones(8))
+    with pytest.raises(InputError, match="collate: 'lengths' has neither a row for each point"):
+        collate(samples)
 
 
 # Input

@@ -91,6 +91,15 @@ def check_features(
     return torch.promote_types(x.dtype, torch.float32)
 
 
+def unrounded(x: Tensor, lb: LaplaceBeltrami, channels: int, parameter: Tensor) -> Tensor:
+    """Features in the type of the parameters, where autocast made them shorter, for layers whose results are derived.
+
+    Rounding that comes before a gradient grows by 1/h. Errors as for `check_features`.
+    """
+    check_features(x, lb, channels, parameter)
+    return x.to(parameter.dtype)
+
+
 def uncompiled(function: Callable[P, T]) -> Callable[P, T]:
     """`torch.compiler.disable`, put off until something is compiled: it loads the compiler, in more than a second."""
 

@@ -15,7 +15,7 @@ from jaxtyping import Float, Int
 from torch import Tensor, nn
 
 from torchlb.errors import InputError
-from torchlb.nn.checks import check_choice, check_features
+from torchlb.nn.checks import check_choice, check_features, unrounded
 from torchlb.nn.diffusion import Diffusion, Method, raw_of_time
 from torchlb.nn.gradient_features import GradientFeatures
 from torchlb.nn.implicit_diffusion import ImplicitDiffusion
@@ -67,8 +67,8 @@ class DiffusionNetBlock(nn.Module):
 
     def forward(self, x: Float[Tensor, "*B N C"], lb: LaplaceBeltrami) -> Float[Tensor, "*B N C"]:
         """Features (N, width) or (B, N, width) in the shape of x."""
-        # Under autocast, too, gradients are of what has not been rounded: an error of it grows by 1/h.
-        diffused = self.diffusion(x.to(self.diffusion.raw_time.dtype), lb)
+        width, parameter = self.diffusion.channels, self.diffusion.raw_time
+        diffused = self.diffusion(unrounded(x, lb, width, parameter), lb)
         features = [x, diffused]
         if self.gradient_features is not None:
             features.append(self.gradient_features(diffused, lb))

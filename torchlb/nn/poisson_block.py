@@ -13,7 +13,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from torchlb.nn.checks import check_features
+from torchlb.nn.checks import check_features, unrounded
 from torchlb.nn.gradient_features import GradientFeatures, TangentMap
 from torchlb.nn.pointwise import mlp
 from torchlb.nn.solves import potential
@@ -108,7 +108,8 @@ class PoissonBlock(nn.Module):
 
     def forward(self, x: Float[Tensor, "*B N C"], lb: LaplaceBeltrami) -> Float[Tensor, "*B N C"]:
         """Features (N, width) or (B, N, width) in the shape of x."""
-        solved = self.features(x.to(self.features.source.weight.dtype), lb)
+        width, parameter = self.features.channels, self.features.source.weight
+        solved = self.features(unrounded(x, lb, width, parameter), lb)
         features = [x, solved]
         if self.gradient_features is not None:
             features.append(self.gradient_features(solved, lb))

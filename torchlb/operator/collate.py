@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from itertools import accumulate
 from typing import Any
 
 import torch
@@ -12,13 +13,21 @@ from torch.utils.data import default_collate
 from torchlb.errors import InputError
 from torchlb.operator.laplace_beltrami import LaplaceBeltrami
 
+INDICES = ("faces", "face_index", "edges")
+"""Keys of what holds indices of points, (·, corners)."""
+
 
 def collate(samples: Sequence[Any]) -> Any:
     """`collate_fn` of a `DataLoader` whose samples, tuples or dicts, hold an operator each.
 
     Operators become one by `LaplaceBeltrami.batch`. Tensors with a row for every point of their sample's operator go
-    below each other, as every layer takes them; those under the key "faces" or "face_index" do too, their indices moved
-    by ``lb.offsets``. The rest is torch's `default_collate`: a label for each shape, say.
+    below each other, as every layer takes them; those under the keys "faces", "face_index" and "edges" do too, their
+    indices moved by ``lb.offsets``, and so do tensors with a row for every one of these. The rest is torch's
+    `default_collate`: a label for each shape, say.
+
+    Raises
+    ------
+    InputError : for samples without an operator, and where `default_collate` fails; the key is named.
 
     >>> from torchlb.surfaces import Sphere
     >>> samples = [(LaplaceBeltrami.from_points(Sphere().points(n), order=1), torch.zeros(n, 3), n) for n in (40, 50)]
@@ -29,25 +38,38 @@ def collate(samples: Sequence[Any]) -> Any:
     first = samples[0]
     if isinstance(first, LaplaceBeltrami):
         return LaplaceBeltrami.batch(samples)
-    keys = list(first) if isinstance(first, Mapping) else range(len(first))
-    columns = {key: [sample[key] for sample in samples] for key in keys}
+    named = hasattr(first, "_asdict")  # a namedtuple, whose fields are keys
+    rows = [sample._asdict() for sample in samples] if named else samples
+    keys = list(rows[0]) if isinstance(rows[0], Mapping) else range(len(first))
+    columns = {key: [row[key] for row in rows] for key in keys}
     operators = [c for c in columns.values() if isinstance(c[0], LaplaceBeltrami)]
     if not operators:
         raise InputError(
             f"collate: expected samples that are tuples or dicts with a LaplaceBeltrami, got {type(first).__name__}"
         )
-    joined = {key: _joined(key, column, operators[0]) for key, column in columns.items()}
+    counts = [[lb.num_points for lb in operators[0]]]
+    for key in INDICES:
+        if all(isinstance(each, Tensor) for each in columns.get(key, [None])):
+            counts.append([len(each) for each in columns[key]])
+    joined = {key: _joined(key, column, counts) for key, column in columns.items()}
+    if named:
+        return type(first)(*joined.values())
     return joined if isinstance(first, Mapping) else tuple(joined.values())
 
 
-def _joined(key: Any, column: list[Any], operators: list[LaplaceBeltrami]) -> Any:
+def _joined(key: Any, column: list[Any], counts: list[list[int]]) -> Any:
+    """By the numbers of points of the shapes, and of whatever else has rows."""
     if isinstance(column[0], LaplaceBeltrami):
         return LaplaceBeltrami.batch(column)
-    if not all(isinstance(each, Tensor) for each in column):
+    if all(isinstance(each, Tensor) and each.ndim > 0 for each in column):
+        if key in INDICES:
+            starts = accumulate([0, *counts[0][:-1]])
+            return torch.cat([rows + start for rows, start in zip(column, starts, strict=True)])
+        if [len(each) for each in column] in counts:
+            return torch.cat(column)
+    try:
         return default_collate(column)
-    sizes = [lb.num_points for lb in operators]
-    if key in ("faces", "face_index"):
-        starts = torch.tensor([0, *sizes[:-1]]).cumsum(0).tolist()
-        return torch.cat([faces + start for faces, start in zip(column, starts, strict=True)])
-    by_point = [each.ndim > 0 and len(each) == n for each, n in zip(column, sizes, strict=True)]
-    return torch.cat(column) if all(by_point) else default_collate(column)
+    except (RuntimeError, TypeError) as error:
+        raise InputError(
+            f"collate: {key!r} has neither a row for each point, face or edge nor one shape in all samples ({error})"
+        ) from error
