@@ -1,5 +1,7 @@
 """trimesh in and out, and files read in their own order."""
 
+import shutil
+
 import numpy as np
 import pytest
 import torch
@@ -93,7 +95,9 @@ def test_clouds(tmp_path):
     np.savez(tmp_path / "b.npz", points=VERTICES.numpy())
     np.savetxt(tmp_path / "c.xyz", VERTICES.numpy())
     trimesh.PointCloud(VERTICES.numpy()).export(tmp_path / "d.ply")
-    for name in ("a.npy", "b.npz", "c.xyz", "d.ply"):
+    for name in ("a.npy", "b.npz"):
+        shutil.copy(tmp_path / name, tmp_path / name.upper())
+    for name in ("a.npy", "A.NPY", "b.npz", "B.NPZ", "c.xyz", "d.ply"):
         vertices, faces = read_shape(tmp_path / name)
         assert faces is None
         assert torch.allclose(vertices, VERTICES, atol=1e-6)

@@ -46,12 +46,13 @@ def read_shape(path: str | Path) -> Shape:
     ValueError : if it is no shape; the message names the file.
     """
     path = Path(path).expanduser()
+    suffix = path.suffix.lower()
     if not path.is_file():
         raise FileNotFoundError(f"{path}: no such file")
     try:
-        if path.suffix == ".npy":
+        if suffix == ".npy":
             vertices, faces = as_tensor(np.load(path, allow_pickle=False)), None
-        elif path.suffix == ".npz":
+        elif suffix == ".npz":
             vertices, faces = _npz(path)
         else:
             import trimesh
@@ -64,7 +65,7 @@ def read_shape(path: str | Path) -> Shape:
         raise InputError(
             f"{path}: not a mesh or cloud that can be read; {', '.join(SUFFIXES)} can ({error})"
         ) from error
-    if path.suffix.lower() == ".stl" and faces is not None:
+    if suffix == ".stl" and faces is not None:
         vertices, merged = torch.unique(vertices, dim=0, return_inverse=True)
         faces = merged[faces]
     return vertices.double(), faces
