@@ -235,6 +235,16 @@ def test_factors_take_over_where_sweeps_stall(monkeypatch):
         LaplaceBeltrami.from_mesh(*Ellipsoid().mesh(900)).eigenbasis(10, tolerance=1e-10)
 
 
+def test_a_correction_of_zero_leaves_the_space_as_it_is():
+    """As where K − λM is not positive in its first direction."""
+    stiffness, mass_matrix, _ = weak_pair(5, 6)
+    u = np.random.default_rng(0).random((30, 4))
+    space = (u, stiffness @ u, mass_matrix @ u)
+    expected, _ = pencil._ritz(space, 4)
+    found, _ = pencil._ritz(tuple(np.pad(x, ((0, 0), (0, 1))) for x in space), 4)
+    np.testing.assert_allclose(found, expected)
+
+
 @pytest.mark.parametrize("unit", [1e-20, 1e20])
 def test_eigenpairs_are_those_in_any_unit(unit):
     """Masses that leave the range of float32, in which sweeps are taken; of an open shape, too."""

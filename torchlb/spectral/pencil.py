@@ -241,7 +241,7 @@ def _swept(
         if sweep and errors[:keep].max() <= tolerance:
             return values, errors, u, mu
         rough = errors[:keep].max() > ROUGH
-        active = np.flatnonzero(errors[:keep] > tolerance) if sweep else np.arange(count)
+        active = np.flatnonzero(errors[:keep] > tolerance) if sweep else np.arange(len(values))
         small = (u.astype(np.float32), mu.astype(np.float32))
         right = (r[:, active], z[:, active], values[active].astype(np.float32))
         w = _correction(shifted, cycle, small, right, 1 if rough else steps).astype(np.float64)
@@ -307,7 +307,7 @@ def _dots(x: np.ndarray, y: np.ndarray) -> np.ndarray:
 def _ritz(space: Blocks, count: int) -> tuple[np.ndarray, Blocks]:
     """Rayleigh–Ritz on the span of U, of (U, KU, MU): the smallest values, ascending, and the same of their vectors."""
     a, b = ((space[0].T @ x).astype(np.float64) for x in space[1:])
-    scale = 1 / np.sqrt(b.diagonal())
+    scale = np.where(b.diagonal() > 0, b.diagonal(), np.inf) ** -0.5  # what has no mass has no part
     squares, q = linalg.eigh(b * scale * scale[:, None])
     q = (scale[:, None] * q / np.sqrt(np.maximum(squares, TINY)))[:, squares > DEPENDENT]
     values, y = linalg.eigh(q.T @ a @ q)  # all of them, in less time than a part
@@ -334,9 +334,7 @@ def _merged(
     for part, (_, _, *vectors), at in zip(parts, found, columns[:-1], strict=True):
         to = place[at : at + vectors[0].shape[1]]
         for whole, own in zip((phi, left), vectors, strict=True):
-            block = np.zeros((len(part.points), keep))
-            block[:, to[to < keep]] = own[:, to < keep]
-            whole[part.points] = block
+            whole[np.ix_(part.points, to[to < keep])] = own[:, to < keep]
     count = len(constants)
     if count:
         nulls = [part for part in parts if part.conserving]
