@@ -118,6 +118,26 @@ def test_constants_and_mass_stay_to_rounding(name):
     assert (weights @ (implicit_step(lb, f, 0.7) - f)).abs().max() < 1e-13 * weights.sum()
 
 
+def test_a_stencil_in_single_precision_keeps_constants_and_mass_for_long():
+    """Rounded, its rows do not sum to zero, and in a long time that shows."""
+    lb = stencil_of_cloud(Sphere().points(200), order=2).float()
+    f = rough(lb)
+    one = torch.ones_like(f)
+    assert (implicit_step(lb, one, 1e6) - one).abs().max() < 1e-7
+    mean = (lb.mass.double() @ f) / lb.mass.double().sum()
+    torch.testing.assert_close(implicit_step(lb, f, 1e6), mean * one, rtol=0, atol=1e-5)
+
+
+def test_a_fine_stencil_is_inverted_to_rounding():
+    """−u'' = u − mean u on two circles of 4,000 points each, for cos θ and sin θ + 1."""
+    theta = torch.arange(4000, dtype=torch.float64) * torch.pi / 2000
+    circle = torch.stack([theta.cos(), theta.sin()], dim=1)
+    lb = stencil_of_cloud(torch.cat([circle, circle + 5]))
+    f = torch.cat([circle[:, 0], circle[:, 1] + 1])
+    expected = torch.cat([circle[:, 0], circle[:, 1]])
+    torch.testing.assert_close(poisson_solve(lb, f), expected, rtol=0, atol=1e-7)
+
+
 @every_builder
 def test_derivatives_in_f_and_t(build):
     lb = build()

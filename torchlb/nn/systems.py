@@ -32,6 +32,7 @@ from torchlb.linalg.two_levels import Matrix, absolute_row_sums, main_entries, t
 from torchlb.nn.conduction import Conducting
 from torchlb.operator.batching import shapes_of
 from torchlb.operator.laplace_beltrami import LaplaceBeltrami
+from torchlb.stability.null_vector import has_outflow
 
 KEPT = 8
 """Factors that are kept for each operator."""
@@ -46,8 +47,6 @@ SINGLE, STIFFEST = 1e-5, 1e5
 """A tolerance from which on steps are taken in float32, unless the entries of M + tK sum to more than so many times the
 area: what is rounded there would show."""
 TINY = 1e-300
-SHIFT = 1e-9
-"""Of an inverted stencil that is singular, in units of its diagonal."""
 Operator = LaplaceBeltrami | Conducting
 _SYSTEMS: Any = WeakIdKeyDictionary()
 atexit.register(_SYSTEMS.clear)  # cholespy reports factors that outlive Python as leaks
@@ -294,37 +293,50 @@ class PairSystem:
 
 
 class StencilSystem:
-    """−L, or 1 − tL, of a stencil L, by sparse LU on the CPU."""
+    """−L, or 1 − tL, of a stencil L, by sparse LU on the CPU.
+
+    Where constants are in the null space of −L, the diagonal entry of one point of the component is made larger: the
+    solution is then zero there, and that of −L, for a right side that the left null vector is orthogonal to.
+    """
 
     def __init__(self, lb: Operator, t: float | None) -> None:
-        n = lb.num_points
         assert isinstance(lb, LaplaceBeltrami)
-        matrix = sparse.csr_array(lb.to_scipy(), dtype=np.float64)
-        self.components = None
-        shift = 1.0
-        if t is None:
-            self.components = _Components(lb)
-            shift = SHIFT * float(np.median(np.abs(matrix.diagonal())))
-            t = 1.0
+        matrix = -sparse.csr_array(lb.to_scipy(), dtype=np.float64)
+        sums = matrix.sum(axis=1)
+        if lb.fixed is not None:
+            sums[has_outflow(matrix, torch.finfo(lb.dtype).eps)] = 0
+        matrix = matrix - sparse.diags_array(sums)  # in float32 constants would decay
         self.free = None if lb.fixed is None else (~lb.fixed).double()[:, None]
-        self.mass = lb.mass.detach().double()[:, None]
-        self.lu = factorized(sparse.csc_array(shift * sparse.eye_array(n) - t * matrix), 1e-2)
+        self.components = _Components(lb) if t is None else None
+        if self.components is None:
+            matrix = sparse.eye_array(lb.num_points) + t * matrix
+            self.lu = factorized(sparse.csc_array(matrix), 1e-2)
+        else:
+            self.mass = lb.mass.detach().double()[:, None]
+            first = np.unique(self.components.of.cpu(), return_index=True)[1]
+            pin = torch.zeros_like(self.mass)
+            pin[first] = float(np.median(matrix.diagonal()))
+            pin = (pin * self.components.free).cpu().numpy()
+            self.lu = factorized(sparse.csc_array(matrix + sparse.diags_array(pin[:, 0])), 1e-2)
+            self.left_null = torch.from_numpy(self.lu.solve(pin, "T")).to(self.mass)
 
     def solve(self, b: Float[Tensor, "N C"], transposed: bool = False) -> Float[Tensor, "N C"]:
         """As for the pair, but exact; `transposed` for the transposed matrix."""
         b = b.double() if self.free is None else b.double() * self.free
         if self.components is not None:
-            b = self._without(b, transposed)
+            b = self._without(b, self.mass if transposed else self.left_null, transposed)
         x = self.lu.solve(b.detach().cpu().numpy(), "T" if transposed else "N")
         result = torch.from_numpy(x).to(b)
         result = result if self.free is None else result * self.free
-        return result if self.components is None else self._without(result, transposed)
+        if self.components is None:
+            return result
+        return self._without(result, self.left_null if transposed else self.mass, transposed)
 
-    def _without(self, x: Tensor, transposed: bool) -> Tensor:
-        """Without constants, in the mass π, or without π, in the sum."""
+    def _without(self, x: Tensor, weights: Tensor, transposed: bool) -> Tensor:
+        """Without constants, in the sense of the weights, or without the weights, in the sum."""
         assert self.components is not None
-        ones = torch.ones_like(self.mass)
-        area = self.components.sums(ones, self.mass)
-        one, other = (ones, self.mass) if transposed else (self.mass, ones)
+        ones = torch.ones_like(weights)
+        area = self.components.sums(ones, weights)
+        one, other = (ones, weights) if transposed else (weights, ones)
         less = other * self.components.sums(one, x) / area
         return x - torch.where(self.components.free, less, 0.0)
