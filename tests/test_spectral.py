@@ -311,6 +311,58 @@ def test_diffusion_map_of_a_circle_is_a_circle():
     )
 
 
+def test_the_first_mode_of_a_dirichlet_shape_is_no_constant():
+    """Its diffusion map has it; and distances of float32 are zero from a point to itself."""
+    lb = LaplaceBeltrami.from_mesh(*UnitDisk().mesh(300), condition="dirichlet").float()
+    basis = lb.eigenbasis(20)
+    scaled = basis.eigenvectors * torch.exp(-0.1 * basis.eigenvalues)
+    torch.testing.assert_close(diffusion_map(lb, 0.1, dim=3), scaled[:, :3])
+    distance = diffusion_distance(lb, [5, 7], 0.1, k=20)
+    expected = (scaled[:, None] - scaled[[5, 7]]).norm(dim=-1)
+    torch.testing.assert_close(distance, expected)
+    assert distance[5, 0] == 0
+
+
+def test_maps_of_a_batch_are_those_of_its_shapes():
+    shapes = [
+        LaplaceBeltrami.from_mesh(*UnitDisk().mesh(80), condition=condition)
+        for condition in ("dirichlet", "neumann")
+    ]
+    alone = torch.cat([diffusion_map(lb, 0.1) for lb in shapes])
+    torch.testing.assert_close(diffusion_map(LaplaceBeltrami.batch(shapes), 0.1), alone)
+
+
+def test_times_are_one_or_several_and_not_negative(unchecked):
+    lb = stencil_of_cloud(Circle().points(40))
+    for signature in (heat_kernel_signature, wave_kernel_signature):
+        assert torch.equal(signature(lb, 0.1, k=9), signature(lb, torch.tensor([0.1]), k=9))
+    f = lb.points[:, 0]
+    assert spectral_wavelets(lb, f, 0.1, k=9).shape == (40, 2)
+    for wrong in (-0.1, [], [[0.1]], torch.nan):
+        for call in (
+            lambda t=wrong: heat_kernel_signature(lb, t, k=9),
+            lambda t=wrong: spectral_wavelets(lb, f, t, k=9),
+            lambda t=wrong: diffusion_map(lb, t),
+        ):
+            with pytest.raises(InputError, match="expected one finite number or more"):
+                call()
+    with pytest.raises(InputError, match="numbers of points"):
+        diffusion_distance(lb, [1.0], 0.1)
+
+
+def test_functions_and_coefficients_without_channels(unchecked):
+    lb = stencil_of_cloud(Torus().points(100))
+    for each in (lb, LaplaceBeltrami.batch([lb, lb])):
+        basis, f = each.eigenbasis(9), each.points[:, 0]
+        coefficients = basis.to_basis(f)
+        assert torch.equal(coefficients, basis.to_basis(f[:, None])[..., 0])
+        assert basis.from_basis(coefficients).shape == f.shape
+    with pytest.raises(InputError, match="N = 200"):
+        basis.to_basis(f[1:])
+    with pytest.raises(TypeError, match="as_tensor"):
+        spectral_wavelets(each, f.numpy(), 0.1, k=9)
+
+
 def test_spectral_convolution_is_its_formula():
     lb = stencil_of_cloud(Torus().points(300))
     layer = SpectralConv(3, 2, k=20, num_filters=2).double()

@@ -101,19 +101,28 @@ class Eigenbasis:
         symmetric = {"is_symmetric": self.is_symmetric, "relative_errors": errors}
         return Eigenbasis(*cut, sizes=self.sizes, **symmetric)
 
-    def to_basis(self, f: Shaped[Tensor, "*B N C"]) -> Float[Tensor, "*S k C"]:
-        """Coefficients Φᵀ(πf), ΦᵀMf for a symmetric pair, (…, k, C), or (…, S, k, C) for a batch of shapes."""
-        if self.is_symmetric:
-            return self._analyse(self.left, f)
-        f = self._real(f)
-        return self._analyse(self.eigenvectors, self.mass.to(f.dtype)[:, None] * f)
+    def to_basis(
+        self, f: Shaped[Tensor, "*B N C"] | Shaped[Tensor, " N"]
+    ) -> Float[Tensor, "*S k C"] | Float[Tensor, "*S k"]:
+        """Coefficients Φᵀ(πf), ΦᵀMf for a symmetric pair, (…, k, C), or (…, S, k, C) for a batch of shapes.
 
-    def to_basis_obliquely(self, f: Shaped[Tensor, "*B N C"]) -> Float[Tensor, "*S k C"]:
+        (k,), or (S, k), for f (N,); InputError for another number of points.
+        """
+        functionals = self.left if self.is_symmetric else self.mass[:, None] * self.eigenvectors
+        return self._analyse(functionals, f)
+
+    def to_basis_obliquely(
+        self, f: Shaped[Tensor, "*B N C"] | Shaped[Tensor, " N"]
+    ) -> Float[Tensor, "*S k C"] | Float[Tensor, "*S k"]:
         """Coefficients Wᵀf: zero on every left-over eigenvector of Δ, which Φᵀ(πf) is not."""
         return self._analyse(self.left, f)
 
-    def from_basis(self, coefficients: Float[Tensor, "*S k C"]) -> Float[Tensor, "*B N C"]:
-        """The function Φc with the given coefficients, (…, N, C)."""
+    def from_basis(
+        self, coefficients: Float[Tensor, "*S k C"] | Float[Tensor, "*S k"]
+    ) -> Float[Tensor, "*B N C"] | Float[Tensor, " N"]:
+        """The function Φc with the given coefficients, (…, N, C), or (N,) for (k,) or (S, k)."""
+        if coefficients.ndim == self.eigenvalues.ndim:
+            return self.from_basis(coefficients[..., None])[..., 0]
         return self.synthesise(self.eigenvectors, coefficients)
 
     def synthesise(
@@ -126,12 +135,17 @@ class Eigenbasis:
         parts = zip(functions.split(self.sizes), coefficients.unbind(-3), strict=True)
         return torch.cat([block @ c for block, c in parts], dim=-2)
 
-    def _real(self, f: Tensor) -> Tensor:
-        """Integers and masks in the type of the basis."""
-        return f if f.is_floating_point() or f.is_complex() else f.to(self.eigenvectors.dtype)
-
     def _analyse(self, functionals: Tensor, f: Tensor) -> Tensor:
-        f = self._real(f)
+        """Of integers and masks, too, in the type of the basis."""
+        if not isinstance(f, Tensor):
+            raise TypeError(f"expected f as a tensor, got {type(f)}; torch.as_tensor(f) makes one")
+        if f.ndim == 1:
+            return self._analyse(functionals, f[:, None])[..., 0]
+        if f.shape[-2:-1] != self.mass.shape:
+            raise InputError(
+                f"expected f of shape (N,) or (…, N, C) with N = {len(self.mass)}, got {tuple(f.shape)}"
+            )
+        f = f if f.is_floating_point() or f.is_complex() else f.to(functionals.dtype)
         functionals = functionals.to(f.dtype)
         if self.sizes is None:
             return functionals.mT @ f

@@ -7,6 +7,8 @@ shapes gives what its shapes give one by one.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
+from typing import Any
 
 import torch
 from jaxtyping import Float, Int, Shaped
@@ -42,9 +44,19 @@ def _log_space(start: Tensor, end: Tensor, count: int) -> Tensor:
     return torch.exp(start.log() * (1 - fraction) + end.log() * fraction)
 
 
+def _numbers(name: str, given: Any, values: Tensor, least: float = 0.0) -> Float[Tensor, " T"]:
+    """One number or a list of them, in the type of the eigenvalues; InputError unless each is at least `least`."""
+    found = torch.as_tensor(given).to(values)
+    if found.ndim > 1 or not found.numel() or not bool(((found >= least) & found.isfinite()).all()):
+        raise InputError(
+            f"{name}: expected one finite number or more, none below {least:g}, got {given!r}"
+        )
+    return found.reshape(-1)
+
+
 def heat_kernel_signature(
     lb: Spectral,
-    times: Float[Tensor, " T"] | None = None,
+    times: Float[Tensor, " T"] | Sequence[float] | float | None = None,
     *,
     count: int = 16,
     k: int = 128,
@@ -70,14 +82,15 @@ def heat_kernel_signature(
     if times is None:
         bound = 4 * math.log(10)
         times = _log_space(bound / values[..., -1:], bound / _first_positive(basis), count)
-    times = torch.as_tensor(times).to(values)
+    else:
+        times = _numbers("times", times, values)
     decay = torch.exp(-values[..., :, None] * times[..., None, :])
     return basis.synthesise(basis.eigenvectors**2, decay)
 
 
 def wave_kernel_signature(
     lb: Spectral,
-    energies: Float[Tensor, " T"] | None = None,
+    energies: Float[Tensor, " T"] | Sequence[float] | float | None = None,
     *,
     count: int = 16,
     k: int = 128,
@@ -101,9 +114,10 @@ def wave_kernel_signature(
         fraction = torch.linspace(0, 1, count, dtype=values.dtype, device=values.device)
         start, end = low + 2 * sigma, high - 2 * sigma
         energies = start * (1 - fraction) + end * fraction
+    else:
+        energies = _numbers("energies", energies, values, -torch.inf)
     positive = (values > 0) & _present(basis)
     logs = torch.where(positive, values, values.new_ones(())).log()
-    energies = torch.as_tensor(energies).to(values)
     exponent = -(((energies[..., None, :] - logs[..., :, None]) / sigma[..., None]) ** 2) / 2
     weights = torch.where(positive[..., :, None], exponent, -torch.inf).softmax(dim=-2)
     return basis.synthesise(basis.eigenvectors**2, weights)
@@ -112,7 +126,7 @@ def wave_kernel_signature(
 def spectral_wavelets(
     lb: Spectral,
     f: Shaped[Tensor, "N C"] | Shaped[Tensor, " N"],
-    scales: Float[Tensor, " T"],
+    scales: Float[Tensor, " T"] | Sequence[float] | float,
     *,
     k: int = 128,
 ) -> Float[Tensor, "N T_plus_1 *C"]:
@@ -126,11 +140,11 @@ def spectral_wavelets(
     ----------
     scales : s, ℓ²; a band sits at the eigenvalue 1/s.
     """
-    if f.ndim == 1:
+    if isinstance(f, Tensor) and f.ndim == 1:
         return spectral_wavelets(lb, f[:, None], scales, k=k)[..., 0]
     basis = lb.eigenbasis(k)
-    scales = torch.as_tensor(scales).to(basis.eigenvalues)
-    gains = _wavelet_gains(basis.eigenvalues, scales)
+    values = basis.eigenvalues
+    gains = _wavelet_gains(values, _numbers("scales", scales, values))
     coefficients = basis.to_basis(f)
     parts = [
         basis.from_basis(g[..., None] * coefficients)
@@ -155,17 +169,20 @@ def diffusion_map(
 ) -> Float[Tensor, "N dim"]:
     """Coordinates e^{−λ_k t} φ_k(x) in which distances are diffusion distances (Coifman, Lafon 2006); ℓ^{−d/2}.
 
-    The constants are left out: the coordinates are those of k = 1, …, dim. `k` at least dim + 1 may be given to share
-    a basis. The time is in ℓ². On a cloud of any ambient dimension this is its diffusion map.
+    The constants, of λ_0 = 0, are left out; a shape with a Dirichlet condition has none. `k` at least dim + 1 may be
+    given to share a basis. The time is in ℓ². On a cloud of any ambient dimension this is its diffusion map.
     """
-    basis = lb.eigenbasis(max(dim + 1, k or 0)).truncate(dim + 1)
-    decay = torch.exp(-basis.eigenvalues * time)
-    columns = torch.diag_embed(decay)[..., 1:]
+    basis = lb.eigenbasis(max(dim + 1, k or 0))
+    values = basis.eigenvalues
+    decay = torch.exp(-values * _numbers("time", time, values))
+    chosen = torch.arange(min(dim, values.shape[-1] - 1), device=values.device)
+    chosen = chosen + (values[..., :1] == 0).long()
+    columns = torch.nn.functional.one_hot(chosen, values.shape[-1]).mT * decay[..., None]
     return basis.from_basis(columns)
 
 
 def diffusion_distance(
-    lb: Spectral, sources: Int[Tensor, " S"], time: float, *, k: int = 128
+    lb: Spectral, sources: Int[Tensor, " S"] | Sequence[int], time: float, *, k: int = 128
 ) -> Float[Tensor, "N S"]:
     """Diffusion distance of every point to each source: (Σ_k e^{−2λ_k t}(φ_k(x) − φ_k(y))²)^{1/2}, ℓ^{−d/2}.
 
@@ -175,9 +192,14 @@ def diffusion_distance(
     if lb.sizes is not None:
         raise InputError("diffusion_distance: got a batch; ask each shape by itself")
     index = torch.as_tensor(sources)
-    if index.ndim != 1 or bool(((index < 0) | (index >= lb.num_points)).any()):
+    whole = not (index.is_floating_point() or index.is_complex() or index.dtype == torch.bool)
+    if index.ndim != 1 or not whole or bool(((index < 0) | (index >= lb.num_points)).any()):
         raise InputError(
             f"sources: expected numbers of points from 0 to {lb.num_points - 1}, in a list or tensor, got {sources!r}"
         )
-    coordinates = diffusion_map(lb, time, dim=min(k, lb.num_points) - 1, k=k)
-    return torch.cdist(coordinates, coordinates[index])
+    basis = lb.eigenbasis(k)
+    values = basis.eigenvalues
+    coordinates = basis.eigenvectors * torch.exp(-values * _numbers("time", time, values))
+    # By the matrix product a point would have a distance from itself.
+    mode = "donot_use_mm_for_euclid_dist"
+    return torch.cdist(coordinates, coordinates[index.long()], compute_mode=mode)
