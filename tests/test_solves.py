@@ -5,6 +5,7 @@ import functools
 import gc
 import pickle
 
+import numpy as np
 import pytest
 import torch
 from torch.autograd import gradcheck
@@ -20,6 +21,7 @@ from torchlb import (
 )
 from torchlb.linalg.conjugate_gradients import conjugate_gradients
 from torchlb.nn import systems
+from torchlb.nn.pair_flow import _coefficients
 from torchlb.surfaces import Ellipsoid, Sphere, StarShaped, Torus, UnitDisk
 
 
@@ -368,6 +370,26 @@ def test_data_that_cannot_be(name, data, message):
     ):
         with pytest.raises(InputError, match=message):
             solve()
+
+
+@pytest.mark.parametrize("tolerance", [-1.0, 0.0, 2.0, float("nan")])
+def test_tolerances_that_cannot_be(tolerance):
+    lb = BUILDERS["cotangent"]()
+    for solve in (
+        lambda: implicit_step(lb, rough(lb), 0.1, tolerance=tolerance),
+        lambda: poisson_solve(lb, rough(lb), tolerance=tolerance),
+        lambda: heat_flow(lb, rough(lb), 0.1, tolerance=tolerance),
+        lambda: lb.eigenbasis(5, tolerance=tolerance),
+    ):
+        with pytest.raises(InputError, match="tolerance: expected a number between 0 and 1"):
+            solve()
+
+
+@pytest.mark.parametrize("ratio", [5.0, 20.0, 50.0])
+def test_a_series_has_few_terms_to_any_tolerance(ratio):
+    """Rounding of coefficients is no term."""
+    coefficients, _ = _coefficients(ratio, 1e-13)
+    assert np.count_nonzero(coefficients) < 60
 
 
 def test_features_of_another_shape():

@@ -23,6 +23,7 @@ from torchlb.linalg.exponential import heat
 from torchlb.linalg.sparse import compute_dtype
 from torchlb.nn.checks import as_columns, as_times, check_choice, check_features
 from torchlb.nn.pair_flow import pair_flow
+from torchlb.operator.checks import check_tolerance
 from torchlb.operator.laplace_beltrami import LaplaceBeltrami
 from torchlb.spectral.eigenbasis import Eigenbasis
 
@@ -59,7 +60,8 @@ def heat_flow(
 
     Raises
     ------
-    InputError : for times that are negative or not finite, for an unknown method and a wrong shape.
+    InputError : for times that are negative or not finite, for an unknown method and a wrong shape, a tolerance that
+        is not between 0 and 1.
     DiffusionError : where the method cannot be used: a series of too many products or of no ellipse, a basis of
         dependent eigenvectors.
 
@@ -97,14 +99,8 @@ def checked_method(method: str) -> Method:
 def _flow(
     lb: LaplaceBeltrami, x: Tensor, time: Tensor, method: str, k: int, tolerance: float
 ) -> Tensor:
-    """e^{tΔ}x in the type of x, which is float32 or float64; autocast has to be off.
-
-    The surfaces of a stack (B, N, C) become channels.
-    """
-    if x.ndim == 3:
-        columns, times = x.transpose(0, 1).flatten(1), time.repeat(len(x))
-        y = _flow(lb, columns, times, method, k, tolerance)
-        return y.view(x.shape[1], x.shape[0], x.shape[2]).transpose(0, 1)
+    """e^{tΔ}x in the type of x, which is float32 or float64; autocast has to be off."""
+    check_tolerance(tolerance)
     if method == "spectral":
         return _spectral(lb.eigenbasis(k), x, time)
     if method == "deflated":

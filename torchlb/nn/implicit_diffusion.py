@@ -48,7 +48,9 @@ class ImplicitDiffusion(LearnedTimes):
         """The diffused features, of the shape and type of x: (N, C), or (B, N, C) on one surface."""
         dtype = check_features(x, lb, self.channels, self.raw_time)
         with torch.autocast(x.device.type, enabled=False):
-            tolerance = self.tolerance or (1e-10 if dtype == torch.float64 else 1e-5)
+            tolerance = self.tolerance
+            if tolerance is None:
+                tolerance = 1e-10 if dtype == torch.float64 else 1e-5
             y = implicit_step(lb, x.to(dtype), self.time.to(dtype), tolerance=tolerance)
         return y.to(x.dtype)
 

@@ -14,6 +14,7 @@ from torchlb.linalg.sparse import compute_dtype, symmetric_product
 from torchlb.nn.checks import as_columns, as_times, uncompiled
 from torchlb.nn.conduction import Conducting, conducting
 from torchlb.nn.systems import SINGLE, solve_columns
+from torchlb.operator.checks import check_tolerance
 from torchlb.operator.laplace_beltrami import LaplaceBeltrami
 
 TOLERANCE = 1e-10
@@ -46,12 +47,14 @@ def implicit_step(
         points count; 0 by default.
     flux : κ∂_ν u along the rest of the boundary, units of f by 1/ℓ, in the same way; 0 by default.
     conductivity : κ > 0 of u − t div(κ∇u) = f, of the vertices (N,), its logarithm prolonged as the surface is, or of
-        the faces (F,); 1 by default. On meshes, with the weak pair or the cotangent's; differentiable in it, too.
+        the faces (F,), if they are not as many; 1 by default. On meshes, with the weak pair or the cotangent's, of one
+        shape; differentiable in it, too.
     tolerance : of the solver, relative.
 
     Raises
     ------
-    InputError : for wrong shapes, times that are negative or not finite, data for a boundary that is not there.
+    InputError : for wrong shapes, times that are negative or not finite, data for a boundary that is not there, a
+        tolerance that is not between 0 and 1.
     DiffusionError : where the solver does not converge.
 
     Examples
@@ -63,6 +66,7 @@ def implicit_step(
     >>> bool((u - vertices[:, 2] / 2).abs().max() < 1e-4)
     True
     """
+    check_tolerance(tolerance)
     x = as_columns(f, lb)
     dtype = torch.float64 if tolerance < SINGLE else compute_dtype(x, lb.values)
     columns, time = _columns(x, as_times(t, x, torch.float64), dtype)
@@ -102,6 +106,7 @@ def poisson_solve(
     >>> bool((u - vertices[:, 2] / 2).abs().max() < 1e-4)
     True
     """
+    check_tolerance(tolerance)
     x = as_columns(f, lb)
     columns, _ = _columns(x, None)
     given, poured = (_data(lb, d, n, f) for d, n in ((boundary_values, 0), (flux, 1)))
@@ -134,6 +139,7 @@ def potential(
     source : (N, C) or (B, N, C), units of u by 1/ℓ²; its mean is taken off.
     tolerance : of the solve with the weak pair, relative; None for that of linear elements, which is second order.
     """
+    check_tolerance(tolerance)
     products = []
     if source is not None:
         products.append(_weights(lb, source)[:, None] * source)

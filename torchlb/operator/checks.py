@@ -263,6 +263,17 @@ def check_boundary(boundary: Any, num_points: int) -> Bool[Tensor, " N"] | str |
     return mask
 
 
+def check_tolerance(tolerance: float | None) -> None:
+    """InputError unless it is between 0 and 1, or None for a default.
+
+    >>> check_tolerance(0.0)
+    Traceback (most recent call last):
+    torchlb.errors.InputError: tolerance: expected a number between 0 and 1, got 0.0
+    """
+    if tolerance is not None and not 0 < tolerance < 1:
+        raise InputError(f"tolerance: expected a number between 0 and 1, got {tolerance}")
+
+
 def _check_integer(name: str, number: Any) -> None:
     try:
         operator.index(number)
