@@ -95,6 +95,19 @@ def test_derivatives_in_conductivity_data_and_time(kind, at):
     assert gradcheck(poisson, (kappa, f), fast_mode=True)
 
 
+def test_as_many_vertices_as_faces_are_vertices():
+    """κ = e^x on a grid of 12 points in 12 triangles, linear elements: its logarithm is linear in each."""
+    x, y = (
+        t.flatten() for t in torch.meshgrid(torch.arange(3.0), torch.arange(4.0), indexing="ij")
+    )
+    corner = torch.arange(8).view(2, 4)[:, :3].flatten()[:, None]
+    faces = torch.cat([corner + torch.tensor([0, 4, 5]), corner + torch.tensor([0, 5, 1])])
+    medium = Medium.linear(torch.stack([x, y, 0 * x], 1).double(), faces)
+    kappa = x.double().exp()
+    expected = (x.double()[faces] @ medium.element.values.T).exp()
+    torch.testing.assert_close(medium.at_gauss_points(kappa), expected)
+
+
 def test_elements_are_made_once():
     lb = build("mesh")
     assert medium_of(lb) is medium_of(lb)

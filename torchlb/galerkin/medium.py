@@ -67,11 +67,11 @@ class Medium:
         return Medium(faces, lengths, p, nodes, metric, self.element)
 
     def at_gauss_points(self, conductivity: Tensor) -> Float[Tensor, "F Q"]:
-        """κ there, differentiable: that of each face, or of the vertices (N,), whose logarithm is prolonged.
+        """κ there, differentiable: of the vertices (N,), whose logarithm is prolonged, or of each face, if F ≠ N.
 
         So it is positive, and of high order where the fits are.
         """
-        if len(conductivity) == len(self.faces):
+        if len(conductivity) != self.prolongation.shape[1]:
             return conductivity[:, None].expand(-1, len(self.element.weights))
         at_nodes = _prolonged(conductivity.log(), self.prolongation)
         return (at_nodes[self.nodes] @ self.element.values.T).exp()
