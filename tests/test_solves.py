@@ -230,6 +230,18 @@ def test_boundary_data_count_at_their_points_alone():
     torch.testing.assert_close(u, torch.ones_like(u))
 
 
+def test_a_flux_counts_where_it_comes_to_a_free_point():
+    """x³ − 3xy² + x on the disk, held at x < 0; the flux is not known inside, nor at x < −0.6."""
+    vertices, faces = UnitDisk().mesh(500)
+    x, y, _ = vertices.T
+    rim = x.square() + y.square() > 1 - 1e-9
+    lb = LaplaceBeltrami.from_mesh(vertices, faces, condition="dirichlet", boundary=rim & (x < 0))
+    u = x**3 - 3 * x * y**2 + x
+    flux = torch.where(rim & (x > -0.6), 3 * u - 2 * x, torch.nan)
+    found = poisson_solve(lb, 0 * x, boundary_values=u, flux=flux)
+    torch.testing.assert_close(found, u, rtol=0, atol=1e-4)
+
+
 def test_given_values_are_taken_at_the_boundary():
     lb = BUILDERS["dirichlet"]()
     given = rough(lb)

@@ -45,7 +45,8 @@ def implicit_step(
     t : time ≥ 0 in ℓ², one for all channels or (C,).
     boundary_values : u at the points of a Dirichlet condition, a number or of the shape of f, of which only those
         points count; 0 by default.
-    flux : κ∂_ν u along the rest of the boundary, units of f by 1/ℓ, in the same way; 0 by default.
+    flux : κ∂_ν u along the rest of the boundary, units of f by 1/ℓ, in the same way; 0 by default. Beside that rest it
+        counts at the next few points that are held, too, as the curve between points does: continue it to them smoothly.
     conductivity : κ > 0 of u − t div(κ∇u) = f, of the vertices (N,), its logarithm prolonged as the surface is, or of
         the faces (F,), if they are not as many; 1 by default. On meshes, with the weak pair or the cotangent's, of one
         shape; differentiable in it, too.
@@ -188,8 +189,8 @@ def _data(lb: LaplaceBeltrami, data: Tensor | float | None, kind: int, f: Tensor
     if not lb.has_weak_form:
         raise InputError(f"{name}: a stencil has no place for them; build from a triangle mesh")
     fixed = torch.zeros_like(lb.mass, dtype=torch.bool) if lb.fixed is None else lb.fixed
-    counts = _on_rim(lb) if kind == 1 else fixed
-    if not bool((counts & ~fixed if kind == 1 else counts).any()):
+    counts = _poured(lb, ~fixed) if kind == 1 else fixed
+    if not bool(counts.any()):
         raise InputError(f"{name}: {_missing(lb, kind)}")
     values = torch.as_tensor(data, dtype=torch.float64, device=f.device)
     try:
@@ -203,11 +204,12 @@ def _data(lb: LaplaceBeltrami, data: Tensor | float | None, kind: int, f: Tensor
     return torch.where(counts[:, None], columns, 0.0)
 
 
-def _on_rim(lb: LaplaceBeltrami) -> Tensor:
-    """(N,), which points an edge of the boundary touches."""
+def _poured(lb: LaplaceBeltrami, free: Tensor) -> Tensor:
+    """(N,), points of the boundary whose flux comes to a free point."""
     if len(lb.weak_values) < 3:
-        return torch.zeros_like(lb.mass, dtype=torch.bool)
-    return _product(lb, 2, torch.ones_like(lb.mass.double())[:, None])[:, 0] > 0
+        return torch.zeros_like(free)
+    size = lb.weak_values[2].abs()
+    return symmetric_product(lb.weak_crow, lb.weak_col, size, free.to(size)[:, None])[:, 0] > 0
 
 
 def _missing(lb: LaplaceBeltrami, kind: int) -> str:
