@@ -10,7 +10,7 @@ import trimesh
 from scipy import linalg, sparse
 
 from torchlb import LaplaceBeltrami
-from torchlb.errors import EigenbasisError
+from torchlb.errors import EigenbasisError, InputError
 from torchlb.linalg.factor import cholesky
 from torchlb.linalg.lanczos import inverse, lanczos
 from torchlb.spectral import pencil
@@ -49,6 +49,25 @@ def test_a_factor_takes_unsorted_and_unsymmetric_matrices():
     torch.testing.assert_close(cholesky(flipped).solve(b), solution)
     upper = sparse.triu(matrix)
     torch.testing.assert_close(torch.from_numpy(upper @ cholesky(upper).solve(b).numpy()), b)
+
+
+def test_a_symmetric_matrix_that_is_indefinite_is_solved_to_rounding():
+    """Of a Poisson problem bordered by the mass, whose last diagonal entry is zero."""
+    lb = LaplaceBeltrami.from_cotangent(*Ellipsoid().mesh(200))
+    stiffness, mass = (m.to_dense().numpy() for m in (lb.stiffness, lb.mass_matrix))
+    area = mass.sum(0)[:, None]
+    bordered = np.block([[stiffness, area], [area.T, np.zeros((1, 1))]])
+    b = torch.randn(201, 2, dtype=torch.float64)
+    x = cholesky(bordered).solve(b)
+    torch.testing.assert_close(torch.from_numpy(bordered) @ x, b, rtol=0, atol=1e-10)
+
+
+def test_complex_systems_are_refused(unchecked):
+    """And not solved for their real part."""
+    matrix, b = path_matrix(30, 1.0), torch.ones(30, dtype=torch.complex128)
+    for call in (lambda: cholesky(1j * matrix), lambda: cholesky(matrix).solve(b)):
+        with pytest.raises(InputError, match="expected real numbers"):
+            call()
 
 
 def test_a_factor_does_without_cholespy(monkeypatch):

@@ -11,6 +11,8 @@ from scipy import sparse
 from scipy.sparse.linalg import SuperLU, splu
 from torch import Tensor
 
+from torchlb.errors import InputError
+
 COLUMNS = {"cpu": 16, "cuda": 128}
 """Right-hand sides that cholespy takes at once: on the CPU a fifth of the time is saved, on CUDA it takes no more."""
 SYMMETRY = 1e-12
@@ -32,11 +34,22 @@ def cholesky(matrix: Any) -> Factor:
 
     By CHOLMOD (`cholespy`), 2.5 times faster than SuperLU and 6 times in the solves. SuperLU takes over where cholespy
     is not installed or the matrix is not symmetric and positive definite; it raises RuntimeError if it is singular.
+    InputError for a complex matrix or right-hand side.
 
     >>> cholesky(sparse.diags_array([2.0, 4.0])).solve(torch.tensor([2.0, 2.0]))
     tensor([1.0000, 0.5000])
     """
+    matrix = sparse.csr_array(matrix)
+    _check_real("matrix", np.iscomplexobj(matrix.data))
     return Factor(sparse.csr_array(matrix, dtype=np.float64))
+
+
+def _check_real(name: str, is_complex: bool) -> None:
+    if is_complex:
+        raise InputError(
+            f"{name}: expected real numbers, got complex ones; scipy.sparse.linalg.splu factors complex matrices, and "
+            "torch.view_as_real(b) makes real columns of a right-hand side"
+        )
 
 
 class Factor:
@@ -50,12 +63,13 @@ class Factor:
     def __init__(self, matrix: sparse.csr_array) -> None:
         self._matrix, self._solvers = matrix, {}
         skew = abs(matrix - matrix.T)
-        self._symmetric = skew.nnz == 0 or skew.max() <= SYMMETRY * abs(matrix).max()
-        self.is_cholesky = self._symmetric and bool((matrix.diagonal() > 0).all())
+        symmetric = skew.nnz == 0 or skew.max() <= SYMMETRY * abs(matrix).max()
+        self.is_cholesky = symmetric and bool((matrix.diagonal() > 0).all())
         self._solver(torch.device("cpu"))
 
     def solve(self, b: Float[Tensor, "N ..."]) -> Float[Tensor, "N ..."]:
         """A⁻¹b, (N,) or (N, C), in the type and on the device of b; without derivatives."""
+        _check_real("b", b.is_complex())
         solver, most = self._solver(b.device), COLUMNS.get(b.device.type, 1)
         if isinstance(solver, SuperLU):
             return torch.from_numpy(solver.solve(b.detach().double().cpu().numpy())).to(b)
@@ -79,7 +93,7 @@ class Factor:
                 return _cholespy(self._matrix, device)
         except (ImportError, ValueError):  # not there; not positive definite
             self.is_cholesky = False
-        return factorized(sparse.csc_array(self._matrix), 0.0 if self._symmetric else 1e-1)
+        return factorized(sparse.csc_array(self._matrix), 1e-1)
 
 
 def _cholespy(matrix: sparse.csr_array, device: torch.device) -> Any:
