@@ -210,6 +210,8 @@ def test_second_derivatives_are_an_error(solve):
             slope.sum().backward(retain_graph=True)
     with pytest.raises(RuntimeError, match="differentiable once"):
         torch.autograd.functional.hessian(lambda s: solve(lb, s * x.detach(), 0.1).pow(2).sum(), t)
+    with pytest.raises(RuntimeError, match="linear: the derivative in a direction"):
+        torch.autograd.functional.jvp(lambda f: solve(lb, f, 0.1), x.detach(), x.detach())
 
 
 @pytest.mark.parametrize("solve", [implicit_step, heat_flow])
