@@ -46,7 +46,7 @@ def implicit_step(
     boundary_values : u at the points of a Dirichlet condition, a number or of the shape of f, of which only those
         points count; 0 by default.
     flux : κ∂_ν u along the rest of the boundary, units of f by 1/ℓ, in the same way; 0 by default. Beside that rest it
-        counts at the next few points that are held, too, as the curve between points does: continue it to them smoothly.
+        counts at the next few held points, too, as the curve between points does: continue it smoothly to them.
     conductivity : κ > 0 of u − t div(κ∇u) = f, of the vertices (N,), its logarithm prolonged as the surface is, or of
         the faces (F,), if they are not as many; 1 by default. On meshes, with the weak pair or the cotangent's, of one
         shape; differentiable in it, too.
