@@ -1,7 +1,7 @@
 """Training with PyTorch Geometric: its DataLoader batches shapes of different sizes, and their operators with them.
 
 Usage: python examples/train_pyg.py [--output gallery_output] [--points 400] [--epochs 20]
-Needs `pip install torchlb[pyg]`. DiffusionNet learns from heat kernel signatures which vertices are more curved than
+Needs `pip install ".[pyg]"`. DiffusionNet learns from heat kernel signatures which vertices are more curved than
 the others of their shape, however it is turned and meshed.
 """
 
@@ -38,7 +38,7 @@ def main(arguments=None):
 
         from torchlb.interop.pyg import LaplaceBeltramiTransform, to_operator
     except ImportError:
-        sys.exit("PyTorch Geometric is not installed: pip install torchlb[pyg]")
+        sys.exit('PyTorch Geometric is not installed: pip install ".[pyg]"')
     torch.manual_seed(0)
     transform, shapes = LaplaceBeltramiTransform(order=3, k=K), []
     for i in tqdm(range(6), "shapes"):

@@ -281,5 +281,5 @@ def test_without_matplotlib_the_error_says_what_to_install(sphere, monkeypatch):
         return real(name, *args, **kwargs)
 
     monkeypatch.setattr(builtins, "__import__", without)
-    with pytest.raises(ImportError, match=r"pip install torchlb\[plot\]"):
+    with pytest.raises(ImportError, match=r'pip install "\.\[plot\]"'):
         plot_surface(vertices, faces, vertices[:, 0])

@@ -139,7 +139,7 @@ def compare(mesh: Path, k: int, out: Path | None, clean: bool, **options: Any) -
     try:
         draw_comparison(lb, faces, values, out, f"{mesh.name}, order {options['order']} requested")
     except ImportError as error:
-        click.echo(f"no picture: {error}; pip install 'torchlb[plot]'", err=True)
+        click.echo(f'no picture: {error}; pip install ".[plot]" in a clone', err=True)
     else:
         click.echo(f"\n{out}")
 

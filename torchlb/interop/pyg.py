@@ -1,4 +1,4 @@
-"""PyTorch Geometric (`pip install torchlb[pyg]`): operators as keys of its `Data`, which its loaders batch.
+"""PyTorch Geometric (`pip install ".[pyg]"` in a clone): operators as keys of its `Data`, which its loaders batch.
 
 Shapes get theirs once, then loaders batch them::
 

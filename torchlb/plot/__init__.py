@@ -1,4 +1,4 @@
-"""Pictures with matplotlib (`pip install torchlb[plot]`).
+"""Pictures with matplotlib (`pip install ".[plot]"` in a clone).
 
 `figures`: scalars, vectors, orders on a surface or cloud; convergence. `drawing`: the painter's algorithm behind them.
 `comparison`: an operator beside the cotangent one, as a table and a picture.

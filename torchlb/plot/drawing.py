@@ -31,7 +31,7 @@ def axes_of(ax: Any) -> Any:
     try:
         import matplotlib as mpl  # noqa: F401
     except ImportError as error:
-        raise ImportError("pictures need matplotlib: pip install torchlb[plot]") from error
+        raise ImportError('pictures need matplotlib: pip install ".[plot]" in a clone') from error
     if ax is not None:
         return ax
     import matplotlib.pyplot as plt
