@@ -11,8 +11,10 @@ import matplotlib.pyplot as plt
 import numpy as np
 import torch
 
+from torchlb.plot.figures import LINE_COLORS
 from torchlb.surfaces import StarShaped, limit_surface
 
+mpl.rcParams["axes.prop_cycle"] = mpl.cycler(color=LINE_COLORS)
 # Elevation and azimuth of an eye that sees the outer side of a left hemisphere.
 LEFT = (15.0, 200.0)
 

@@ -48,6 +48,7 @@ def main(arguments=None):
         plot_surface(vertices, faces, error, ax=axes[name], title=name, **scale)
     plot_convergence(sizes, table, ax=axes["table"], title="Δf of a smooth f")
     figure.suptitle(f"|error of Δf| / root mean square of Δf, {len(f):,} vertices")
+    figure.get_layout_engine().set(h_pad=0.12)
     save(figure, options.output, "cotangent_vs_orders.png")
 
 

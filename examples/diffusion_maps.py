@@ -62,6 +62,9 @@ def main(arguments=None):
     plot_points(coordinates, flat[:, 0], ax=axes[1], title="the diffusion map", **label)
     label["label"] = "place across the sheet"
     plot_points(coordinates, flat[:, 1], ax=axes[2], title="the diffusion map", **label)
+    for ax in axes[1:]:
+        ax.set(frame_on=False, xlabel="φ₁", ylabel="φ₂", xticks=[], yticks=[])
+        ax.set_axis_on()
     save(figure, options.output, "diffusion_maps.png")
 
 

@@ -66,7 +66,7 @@ def main(arguments=None):
         ]
         print(f"{method:>17}" + "".join(f"{error:10.1e}" for error in errors))
         off = (spots(coarse[0], found[0]) - before).abs().clamp_min(1e-6).log10()
-        title = f"{method}: error of the start; of the time {100 * errors[1]:.2g} %"
+        title = f"error of the start, {method} (time off by {100 * errors[1]:.2g} %)"
         scale = {"limits": (-4.5, -2.0), "label": "log₁₀", "cmap": "magma"}
         plot_surface(*coarse, off, ax=ax, title=title, view=LEFT, **scale)
     save(figure, options.output, "find_heat_source.png")

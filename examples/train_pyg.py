@@ -41,7 +41,7 @@ def main(arguments=None):
         sys.exit('PyTorch Geometric is not installed: pip install ".[pyg]"')
     torch.manual_seed(0)
     transform, shapes = LaplaceBeltramiTransform(order=3, k=K), []
-    for i in tqdm(range(6), "shapes"):
+    for i in tqdm(range(6), "shapes", disable=None):
         vertices, faces = StarShaped(0.1 + 0.03 * i).mesh(options.points + 20 * i, seed=i)
         turn = torch.linalg.qr(torch.randn(3, 3))[0]
         pos = vertices.float() @ (turn * turn.det())
@@ -54,7 +54,7 @@ def main(arguments=None):
     net = DiffusionNet(test.x.shape[1], 1, method="spectral", **small)
     optimizer = torch.optim.Adam(net.parameters(), lr=5e-3)
     losses = []
-    for _ in tqdm(range(options.epochs), "epochs"):
+    for _ in tqdm(range(options.epochs), "epochs", disable=None):
         for batch in train:
             logits = net(batch.x, to_operator(batch))[:, 0]
             loss = binary_cross_entropy_with_logits(logits, batch.y)
@@ -69,6 +69,7 @@ def main(arguments=None):
 
     figure, axes = plt.subplots(1, 3, figsize=(14, 4), layout="constrained")
     axes[0].plot(losses)
+    axes[0].spines[["top", "right"]].set_visible(False)
     axes[0].set(xlabel="step", ylabel="loss", ylim=(0, None))
     panels = {"predicted probability of more curvature": predicted, "given": test.y}
     for ax, (title, values) in zip(axes[1:], panels.items(), strict=True):

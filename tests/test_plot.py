@@ -16,7 +16,7 @@ from torchlb.plot import (
     plot_surface,
     plot_vectors,
 )
-from torchlb.plot.comparison import draw_comparison, spectra
+from torchlb.plot.comparison import draw_comparison, plot_spectrum, spectra
 from torchlb.plot.figures import ORDER_COLORS
 from torchlb.surfaces import Sphere, smooth_function
 
@@ -225,6 +225,14 @@ def test_axes_that_are_given_leave_pyplot_alone(sphere, tmp_path, monkeypatch):
     assert (tmp_path / "a.png").read_bytes().startswith(b"\x89PNG")
 
 
+def test_a_spectrum_shows_how_far_the_others_are_in_per_cent_and_whole_numbers():
+    values = {"a": torch.tensor([0.0, 2.0, 4.0]), "b": torch.tensor([0.0, 2.1, 4.0])}
+    ax = plot_spectrum(values, (figure := Figure()).subplots())
+    [difference] = figure.axes[1].lines
+    assert np.allclose(difference.get_ydata(), [np.nan, 5.0, 0.0], equal_nan=True, atol=1e-4)
+    assert all(tick == round(tick) for tick in ax.get_xticks())
+
+
 @pytest.mark.parametrize(("dim", "expected"), [(2, "4.0"), (1, "2.0")])
 def test_measured_order_is_the_slope_against_the_spacing(dim, expected):
     sizes = [100, 400, 1600, 6400]
@@ -246,6 +254,8 @@ def test_reference_lines_have_whole_slopes_and_stay_inside():
         powers.append(-2 * (y[1] - y[0]) / (x[1] - x[0]))
         assert ax.get_ylim()[0] <= line.get_ydata()[1] * (1 + 1e-9)
     assert np.allclose(powers, [1, 4])
+    (left, right), (low, high) = ax.get_xlim(), ax.get_ylim()
+    assert all(left < x < right and low < y < high for x, y in (name.xy for name in ax.texts))
 
 
 def test_what_does_not_fit_is_refused(sphere):

@@ -41,13 +41,28 @@ def spectrum_table(values: Mapping[str, Float[Tensor, " k"]]) -> str:
 
 
 def plot_spectrum(values: Mapping[str, Float[Tensor, " k"]], ax: Any) -> Any:
-    """Eigenvalues against their number, a line for each operator, on given matplotlib axes, which are returned."""
-    for i, (name, line) in enumerate(values.items()):
-        style = {"color": LINE_COLORS[2 - 2 * i], "marker": MARKERS[i], "markersize": 4}
-        ax.plot(range(len(line)), line.numpy(), label=name, linewidth=1, **style)
-    ax.set(xlabel="number k", ylabel="eigenvalue of −Δ, 1/length²", title="spectrum")
+    """Eigenvalues of the first operator against their number, on given matplotlib axes, which are returned.
+
+    At the right how far those of the others are from them, in per cent, as in the table.
+    """
+    from matplotlib.ticker import MaxNLocator
+
+    (name, first), *others = values.items()
+    style = {"marker": MARKERS[0], "markersize": 4, "linewidth": 1}
+    ax.plot(first.numpy(), color=LINE_COLORS[2], **style)
+    ax.set(xlabel="number k", ylabel=f"eigenvalue of −Δ, {name}, 1/length²", title="spectrum")
+    ax.yaxis.label.set_color(LINE_COLORS[2])
+    ax.xaxis.set_major_locator(MaxNLocator(integer=True))
     ax.spines[["top", "right"]].set_visible(False)
-    ax.legend(frameon=False)
+    for name, line in others:
+        right = ax.twinx()
+        right.plot(
+            100 * (line / first.where(first > 0, torch.nan) - 1).numpy(),
+            color=LINE_COLORS[0],
+            **style,
+        )
+        right.set_ylabel(f"{name}, difference in %", color=LINE_COLORS[0])
+        right.spines[["top", "left"]].set_visible(False)
     return ax
 
 

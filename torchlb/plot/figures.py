@@ -267,7 +267,7 @@ def plot_convergence(
 
 
 def _references(ax: Any, sizes: Sequence[int], orders: list[float], dim: int) -> None:
-    """A grey fan of the whole powers of h near the measured ones, from the largest error on, named at its ends."""
+    """A grey fan of the whole powers of h near the measured ones, from the largest error on, each with its name."""
     drawn = [y for line in ax.lines for y in line.get_ydata()]
     if not drawn:
         raise InputError("errors: expected some that are positive, got none")
@@ -278,6 +278,7 @@ def _references(ax: Any, sizes: Sequence[int], orders: list[float], dim: int) ->
         fall = (end / first) ** (-power / dim)
         ax.loglog([first, end], [high, high * fall], color="0.75", lw=1, ls="--", zorder=0)
         name = "$h$" if power == 1 else f"$h^{{{power}}}$"
-        place = {"xytext": (4, 0), "textcoords": "offset points", "va": "center"}
-        ax.annotate(name, (end, high * fall), color="0.45", annotation_clip=False, **place)
+        at = (first * (end / first) ** 0.94, high * fall**0.94)
+        box = {"facecolor": ax.get_facecolor(), "edgecolor": "none", "pad": 1}
+        ax.annotate(name, at, color="0.45", ha="center", va="center", bbox=box, zorder=0)
     ax.set_ylim(low, 1.2 * high)
