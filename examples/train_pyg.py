@@ -69,7 +69,6 @@ def main(arguments=None):
 
     figure, axes = plt.subplots(1, 3, figsize=(14, 4), layout="constrained")
     axes[0].plot(losses)
-    axes[0].spines[["top", "right"]].set_visible(False)
     axes[0].set(xlabel="step", ylabel="loss", ylim=(0, None))
     panels = {"predicted probability of more curvature": predicted, "given": test.y}
     for ax, (title, values) in zip(axes[1:], panels.items(), strict=True):
