@@ -1,12 +1,14 @@
 """The boundary of a shape: which points lie on it, and the conormals there (`method.md`, section 6).
 
 The conormal ν at a boundary point is the unit tangent vector of the shape that leaves it at a right angle to the
-boundary. The boundary is itself a manifold of dimension d − 1, so its tangents come from the same fits.
+boundary. The boundary is itself a manifold of dimension d − 1, so its tangents come from the same fits; where that of a
+mesh has a crease, or a corner, ν is the mean of the outer normals around.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from math import cos, radians
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -31,6 +33,9 @@ OPEN_ANGLE, NEAREST = 2.3, 32
 """Radians of the tangent plane without any of so many nearest points that make a point of a cloud a boundary point.
 Of 16, two in a hundred random points leave as much open, of 32 none in a thousand."""
 
+SMOOTH = cos(radians(20))
+"""Where the mean of the outer normals around a boundary vertex is shorter there is a crease: two that are 40° apart."""
+
 
 @dataclass(frozen=True)
 class Boundary:
@@ -52,12 +57,18 @@ def boundary_faces(faces: Int[Tensor, "F v"]) -> Int[Tensor, "G w"]:
     >>> boundary_faces(torch.tensor([[0, 1, 2], [1, 3, 2]])).tolist()
     [[0, 1], [0, 2], [1, 3], [2, 3]]
     """
+    return _open_sides(faces)[0]
+
+
+def _open_sides(faces: Int[Tensor, "F v"]) -> tuple[Int[Tensor, "G w"], Int[Tensor, " G"]]:
+    """`boundary_faces`, and of each the corner of its face that lies opposite."""
     corners = faces.shape[1]
     sides = torch.cat(
         [faces[:, [c for c in range(corners) if c != left]] for left in range(corners)]
     )
+    opposite = faces.T.reshape(-1)
     if len(faces) == 0:
-        return sides
+        return sides, opposite
     sides = sides.sort(dim=1).values
     base = int(faces.max()) + 1
     key = sides[:, 0]
@@ -65,8 +76,8 @@ def boundary_faces(faces: Int[Tensor, "F v"]) -> Int[Tensor, "G w"]:
         key = key * base + column
     order = key.argsort(stable=True)
     _, count = torch.unique_consecutive(key[order], return_counts=True)
-    first = (count.cumsum(0) - count)[count == 1]
-    return sides[order[first]]
+    first = order[(count.cumsum(0) - count)[count == 1]]
+    return sides[first], opposite[first]
 
 
 def boundary_of_mesh(
@@ -79,7 +90,7 @@ def boundary_of_mesh(
 
     `degree` is that of the fits to the boundary's tangents.
     """
-    sides = boundary_faces(faces)
+    sides, opposite = _open_sides(faces)
     if len(sides) == 0:
         return None
     mask = torch.zeros(len(vertices), dtype=torch.bool)
@@ -92,7 +103,9 @@ def boundary_of_mesh(
         graph = mesh_graph(local, len(members))
         balls = GraphBalls(own, graph, mesh_frames(own, local))
         tangents = _refined_tangents(balls, degree)
-    return _with_conormals(vertices, frames, mask, tangents)
+    outward, size = _outward_sums(vertices, sides, opposite)
+    crease = outward.norm(dim=1) < SMOOTH * size
+    return _with_conormals(frames, mask, tangents, outward[members], crease[members])
 
 
 def boundary_of_cloud(
@@ -112,7 +125,12 @@ def boundary_of_cloud(
         initial = cloud_frames(own, candidates, dim)
         balls = GraphBalls(own, nearest_graph(own, initial, candidates), initial)
         tangents = _refined_tangents(balls, degree)
-    return _with_conormals(points, frames, mask, tangents)
+    inside = points[~mask] if not mask.all() else points
+    near = min(INSIDE, len(inside))
+    _, index = KDTree(inside.numpy()).query(own.numpy(), k=near)
+    nearest = inside[torch.from_numpy(index.reshape(len(members), near))]
+    outward = (own[:, None] - nearest).mean(1)
+    return _with_conormals(frames, mask, tangents, outward, crease=mask.new_zeros(len(members)))
 
 
 def detect_boundary(
@@ -137,23 +155,45 @@ def _refined_tangents(balls: GraphBalls, degree: int) -> Tensor:
     return refine_frames(balls, torch.arange(len(balls.points)), candidates)[0]
 
 
+def _outward_sums(
+    vertices: Float[Tensor, "N n"], sides: Int[Tensor, "G w"], opposite: Int[Tensor, " G"]
+) -> tuple[Float[Tensor, "N n"], Float[Tensor, " N"]]:
+    """Sums at every vertex over its boundary sides: of their outer normals, weighted by their sizes, and of these."""
+    corners = vertices[sides]
+    basis, triangle = torch.linalg.qr((corners[:, 1:] - corners[:, :1]).mT)
+    size = torch.diagonal(triangle, dim1=-2, dim2=-1).prod(-1).abs()
+    offset = (corners[:, 0] - vertices[opposite])[..., None]
+    height = (offset - basis @ (basis.mT @ offset))[..., 0]
+    normal = size[:, None] * _unit(height)
+    outward, total = torch.zeros_like(vertices), torch.zeros_like(vertices[:, 0])
+    for corner in sides.T:
+        outward.index_add_(0, corner, normal)
+        total.index_add_(0, corner, size)
+    return outward, total
+
+
 def _with_conormals(
-    points: Tensor, frames: Tensor, mask: Tensor, tangents: Float[Tensor, "b n d_minus_1"]
+    frames: Float[Tensor, "N n d"],
+    mask: Bool[Tensor, " N"],
+    tangents: Float[Tensor, "b n d_minus_1"],
+    outward: Float[Tensor, "b n"],
+    crease: Bool[Tensor, " b"],
 ) -> Boundary:
-    """ν = the direction of the shape's frame orthogonal to the boundary's, on the side away from the shape."""
-    members = mask.nonzero()[:, 0]
-    own = frames[members]
+    """ν = the direction of the frame orthogonal to the boundary's, on the side of `outward`; on a crease `outward`."""
+    own = frames[mask]
     if tangents.shape[-1] == 0:
         conormal = own[..., 0]
     else:
         along, _ = torch.linalg.qr(own.mT @ tangents)
         conormal = (own @ normals_of_frames(along)[..., None])[..., 0]
-    inside = points[~mask] if not mask.all() else points
-    near = min(INSIDE, len(inside))
-    _, index = KDTree(inside.numpy()).query(points[members].numpy(), k=near)
-    nearest = inside[torch.from_numpy(index.reshape(len(members), near))]
-    inward = (nearest - points[members, None]).mean(1)
-    side = (conormal * inward).sum(-1, keepdim=True)
-    conormals = torch.zeros_like(points)
-    conormals[members] = torch.where(side > 0, -conormal, conormal)
+    side = (conormal * outward).sum(-1, keepdim=True)
+    conormal = torch.where(side < 0, -conormal, conormal)
+    within = (own @ (own.mT @ outward[..., None]))[..., 0]
+    conormals = frames.new_zeros(frames.shape[:2])
+    conormals[mask] = torch.where(crease[:, None], _unit(within), conormal)
     return Boundary(mask, conormals)
+
+
+def _unit(vectors: Float[Tensor, "G n"]) -> Float[Tensor, "G n"]:
+    """Of length one; zero stays zero."""
+    return torch.nn.functional.normalize(vectors, dim=-1, eps=torch.finfo(vectors.dtype).tiny)
