@@ -190,6 +190,24 @@ def test_clean_points_is_the_remedy_that_the_error_names():
     assert kept.tolist() == list(range(100))
 
 
+@pytest.mark.parametrize(
+    ("faces", "message"), [(FACES.double(), "integers"), (FACES - 1, "outside 0 … 99")]
+)
+def test_cleaning_takes_what_the_operator_would(faces, message):
+    with pytest.raises(ValueError, match=message):
+        clean_mesh(VERTICES, faces)
+    with pytest.raises(ValueError, match="1 are NaN or infinite \\(3\\)"):
+        clean_points(spoiled(3, torch.nan))
+
+
+def test_cotangents_of_a_triangle_without_area_are_refused():
+    """A T-junction, closed by a triangle whose corners are on a line: its vertices have areas, from the others."""
+    vertices = torch.tensor([[0.0, 0], [1, 0], [2, 0], [1, 1], [1, -1]], dtype=torch.float64)
+    faces = torch.tensor([[0, 2, 3], [0, 1, 2], [0, 4, 1], [1, 4, 2]])
+    with pytest.raises(ValueError, match=r"3 vertices \(0, 1, 2\) have no area.*from_mesh"):
+        LaplaceBeltrami.from_cotangent(vertices, faces)
+
+
 def test_quads_are_named_and_split():
     """A quad mesh of a curved square: an error, and its triangles after `clean_mesh`."""
     flat, quads = grid(9)

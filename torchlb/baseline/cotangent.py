@@ -8,7 +8,7 @@ from jaxtyping import Float, Int
 from scipy import sparse
 from torch import Tensor
 
-from torchlb.errors import InputError
+from torchlb.errors import InputError, first_few
 from torchlb.linalg.sparse import with_diagonal
 
 
@@ -17,7 +17,7 @@ def cotangent_laplacian(
 ) -> tuple[sparse.csr_array, Float[Tensor, " N"]]:
     """libigl's cotangent matrix C (negative semidefinite, weak) and Voronoi mass, as (M⁻¹C, diagonal of M).
 
-    Units: 1/ℓ² and ℓ². Raises ValueError if a vertex has no area.
+    Units: 1/ℓ² and ℓ². InputError if a vertex has no area, or a triangle around it.
     """
     import igl
 
@@ -25,12 +25,13 @@ def cotangent_laplacian(
     corners = np.ascontiguousarray(faces.numpy().astype(np.int64))
     weak = sparse.csr_array(igl.cotmatrix(points, corners))
     area = igl.massmatrix(points, corners, igl.MASSMATRIX_TYPE_VORONOI).diagonal()
-    usable = area > 0  # False for NaN as well
+    usable = (area > 0) & np.isfinite(weak.sum(axis=1))  # False for NaN as well
     if not usable.all():
-        bad = np.flatnonzero(~usable)[:5].tolist()
+        bad = torch.from_numpy(np.flatnonzero(~usable))
         raise InputError(
-            f"cotangent operator: vertices {bad} have no area (all their triangles are degenerate); "
-            "remove or merge them, or use LaplaceBeltrami.from_mesh, which accepts degenerate triangles"
+            f"cotangent operator: {len(bad)} vertices ({first_few(bad)}) have no area, or are corners of triangles of "
+            "none, whose cotangents are infinite; remove these triangles, or use LaplaceBeltrami.from_mesh, which "
+            "accepts them"
         )
     return with_diagonal(sparse.csr_array(sparse.diags_array(1 / area) @ weak)), torch.from_numpy(
         area.copy()

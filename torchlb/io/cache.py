@@ -20,8 +20,8 @@ import torch
 from torch import Tensor
 
 from torchlb.errors import CacheWarning, InputError, OperatorFileError, warn
-from torchlb.operator.cleaning import ArrayLike, as_tensor, float_type
 from torchlb.operator.dispatch import Operator, build_operator, builder_of, complete_options
+from torchlb.operator.inputs import ArrayLike, as_tensor, float_type
 from torchlb.operator.laplace_beltrami import LaplaceBeltrami
 from torchlb.version import __version__
 

@@ -11,7 +11,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from torchlb.errors import InputError
-from torchlb.operator.cleaning import as_tensor
+from torchlb.operator.inputs import as_tensor
 
 SUFFIXES = (".glb", ".gltf", ".npy", ".npz", ".obj", ".off", ".ply", ".stl", ".xyz")
 """Of files that `read_shape` takes."""

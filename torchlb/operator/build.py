@@ -27,13 +27,12 @@ from torchlb.operator.checks import (
     check_faces,
     check_normals,
     check_options,
-    check_points,
     check_scale,
     check_spread,
     mended_faces,
 )
-from torchlb.operator.cleaning import ArrayLike
 from torchlb.operator.doubts import warn_of_doubts, warn_of_walls
+from torchlb.operator.inputs import ArrayLike, check_points
 from torchlb.stability.certificate import Certificate
 from torchlb.stability.enforce import certify
 from torchlb.stencils.assemble import Stencils, assemble

@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import operator
-from pathlib import Path
 from typing import Any
 
-import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
 from scipy.spatial import KDTree
@@ -15,14 +13,13 @@ from torch import Tensor
 from torchlb.errors import InputError, first_few, warn
 from torchlb.fits.polynomials import num_monomials
 from torchlb.operator.cleaning import (
-    ArrayLike,
     are_quads,
-    as_tensor,
     coincident,
     first_of_each,
     proper_faces,
     turned_faces,
 )
+from torchlb.operator.inputs import ArrayLike, check_corners, check_points
 
 MAX_EXTENT = 1e30
 """Largest extent of the points, and the inverse of the smallest, with which all that is called keeps its digits."""
@@ -32,37 +29,6 @@ ON_LINE = 1e-9
 """Spread of a cloud across its longest direction over that along it, below which it is a line."""
 FLAT = 1e-14
 """Squared sine of the angles of triangles that have no area."""
-
-
-def check_points(points: ArrayLike, what: str = "points") -> Float[Tensor, "N n"]:
-    """As (N, n) float64 on the CPU, detached; ValueError for a wrong shape or type, none at all, NaN or infinity."""
-    try:
-        points = as_tensor(points)
-    except (TypeError, ValueError, RuntimeError) as error:
-        hint = "; a mesh goes to from_trimesh" if hasattr(points, "faces") else ""
-        if isinstance(points, str | Path):
-            hint = "; trimesh.load_mesh reads a file, and from_trimesh takes what it gives"
-        raise InputError(
-            f"{what}: expected an (N, n) tensor or array, got {type(points)}{hint}"
-        ) from error
-    if points.ndim != 2:
-        raise InputError(f"{what}: expected shape (N, n), got {tuple(points.shape)}")
-    if len(points) == 0 or points.shape[1] == 0:
-        raise InputError(f"{what}: got none (shape {tuple(points.shape)})")
-    if len(points) < points.shape[1]:
-        raise InputError(
-            f"{what}: shape {tuple(points.shape)} is {len(points)} points in R^{points.shape[1]}, which have no "
-            f"manifold; if they are columns, pass {what}.T"
-        )
-    if points.is_complex() or points.dtype == torch.bool:
-        raise InputError(f"{what}: expected real numbers, got {points.dtype}")
-    points = points.detach().to("cpu", torch.float64, copy=True)  # it is kept
-    bad = (~points.isfinite()).any(1).nonzero()[:, 0]
-    if len(bad):
-        raise InputError(
-            f"{what}: {len(bad)} are NaN or infinite ({first_few(bad)}); remove or repair them"
-        )
-    return points
 
 
 def check_scale(points: Float[Tensor, "N n"]) -> None:
@@ -195,31 +161,8 @@ def mended_faces(vertices: Float[Tensor, "N n"], faces: Int[Tensor, "F v"]) -> I
 
 
 def check_faces(faces: ArrayLike, num_points: int) -> Int[Tensor, "F v"]:
-    """As (F, d + 1) int64 on the CPU; ValueError for wrong shapes, types, indices, or unreferenced vertices."""
-    try:
-        faces = as_tensor(faces if isinstance(faces, Tensor) else np.asarray(faces))
-    except (TypeError, ValueError, RuntimeError) as error:
-        raise InputError(f"faces: expected an (F, 3) tensor or array, got {type(faces)}") from error
-    if faces.ndim != 2 or faces.shape[1] not in (2, 3, 4):
-        raise InputError(
-            f"faces: expected shape (F, 3) (or (F, 2) segments, (F, 4) tetrahedra), got {tuple(faces.shape)}"
-        )
-    if len(faces) == 0:
-        raise InputError("faces: got none; use LaplaceBeltrami.from_points for a cloud")
-    if faces.is_floating_point() or faces.is_complex() or faces.dtype == torch.bool:
-        raise InputError(f"faces: expected integers, got {faces.dtype}")
-    faces = faces.detach().to("cpu", torch.int64)
-    bad = ((faces < 0) | (faces >= num_points)).any(1).nonzero()[:, 0]
-    if len(bad):
-        hint = (
-            "; they count from 1: subtract 1"
-            if faces.min() == 1 and faces.max() == num_points
-            else ""
-        )
-        raise InputError(
-            f"faces: {len(bad)} of them ({first_few(bad)}) have indices outside 0 … {num_points - 1}: "
-            f"face {int(bad[0])} is {faces[bad[0]].tolist()}{hint}"
-        )
+    """`check_corners`, and no face twice on a corner; ValueError for unreferenced vertices, too."""
+    faces = check_corners(faces, num_points)
     used = torch.zeros(num_points, dtype=torch.bool)
     used[proper_faces(faces).reshape(-1)] = True
     lost = (~used).nonzero()[:, 0]

@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import Any
-
 import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
@@ -12,24 +9,10 @@ from scipy.spatial import KDTree
 from torch import Tensor
 
 from torchlb.geometry.manifold import edges_of, two_orientations
+from torchlb.operator.inputs import ArrayLike, as_tensor, check_corners, check_points
 
-ArrayLike = Tensor | np.ndarray | Sequence[Any]
-"""What becomes a tensor."""
 COINCIDENT = 1e-12
 """Points closer than this share of the largest coordinate are one point: their difference is rounding."""
-
-
-def as_tensor(values: ArrayLike) -> Tensor:
-    """As `torch.as_tensor`, for arrays of any byte order and stride, too."""
-    if isinstance(values, np.ndarray):
-        values = np.ascontiguousarray(values, values.dtype.newbyteorder("="))
-    return torch.as_tensor(values)
-
-
-def float_type(values: ArrayLike) -> torch.dtype:
-    """Floating type of the input, and of what is computed from it; torch's default for integers."""
-    dtype = as_tensor(values).dtype
-    return dtype if dtype.is_floating_point else torch.get_default_dtype()
 
 
 def coincident(
@@ -64,8 +47,7 @@ def clean_points(points: ArrayLike) -> tuple[Tensor, Tensor]:
     >>> kept.tolist()
     [0, 1]
     """
-    points = as_tensor(points)
-    places = points.detach().cpu().double()
+    places, points = check_points(points), as_tensor(points)
     kept = torch.arange(len(points))
     while len(kept):
         _, other, twins = coincident(places[kept])
@@ -102,8 +84,8 @@ def clean_mesh(vertices: ArrayLike, faces: ArrayLike) -> tuple[Tensor, Tensor, T
     >>> faces.tolist(), kept.tolist()
     ([[0, 1, 2]], [0, 1, 3])
     """
-    vertices, faces = as_tensor(vertices), as_tensor(faces)
-    corners = faces.detach().cpu().long()
+    vertices = as_tensor(vertices)
+    corners, faces = check_corners(faces, len(vertices)), as_tensor(faces)
     places = vertices.detach().cpu().double()
     if corners.shape[1] == 4 and are_quads(corners):
         corners = _triangles(places, corners)

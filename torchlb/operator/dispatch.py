@@ -10,8 +10,8 @@ import numpy as np
 from torch import Tensor
 
 from torchlb.errors import InputError
-from torchlb.operator.checks import check_faces, check_points
-from torchlb.operator.cleaning import ArrayLike
+from torchlb.operator.checks import check_faces
+from torchlb.operator.inputs import ArrayLike, check_points
 from torchlb.operator.laplace_beltrami import LaplaceBeltrami
 
 Operator = Literal["stencil", "cotangent"]

@@ -18,7 +18,7 @@ from torchlb.operator.batching import (
     remember_shapes,
     split_buffers,
 )
-from torchlb.operator.cleaning import ArrayLike, float_type
+from torchlb.operator.inputs import ArrayLike, float_type
 from torchlb.operator.stencil_face import StencilFace
 from torchlb.operator.storage import FIT_FIELDS, REPORT_FIELDS
 from torchlb.operator.weak_face import WeakFace

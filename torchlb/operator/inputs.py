@@ -1,0 +1,90 @@
+"""Points and faces as they come, tensors or arrays or lists, as tensors; what is neither is refused."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from torchlb.errors import InputError, first_few
+
+ArrayLike = Tensor | np.ndarray | Sequence[Any]
+"""What becomes a tensor."""
+
+
+def as_tensor(values: ArrayLike) -> Tensor:
+    """As `torch.as_tensor`, for arrays of any byte order and stride, too."""
+    if isinstance(values, np.ndarray):
+        values = np.ascontiguousarray(values, values.dtype.newbyteorder("="))
+    return torch.as_tensor(values)
+
+
+def float_type(values: ArrayLike) -> torch.dtype:
+    """Floating type of the input, and of what is computed from it; torch's default for integers."""
+    dtype = as_tensor(values).dtype
+    return dtype if dtype.is_floating_point else torch.get_default_dtype()
+
+
+def check_points(points: ArrayLike, what: str = "points") -> Float[Tensor, "N n"]:
+    """As (N, n) float64 on the CPU, detached; ValueError for a wrong shape or type, none at all, NaN or infinity."""
+    try:
+        points = as_tensor(points)
+    except (TypeError, ValueError, RuntimeError) as error:
+        hint = "; a mesh goes to from_trimesh" if hasattr(points, "faces") else ""
+        if isinstance(points, str | Path):
+            hint = "; trimesh.load_mesh reads a file, and from_trimesh takes what it gives"
+        raise InputError(
+            f"{what}: expected an (N, n) tensor or array, got {type(points)}{hint}"
+        ) from error
+    if points.ndim != 2:
+        raise InputError(f"{what}: expected shape (N, n), got {tuple(points.shape)}")
+    if len(points) == 0 or points.shape[1] == 0:
+        raise InputError(f"{what}: got none (shape {tuple(points.shape)})")
+    if len(points) < points.shape[1]:
+        raise InputError(
+            f"{what}: shape {tuple(points.shape)} is {len(points)} points in R^{points.shape[1]}, which have no "
+            f"manifold; if they are columns, pass {what}.T"
+        )
+    if points.is_complex() or points.dtype == torch.bool:
+        raise InputError(f"{what}: expected real numbers, got {points.dtype}")
+    points = points.detach().to("cpu", torch.float64, copy=True)  # it is kept
+    bad = (~points.isfinite()).any(1).nonzero()[:, 0]
+    if len(bad):
+        raise InputError(
+            f"{what}: {len(bad)} are NaN or infinite ({first_few(bad)}); remove or repair them"
+        )
+    return points
+
+
+def check_corners(faces: ArrayLike, num_points: int) -> Int[Tensor, "F v"]:
+    """Faces as (F, d + 1) int64 on the CPU; ValueError for wrong shapes, types or indices."""
+    try:
+        faces = as_tensor(faces if isinstance(faces, Tensor) else np.asarray(faces))
+    except (TypeError, ValueError, RuntimeError) as error:
+        raise InputError(f"faces: expected an (F, 3) tensor or array, got {type(faces)}") from error
+    if faces.ndim != 2 or faces.shape[1] not in (2, 3, 4):
+        raise InputError(
+            f"faces: expected shape (F, 3) (or (F, 2) segments, (F, 4) tetrahedra), got {tuple(faces.shape)}"
+        )
+    if len(faces) == 0:
+        raise InputError("faces: got none; use LaplaceBeltrami.from_points for a cloud")
+    if faces.is_floating_point() or faces.is_complex() or faces.dtype == torch.bool:
+        raise InputError(f"faces: expected integers, got {faces.dtype}")
+    faces = faces.detach().to("cpu", torch.int64)
+    bad = ((faces < 0) | (faces >= num_points)).any(1).nonzero()[:, 0]
+    if len(bad):
+        hint = (
+            "; they count from 1: subtract 1"
+            if faces.min() == 1 and faces.max() == num_points
+            else ""
+        )
+        raise InputError(
+            f"faces: {len(bad)} of them ({first_few(bad)}) have indices outside 0 … {num_points - 1}: "
+            f"face {int(bad[0])} is {faces[bad[0]].tolist()}{hint}"
+        )
+    return faces
