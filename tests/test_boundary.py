@@ -16,7 +16,7 @@ from torchlb.geometry.frames import mesh_frames
 from torchlb.linalg.sparse import to_scipy
 from torchlb.stencils.assemble import Stencils, assemble
 from torchlb.stencils.conditions import Neumann
-from torchlb.stencils.shape import mesh_shape
+from torchlb.stencils.shape import cloud_shape, mesh_shape
 from torchlb.surfaces import Hemisphere, Sphere, Torus, UnitDisk
 
 
@@ -272,6 +272,18 @@ def test_a_boundary_may_be_a_few_points(count, condition):
     mask = (points - points[0]).norm(dim=1).argsort().argsort() < count
     lb = stencil_of_cloud(points, boundary=mask, condition=condition)
     assert lb.certificate.holds
+
+
+def test_low_order_rows_and_areas_of_a_square_in_four_dimensions():
+    """Five-point rows: Δx = 0 but at the ends of x; areas that are 1 in all, to an h² too much at the four corners."""
+    line, spacing = torch.linspace(0, 1, 9, dtype=torch.float64), 1 / 8
+    square = torch.cartesian_prod(line, line)
+    edge = (square == 0) | (square == 1)
+    shape = cloud_shape(torch.cat([square, 0 * square], 1), 2, 2, boundary=edge.any(1))
+    x = square[:, 0]
+    rows = shape.low_order.rows(torch.arange(81)[~edge[:, 0]])
+    assert abs(rows @ x.numpy()).max() < 1e-9 / spacing
+    assert abs(shape.areas.sum() - 1) < 1.1 * spacing**2
 
 
 def test_gradient_at_the_boundary_serves_any_function():

@@ -28,6 +28,10 @@ def all_of(coords):
     return torch.ones(coords.shape[:2], dtype=torch.bool)
 
 
+def own_laplacian(coords, valid):
+    return cell_laplacian(coords, valid, cell_volume(coords, valid))
+
+
 def scattered(batch=20, size=40):
     """Uniform points around 0, so many that the cell is closed."""
     return torch.rand(batch, size, 2, dtype=torch.float64) * 2 - 1
@@ -72,9 +76,9 @@ def test_invalid_neighbours_do_not_count():
     valid = all_of(coords)
     valid[0, 0] = False
     torch.testing.assert_close(cell_volume(coords, valid), cell_volume(SQUARE, all_of(SQUARE)))
-    weights = cell_laplacian(coords, valid)
+    weights = own_laplacian(coords, valid)
     assert weights[0, 0] == 0
-    torch.testing.assert_close(weights[:, 1:], cell_laplacian(SQUARE, all_of(SQUARE)))
+    torch.testing.assert_close(weights[:, 1:], own_laplacian(SQUARE, all_of(SQUARE)))
 
 
 @pytest.mark.parametrize(("coords", "count"), [(SQUARE, 4), (HEXAGONAL, 6), (LINE, 2), (CUBIC, 6)])
@@ -87,7 +91,7 @@ def test_natural_neighbours_of_a_lattice_are_the_nearest(coords, count):
 def test_lattices_have_their_classical_laplacians():
     """[1, 1, −4, 1, 1] / h² on squares, 2/3 (six neighbours) / h² on hexagons, [1, −2, 1] / h² on a line."""
     for coords, count, weight in ((SQUARE, 4, 1.0), (HEXAGONAL, 6, 2 / 3), (LINE, 2, 1.0)):
-        weights = cell_laplacian(coords, all_of(coords))[0]
+        weights = own_laplacian(coords, all_of(coords))[0]
         torch.testing.assert_close(
             weights[:count], torch.full((count,), weight).double(), rtol=1e-3, atol=0
         )
@@ -97,7 +101,7 @@ def test_lattices_have_their_classical_laplacians():
 def test_weights_of_a_scattered_cloud():
     """M-matrix: w ≥ 0; trace Σ w |y|² = 2d = 4; linear exactness Σ w y = 0, since the faces of a cell close."""
     coords = scattered()
-    weights = cell_laplacian(coords, all_of(coords))
+    weights = own_laplacian(coords, all_of(coords))
     assert (weights >= 0).all()
     square = coords.square().sum(-1)
     trace = (weights * square).sum(1)
@@ -112,7 +116,7 @@ def test_weights_of_a_scattered_cloud():
 @pytest.mark.parametrize("coords", [LINE, CUBIC], ids=["line", "cubic"])
 def test_trace_is_exact_in_other_dimensions(coords):
     """Σ w |y|² = 2d by the shares of the cell, which sum to one."""
-    weights = cell_laplacian(coords, all_of(coords))
+    weights = own_laplacian(coords, all_of(coords))
     trace = (weights * coords.square().sum(-1)).sum()
     torch.testing.assert_close(trace.item(), 2.0 * coords.shape[-1], **TOLERANCE[torch.float64])
 
@@ -120,7 +124,7 @@ def test_trace_is_exact_in_other_dimensions(coords):
 def test_a_point_without_a_closed_face_stays_joined():
     """Neighbours on one side only: some positive weight remains, and all are finite."""
     coords = torch.tensor([[[1.0, 0.0], [2.0, 0.0]]], dtype=torch.float64)
-    weights = cell_laplacian(coords, all_of(coords))
+    weights = own_laplacian(coords, all_of(coords))
     assert weights.isfinite().all()
     assert (weights >= 0).all()
     assert weights.sum() > 0

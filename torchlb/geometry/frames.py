@@ -52,12 +52,16 @@ def _principal_directions(
     planes: Float[Tensor, "N n d"] | Float[Tensor, "N n"] | None,
     dim: int,
 ) -> Float[Tensor, "B n d"]:
-    """Leading eigenvectors of the weighted covariance of the nearer half of those that `planes` admit."""
+    """Leading eigenvectors of the weighted covariance of the nearer half of those that `planes` admit.
+
+    Where these are too few for a plane, as where those around a corner stand across it, all count.
+    """
     offset = points[index] - points[index[:, :1]]
     distance = offset.norm(dim=-1)
     good = torch.ones_like(index, dtype=torch.bool)
     if planes is not None:
         good = admissible_neighbors(points, planes, index)
+        good |= good.sum(1, keepdim=True) <= dim
     near = good & (good.cumsum(1) <= (index.shape[1] + 1) // 2)
     reach = (distance * near).amax(1, keepdim=True).clamp_min(torch.finfo(distance.dtype).tiny)
     weight = window((distance / reach).clamp_max(1.1)) * near

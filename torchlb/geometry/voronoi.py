@@ -102,20 +102,21 @@ def cell_volume(
 
 
 def cell_laplacian(
-    coords: Float[Tensor, "B K d"], valid: Bool[Tensor, "B K"]
+    coords: Float[Tensor, "B K d"], valid: Bool[Tensor, "B K"], volume: Float[Tensor, " B"]
 ) -> Float[Tensor, "B K"]:
     r"""Finite-volume weights w_j ≥ 0 of Δf ≈ Σ_j w_j (f_j − f_i), 1/ℓ².
 
     .. math:: w_j = \frac{A_j}{V |y_j|} = \frac{2 d\, s_j}{|y_j|^2}
 
-    with A_j the face towards j, V the cell and s_j the share of V that lies before the face. An M-matrix row: stable,
-    with the right trace, though not consistent on uneven points. Open parts of the cell let no flux through.
+    with A_j the face towards j, V the `volume` of the cell and s_j the share of V that lies before the face. An
+    M-matrix row: stable, with the right trace, though not consistent on uneven points. Open parts of the cell let no
+    flux through.
     On surfaces the faces are exact, so that linear functions have Δ = 0 wherever the cell is closed.
     """
     square = coords.square().sum(-1).clamp_min(torch.finfo(coords.dtype).tiny)
     dim = coords.shape[-1]
     if dim == 2:
-        weights = _star_cotangents(coords, valid) / cell_volume(coords, valid)[:, None]
+        weights = _star_cotangents(coords, valid) / volume[:, None]
     else:
         directions = _directions(coords, valid)
         inverse, first = _inverse_radius(coords, valid, directions).max(dim=1)

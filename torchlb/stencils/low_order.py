@@ -151,7 +151,7 @@ class CloudLowOrder:
     def _one_sided(self, centers: Int[Tensor, " B"]) -> sparse.csr_array:
         """Rows as each point by itself would have them."""
         index, coords, valid = self._cells(centers)
-        flux = cell_laplacian(coords, valid)
+        flux = cell_laplacian(coords, valid, self._volumes[centers])
         weights = torch.cat([-flux.sum(1, keepdim=True), flux], dim=1)
         row = np.arange(len(centers)).repeat(index.shape[1])
         shape = (len(centers), len(self.balls.points))
