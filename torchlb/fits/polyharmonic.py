@@ -50,7 +50,7 @@ def polyharmonic_weights(
     )
     constant = functionals.new_zeros(1, functionals.shape[1])
     exact = torch.cat([constant, functionals]).expand(batch, -1, -1)
-    right = torch.cat([_kernel_derivatives(nodes, exponent, functionals.shape[1]), exact], dim=1)
+    right = torch.cat([_kernel_derivatives(nodes, exponent), exact], dim=1)
     factors, pivots, _ = torch.linalg.lu_factor_ex(matrix)
     weights = torch.linalg.lu_solve(factors, pivots, right)[:, :num_points]
     moments = values.mT @ weights[:, 1:]
@@ -61,20 +61,7 @@ def polyharmonic_weights(
     return _finish(weights, residual, radius, _condition(_inverse(r)), left, dim)
 
 
-def _kernel_derivatives(
-    nodes: Float[Tensor, "B K d"], s: int, count: int
-) -> Float[Tensor, "B K F"]:
-    """First, then second derivatives at y = 0 of |y − y_j|^s, s ≥ 5.
-
-    −s r^{s−2} y_c and s r^{s−2} δ_ab + s (s − 2) r^{s−4} y_a y_b.
-    """
-    dim = nodes.shape[-1]
-    r = nodes.norm(dim=-1)
-    columns = [-s * r ** (s - 2) * nodes[..., c] for c in range(dim)]
-    columns += [
-        s * (s - 2) * r ** (s - 4) * nodes[..., a] * nodes[..., b]
-        + (s * r ** (s - 2) if a == b else 0)
-        for a in range(dim)
-        for b in range(a, dim)
-    ]
-    return torch.stack(columns[:count], dim=-1)
+def _kernel_derivatives(nodes: Float[Tensor, "B K d"], s: int) -> Float[Tensor, "B K F"]:
+    """First derivatives, then Δ, at y = 0 of |y − y_j|^s: −s r^{s−2} y and s (s + d − 2) r^{s−2}."""
+    power = s * nodes.norm(dim=-1, keepdim=True) ** (s - 2)
+    return torch.cat([-power * nodes, (s + nodes.shape[-1] - 2) * power], dim=-1)

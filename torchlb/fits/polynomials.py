@@ -16,8 +16,6 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from torchlb.errors import InputError
-
 
 def num_monomials(dim: int, degree: int) -> int:
     """Number M of monomials of `dim` variables and total degree ≤ `degree`, the constant included.
@@ -117,20 +115,11 @@ def gradient_functional(dim: int, degree: int) -> Float[Tensor, "M d"]:
     return (alpha[:, None, :] == unit).all(-1).double()
 
 
-def hessian_functional(dim: int, degree: int) -> Float[Tensor, "M pairs"]:
-    """∂_a ∂_b y^α (0) for the d(d+1)/2 pairs a ≤ b, in the order (1,1), (1,2), …, (d,d): α! where α = e_a + e_b.
+def laplacian_functional(dim: int, degree: int) -> Float[Tensor, "M 1"]:
+    """Σ_c ∂_c² y^α (0): 2 where α = 2 e_c.
 
-    Raises ValueError below degree 2, where no second derivative can be exact.
-
-    >>> hessian_functional(2, 2).T.tolist()
-    [[0.0, 0.0, 2.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0, 0.0], [0.0, 0.0, 0.0, 0.0, 2.0]]
+    >>> laplacian_functional(2, 2).T.tolist()
+    [[0.0, 0.0, 2.0, 0.0, 2.0]]
     """
-    if degree < 2:
-        raise InputError(f"second derivatives need polynomials of degree ≥ 2, got degree {degree}")
     alpha = exponents(dim, degree)
-    unit = torch.eye(dim, dtype=alpha.dtype)
-    pairs = [(a, b) for a in range(dim) for b in range(a, dim)]
-    columns = [
-        (alpha == unit[a] + unit[b]).all(-1).double() * (2.0 if a == b else 1.0) for a, b in pairs
-    ]
-    return torch.stack(columns, dim=-1)
+    return 2 * ((alpha == 2).any(1) & (alpha.sum(1) == 2)).double()[:, None]

@@ -14,7 +14,7 @@ from torch import Tensor
 
 from torchlb.fits.polynomials import (
     gradient_functional,
-    hessian_functional,
+    laplacian_functional,
     monomial_derivatives,
     monomials,
 )
@@ -27,12 +27,11 @@ MAX_RESIDUAL = 1e-10
 
 @dataclass(frozen=True)
 class Weights:
-    """Weights of the gradient and of the second derivatives at the centre of a batch of stencils.
+    """Weights of the gradient and of the Laplacian at the centre of a batch of stencils.
 
     Attributes
     ----------
     gradient : (B, K, d), 1/ℓ. Entry 0 along K is the centre, as below.
-    hessian : (B, K, pairs), 1/ℓ²: ∂_a∂_b for a ≤ b; no columns below degree 2.
     laplacian : (B, K), 1/ℓ²: Δ = Σ_c ∂_c²; zero below degree 2.
     radius : (B,), ℓ: distance ρ of the farthest neighbour in local coordinates.
     condition : (B,): Frobenius norm of the inverse of the R of √ω V with its columns scaled to length one, which is its
@@ -42,7 +41,6 @@ class Weights:
     """
 
     gradient: Float[Tensor, "B K d"]
-    hessian: Float[Tensor, "B K pairs"]
     laplacian: Float[Tensor, "B K"]
     radius: Float[Tensor, " B"]
     condition: Float[Tensor, " B"]
@@ -75,11 +73,8 @@ def window(radius: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
 
 
 def _functionals(dim: int, degree: int) -> Float[Tensor, "M F"]:
-    """Right-hand sides: the d first derivatives, then (from degree 2 on) the second ones."""
-    columns = [gradient_functional(dim, degree)]
-    if degree >= 2:
-        columns.append(hessian_functional(dim, degree))
-    return torch.cat(columns, dim=1)
+    """Right-hand sides: the d first derivatives, then Δ, which is zero below degree 2."""
+    return torch.cat([gradient_functional(dim, degree), laplacian_functional(dim, degree)], dim=1)
 
 
 def _finish(
@@ -92,12 +87,9 @@ def _finish(
 ) -> Weights:
     """Return from scaled coordinates to units of length."""
     rho = radius[:, None, None]
-    hessian = weights[..., dim:] / rho.square()
-    pure = [float(a == b) for a in range(dim) for b in range(a, dim)][: hessian.shape[-1]]
     return Weights(
         gradient=weights[..., :dim] / rho,
-        hessian=hessian,
-        laplacian=hessian @ hessian.new_tensor(pure),
+        laplacian=weights[..., dim] / rho[..., 0].square(),
         radius=radius,
         condition=condition,
         residual=residual,
@@ -233,7 +225,7 @@ def least_squares_weights(
 ) -> Weights:
     r"""Centre-constrained moving least squares.
 
-    For every functional D among the first and second derivatives,
+    For every functional D among the first derivatives and Δ,
 
     .. math:: \min \sum_{j \ne i} w_j^2 / \omega_j \quad\text{subject to}\quad
               \sum_{j \ne i} w_j y_j^\alpha = (D y^\alpha)(0), \quad 1 \le |\alpha| \le m, \qquad
@@ -246,7 +238,7 @@ def least_squares_weights(
     Parameters
     ----------
     coords : (B, K − 1, d), ℓ: the neighbours without the centre, K − 1 ≥ M − 1.
-    degree : m ≥ 1. Second derivatives come with m ≥ 2.
+    degree : m ≥ 1. Δ comes with m ≥ 2.
     keep : (B, K − 1), neighbours that may have a weight; all by default.
     flux : (B, K, d), the conormal at each point of the stencil that lies on a boundary with the datum ∂_ν f + a f = 0
         (centre first), zero at the others. Each adds an unknown v_b: minimise Σ w²/ω + Σ v²/ω subject to
