@@ -177,6 +177,9 @@ def test_shapes_of_the_divergence_and_of_the_mean_curvature_normal(lb):
     v = random_like(lb, num_points, n, 3)
     assert lb.divergence(v).shape == (num_points, 3)
     same(lb.divergence(v[..., 1]), lb.divergence(v)[:, 1])
+    same(lb.divergence(torch.stack([v, 2 * v]))[1], 2 * lb.divergence(v))
+    with pytest.raises(ValueError, match=rf"\(N, n\).* with N = {num_points}, n = {n}, got"):
+        lb.divergence(v[1:])
     assert lb.mean_curvature_normal().shape == (num_points, n)
     same(lb.mean_curvature_normal(), lb(lb.points))
 

@@ -91,21 +91,22 @@ class StencilFace(OperatorStorage):
         return torch.einsum("ind,...idc->...inc", self.frames.to(local.dtype), local)
 
     def divergence(self, v: Tensor) -> Tensor:
-        """div v = Σ_c E_c · ∂_c v of a field of space vectors v: (N,) for (N, n), (N, C) for (N, n, C).
+        """div v = Σ_c E_c · ∂_c v of space vectors v: (N,) for (N, n), (N, C) for (N, n, C), batches (B, N, C) likewise.
 
         The divergence on the manifold of its tangential part plus, for a normal part φν, the term −Hφ of its mean
         curvature. Units of v by 1/ℓ. It is consistent, but neither −1 times the adjoint of `gradient` nor exactly
         conservative: ∫ div v = 0 on a closed surface, and div ∇f = Δf, up to the order of the stencils.
         """
-        expected = (self.num_points, self.points.shape[1])
-        if not (v.ndim in (2, 3) and v.shape[:2] == expected):
+        if v.ndim == 2:
+            return self.divergence(v[..., None])[:, 0]
+        size, n = self.num_points, self.points.shape[1]
+        if not (v.ndim in (3, 4) and v.shape[-3:-1] == (size, n)):
             raise InputError(
-                f"expected a field of shape {expected} or {(*expected, 'C')}, got {tuple(v.shape)}"
+                f"expected a field of shape (N, n), (N, n, C) or (B, N, n, C) with N = {size}, n = {n}, got "
+                f"{tuple(v.shape)}"
             )
-        field = v[..., None] if v.ndim == 2 else v
-        local = self.local_gradient(field.flatten(1)).unflatten(-1, field.shape[1:])  # (N, d, n, C)
-        result = torch.einsum("ind,idnc->ic", self.frames.to(local.dtype), local)
-        return result[:, 0] if v.ndim == 2 else result
+        local = self.local_gradient(v.flatten(-2)).unflatten(-1, v.shape[-2:])  # (…, N, d, n, C)
+        return torch.einsum("ind,...idnc->...ic", self.frames.to(local.dtype), local)
 
     def hessian(self, f: Tensor) -> Tensor:
         """∇²f, covariant second derivatives E_b·∂_a(∇f) in the frames: (N, d, d) for f (N,), (N, d, d, C) for (N, C).
