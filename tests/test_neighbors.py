@@ -8,6 +8,7 @@ import pytest
 import torch
 from scipy.sparse import csgraph
 
+from torchlb.geometry import neighbors
 from torchlb.geometry.frames import cloud_frames, mesh_frames
 from torchlb.geometry.neighbors import (
     GraphBalls,
@@ -225,6 +226,23 @@ def test_no_ball_crosses_between_parallel_sheets(size):
     assert torch.equal(row < n, others < n)
     plain = nearest_neighbors(points, 24)
     assert ((plain < n) != (plain[:, :1] < n)).any(1).double().mean() > 0.5
+
+
+def test_balls_around_a_fan_are_grown_a_few_at_a_time(monkeypatch):
+    """300 triangles at one apex: two steps lead from any vertex to all, and no more than 2¹² such ends are held."""
+    angle = torch.arange(300).double() * math.tau / 300
+    points = torch.stack([angle.cos(), angle.sin()], 1)
+    points = torch.cat([points, torch.zeros(1, 2).double()])
+    rim = torch.arange(300)
+    faces = torch.stack([rim, (rim + 1) % 300, torch.full((300,), 300)], 1)
+    graph, frames = mesh_graph(faces, 301), mesh_frames(points, faces)
+    whole = GraphBalls(points, graph, frames)(torch.arange(301), 20)
+    monkeypatch.setattr(neighbors, "WALKS_AT_ONCE", 2**12)
+    balls, sizes = GraphBalls(points, graph, frames), []
+    grown = balls._grown
+    monkeypatch.setattr(balls, "_grown", lambda c, size: sizes.append(len(c)) or grown(c, size))
+    assert torch.equal(balls(torch.arange(301), 20)[0], whole[0])
+    assert max(sizes) <= 2**12 / 300 + 1
 
 
 def test_balls_do_not_depend_on_the_chunk():

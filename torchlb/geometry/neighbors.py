@@ -34,6 +34,8 @@ AT_ONCE = 2**13
 """Points whose neighbours are looked at together: of small arrays the memory is used again."""
 PAIRS_AT_ONCE = 2**16
 """Pairs of points that are looked at together, for the same reason."""
+WALKS_AT_ONCE = 2**22
+"""Walks of two edges whose ends are looked at together: through the middle of a fan of n triangles there are n²."""
 EDGES = 6
 """The longest edges of a point, in whose middles its fit is judged."""
 BALL_SURPLUS = 1.5
@@ -252,6 +254,11 @@ class GraphBalls:
         return balls
 
     @cached_property
+    def _walks(self) -> Int[Tensor, " N"]:
+        """Of how many walks of two edges every point is the start."""
+        return torch.from_numpy(self.graph @ np.diff(self.graph.indptr).astype(np.int64)).long()
+
+    @cached_property
     def longest(self) -> Int[Tensor, "N edges"]:
         """The other ends of the longest `EDGES` edges of every point, see `longest_edges`."""
         return longest_edges(self.points, self.graph, EDGES)
@@ -272,7 +279,9 @@ class GraphBalls:
             self._kept.append(level)
         missing = centers[level.place[centers] < 0]
         if len(missing):
-            level.add(missing, *self._grown(missing, level.size))
+            number = self._walks[missing].cumsum(0) // WALKS_AT_ONCE
+            for part in missing.split(number.unique_consecutive(return_counts=True)[1].tolist()):
+                level.add(part, *self._grown(part, level.size))
         place = level.place[centers]
         return level.index[place, :size].long(), level.count[place].long().clamp_max(size)
 

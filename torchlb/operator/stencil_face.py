@@ -91,7 +91,7 @@ class StencilFace(OperatorStorage):
         return torch.einsum("ind,...idc->...inc", self.frames.to(local.dtype), local)
 
     def divergence(self, v: Tensor) -> Tensor:
-        """div v = Σ_c E_c · ∂_c v of space vectors v: (N,) for (N, n), (N, C) for (N, n, C), batches (B, N, C) likewise.
+        """div v = Σ_c E_c · ∂_c v of space vectors v: (N,) for (N, n), (N, C) for (N, n, C), batches (B, N, C) too.
 
         The divergence on the manifold of its tangential part plus, for a normal part φν, the term −Hφ of its mean
         curvature. Units of v by 1/ℓ. It is consistent, but neither −1 times the adjoint of `gradient` nor exactly
