@@ -106,6 +106,18 @@ def test_a_band_with_one_side_stays_one_band():
     assert wound_alike(points.numpy(), faces)[1].any()
 
 
+@pytest.mark.parametrize("ratio", [30, 100])
+def test_a_sudden_change_of_density_is_no_boundary(ratio):
+    """A sphere, its cap z > 0.3 many times as dense as the rest; the half of it with x > 0 has its own boundary."""
+    generator = torch.Generator().manual_seed(ratio)
+    points = torch.nn.functional.normalize(torch.randn(20000, 3, generator=generator).double())
+    chance = torch.rand(len(points), generator=generator)
+    points = points[chance < torch.where(points[:, 2] > 0.3, 0.3, 0.3 / ratio)]
+    assert euler(cloud_surface(points).faces.numpy()) == 2
+    half = cloud_surface(points[points[:, 0] > 0])
+    assert half.summary.boundary_loops == euler(half.faces.numpy()) == 1
+
+
 def test_spheres_apart_stay_apart_and_an_outlier_is_joined():
     points = Sphere().points(600)
     two = torch.cat([points, points + torch.tensor([2.4, 0.0, 0.0])])
@@ -124,7 +136,7 @@ def test_spheres_apart_stay_apart_and_an_outlier_is_joined():
 def test_outliers_that_hold_most_of_the_area_are_named():
     points, generator = Torus().points(1000), torch.Generator().manual_seed(3)
     far = 20 * torch.randn(10, 3, generator=generator).double()
-    with pytest.warns(UserWarning, match=r"at 10 of 1010 .* too coarse or noisy .* \(.*1001, "):
+    with pytest.warns(UserWarning, match=r"at 11 of 1010 .* too coarse or noisy .* \(.*1001, "):
         LaplaceBeltrami.from_points(torch.cat([points, far]))
 
 
@@ -391,6 +403,18 @@ def test_rings_of_a_scan_are_one_surface():
     lb = LaplaceBeltrami.from_points(np.r_[points, [[0, 0, 1], [0, 0, -1]]])
     exact = torch.tensor([0, 2, 2, 2, 6]).double()
     torch.testing.assert_close(lb.eigenbasis(5).eigenvalues, exact, rtol=1e-3, atol=1e-9)
+
+
+def test_rings_far_denser_than_apart_are_one_sphere():
+    """16 circles of 200 points, up to 64 times as far apart as those, and none at the poles: χ = 2."""
+    polar = torch.pi * (torch.arange(16).double() + 0.5) / 16
+    angle = 2 * torch.pi * torch.arange(200).double() / 200
+    t, phi = (x.flatten() for x in torch.meshgrid(polar, angle, indexing="ij"))
+    points = torch.stack([t.sin() * phi.cos(), t.sin() * phi.sin(), t.cos()], 1)
+    surface = cloud_surface(points)
+    assert euler(surface.faces.numpy()) == 2
+    assert surface.summary.reached == len(points)
+    assert surface.summary.components == 1
 
 
 def test_rings_in_a_plane_have_the_normal_of_the_plane():

@@ -8,6 +8,7 @@ leaves their double cone, the *cocone*.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 import torch
@@ -27,6 +28,11 @@ COCONE = np.sin(np.pi / 8)
 """Sine of the half-angle between a tangent plane and the double cone that a dual edge has to leave."""
 FOLD = 0.5
 """Cosine of the least angle between two triangles at an edge."""
+REACH = 2.0
+"""The reach of a point is so many times the distance to a certain neighbour."""
+STEP, LEVEL = 1.5, 0.7
+"""Of reaches, one over that by all neighbours of another point: where the density changes at once; and the least cosine
+between the normal of a triangle across that and those of its corners."""
 TILTED = 0.1
 """Least cosine between the normal of a triangle and those of its corners: walls between two rims have none."""
 FAR = 1e6
@@ -50,7 +56,7 @@ class Cloud:
     points : (N, 3), ℓ.
     normals : (N, 3), unit.
     neighbors : (N, K), nearest points, itself first.
-    reach : (N,), ℓ: the largest circumradius of a triangle at each point; half of it if all corners are on the rim.
+    reach : (N,), ℓ: of a triangle the circumradius is no larger than those of its corners; half if all are on the rim.
     rim : (N,), points of a declared boundary.
     """
 
@@ -71,11 +77,27 @@ class Cloud:
         return lengths.prod(1) / (2 * twice), normal / twice[:, None]
 
     def limits(self, faces: Faces) -> Float[np.ndarray, " F"]:
-        """Their largest circumradii, ℓ."""
-        return self.reach[faces].min(1) / np.where(self.rim[faces].all(1), 2, 1)
+        """Their largest circumradii, ℓ: the least reach of the corners, or the largest where density changes at once.
+
+        All the nearest of a dense point at such a place are on its own side. Triangles across it have to lie level.
+        """
+        reach = self.reach[faces]
+        limit = reach.min(1)
+        across = np.flatnonzero(reach.max(1) > STEP * self.around[faces].min(1))
+        normal = self.circles(faces[across])[1]
+        cosine = (normal[:, None] * self.normals[faces[across]]).sum(-1)
+        across = across[np.abs(cosine).min(1) > LEVEL]
+        limit[across] = reach[across].max(1)
+        return limit / np.where(self.rim[faces].all(1), 2, 1)
+
+    @cached_property
+    def around(self) -> Float[np.ndarray, " N"]:
+        """The reach of each point by all its neighbours, ℓ."""
+        far = np.linalg.norm(self.points[self.neighbors[:, -1]] - self.points, axis=1)
+        return np.maximum(self.reach, REACH * far)
 
     def small(self, faces: Faces) -> Faces:
-        """Those within the reach of all their corners."""
+        """Those within the reach of their corners."""
         return faces[self.circles(faces)[0] <= self.limits(faces)]
 
 

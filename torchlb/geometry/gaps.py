@@ -167,13 +167,16 @@ def closed(
 ) -> tuple[Faces, list[list[int]]]:
     """The faces with narrow boundary loops closed, ear by ear; and the points of the loops that were.
 
-    Loops stay that have two neighbouring points in the declared boundary, or one in `kept`.
+    A point reaches as far as the triangles at it. Loops stay that have two neighbouring points in the declared
+    boundary, or one in `kept`.
     """
     count = len(cloud.points)
     edges = edges_of(faces, count)
     known, new, done = set(edges.keys.tolist()), [faces], []
+    reach = cloud.reach.copy()
+    np.maximum.at(reach, faces, cloud.limits(faces)[:, None])
     for loop in boundary_loops(faces, count):
-        wide = WIDTH * cloud.reach[loop].mean()
+        wide = WIDTH * reach[loop].mean()
         places = cloud.points[loop]
         declared = cloud.rim[loop] & cloud.rim[np.roll(loop, 1)]
         if declared.any() or kept[loop].any() or np.ptp(places, axis=0).max() > wide:

@@ -13,7 +13,7 @@ from scipy.spatial import Delaunay
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from torchlb.geometry.cocone import Candidates, Cloud, Tetrahedra, refined_normals
+from torchlb.geometry.cocone import REACH, Candidates, Cloud, Tetrahedra, refined_normals
 from torchlb.geometry.frames import cloud_frames, vertex_normals
 from torchlb.geometry.gaps import closed, filled, with_left_points
 from torchlb.geometry.manifold import (
@@ -32,8 +32,8 @@ from torchlb.geometry.stars import gaps_between, pieces_of, stars_in_gaps
 
 NEAREST = 24
 """Nearest points from which normals, stars and neighbourhoods are made."""
-SPACING, REACH = 8, 2.0
-"""The reach of a point is so many times the distance to its neighbour of this number."""
+SPACING = 8
+"""The reach of a point is twice the distance to its neighbour of this number."""
 IN_ROW = 0.2
 """Spread across over that along it, below which points lie in a row."""
 ASKEW = 0.7
