@@ -106,6 +106,19 @@ def test_a_band_with_one_side_stays_one_band():
     assert wound_alike(points.numpy(), faces)[1].any()
 
 
+def test_a_band_of_random_points_is_not_torn_at_its_seam():
+    """Möbius, as wide as its radius: χ = 0, one boundary loop, no points apart that are neighbours."""
+    generator = torch.Generator().manual_seed(4)
+    u, v = torch.rand(2, 2500, generator=generator).double()
+    u, v = 2 * torch.pi * u, v - 0.5
+    ring = 1 + v * (u / 2).cos()
+    points = torch.stack([ring * u.cos(), ring * u.sin(), v * (u / 2).sin()], 1)
+    surface = cloud_surface(points)
+    assert euler(surface.faces.numpy()) == 0
+    assert surface.summary.boundary_loops == 1
+    assert surface.summary.contacts == 0
+
+
 @pytest.mark.parametrize("ratio", [30, 100])
 def test_a_sudden_change_of_density_is_no_boundary(ratio):
     """A sphere, its cap z > 0.3 many times as dense as the rest; the half of it with x > 0 has its own boundary."""

@@ -136,14 +136,11 @@ def cloud_surface(
     places = cloud.points
     outward = found.outward if given is None else given.numpy()
     pairs = _kin(cloud)
-    faces, seam = wound_alike(places, _chosen(cloud, found, start.two_sided, pairs))
-    faces = facing_out(places, _clean(faces[~seam], count) if seam.any() else faces, outward)
-    cloud = _oriented(cloud, faces)
-    bare, faces = faces, _without_gaps(cloud, faces, found.small)
-    faces, done = closed(cloud, faces, _at_gaps(faces, pairs, count))
-    faces = with_left_points(cloud, faces)
-    if faces is not bare:
-        faces = facing_out(places, wound_alike(places, faces)[0], outward)
+    every, seam = wound_alike(places, _chosen(cloud, found, start.two_sided, pairs))
+    faces = _clean(every[~seam], count) if seam.any() else every
+    faces, done = _completed(cloud, faces, found.small, pairs, outward)
+    if _single_seams(every, seam, count) and wound_alike(places, faces)[1].any():
+        faces, done = _completed(cloud, every, found.small, pairs, outward)
     # not by the faces where these lead into a mouth from outside
     cloud = _along(_oriented(cloud, faces), outward)
     if given is None:
@@ -252,6 +249,32 @@ def _chosen(
     torn[i[across]] = torn[j[across]] = True
     first = np.where(torn[found.triangles].any(1), found.tangent, first)
     return _clean(found.best(points, first), len(points)) if torn.any() else faces
+
+
+def _completed(
+    cloud: Cloud,
+    bare: Faces,
+    pool: Faces,
+    pairs: tuple[np.ndarray, np.ndarray],
+    outward: Float[np.ndarray, "N 3"],
+) -> tuple[Faces, list[list[int]]]:
+    """The faces turned outward, their gaps filled from the pool or closed, all points in them; and the loops closed."""
+    places, count = cloud.points, len(cloud.points)
+    bare = facing_out(places, bare, outward)
+    cloud = _oriented(cloud, bare)
+    faces = _without_gaps(cloud, bare, pool)
+    faces, done = closed(cloud, faces, _at_gaps(faces, pairs, count))
+    faces = with_left_points(cloud, faces)
+    if faces is not bare:
+        faces = facing_out(places, wound_alike(places, faces)[0], outward)
+    return faces, done
+
+
+def _single_seams(faces: Faces, seam: Bool[np.ndarray, " F"], count: int) -> bool:
+    """Whether pieces with a seam have one each: a band with one side has, wrong triangles make several."""
+    ends = faces[seam][:, 0]
+    seams, pieces = (np.unique(pieces_of(part, count)[ends]) for part in (faces[seam], faces))
+    return len(seams) == len(pieces) > 0
 
 
 def _without_gaps(cloud: Cloud, faces: Faces, pool: Faces) -> Faces:
