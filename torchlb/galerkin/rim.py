@@ -13,6 +13,8 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from torchlb.geometry.vertex_fits import MAX_LEBESGUE
+
 SHARP = cos(radians(60))
 """A boundary that turns by more at a vertex has a corner there."""
 KINK, OUTSTANDING = cos(radians(20)), 3.0
@@ -55,7 +57,7 @@ def rim_curves(points: Float[Tensor, "N n"], rim: Int[Tensor, "G 2"], width: int
     place = torch.arange(width - 2)
     first = torch.zeros(len(rim), 1).to(points)
     length = (points[rim[:, 1]] - points[rim[:, 0]]).norm(dim=1, keepdim=True)
-    return RimCurves(
+    curves = RimCurves(
         torch.cat([rim, right, left], 1),
         torch.cat(
             [
@@ -67,6 +69,21 @@ def rim_curves(points: Float[Tensor, "N n"], rim: Int[Tensor, "G 2"], width: int
         ),
         torch.cat([first, length, length + right_arc, -left_arc], 1),
     )
+    _bound(curves)
+    return curves
+
+
+def _bound(curves: RimCurves) -> None:
+    """Leave out the farthest vertices of curves whose Lebesgue constant is too large, as where spacings jump."""
+    middle = curves.arc[:, 1:2] / 2
+    distance = (curves.arc - middle).abs()
+    distance[:, :2] = 0
+    while True:
+        size = curves.weights(torch.full_like(middle, 0.5)).abs().sum(2)[:, 0]
+        steep = (size > MAX_LEBESGUE).nonzero()[:, 0]
+        if len(steep) == 0:
+            return
+        curves.valid[steep, (distance * curves.valid)[steep].argmax(1)] = False
 
 
 def _mates(points: Float[Tensor, "N n"], rim: Int[Tensor, "G 2"]) -> Int[Tensor, " two_G"]:
