@@ -18,7 +18,7 @@ from torchlb.geometry.boundary import boundary_faces
 from torchlb.geometry.frames import complete_frames, vertex_normals
 from torchlb.geometry.neighbors import GraphBalls, mesh_graph
 from torchlb.geometry.vertex_fits import VertexFits
-from torchlb.surfaces import Hemisphere, Sphere, Torus, UnitDisk, deserno_points
+from torchlb.surfaces import CliffordTorus, Hemisphere, Sphere, Torus, UnitDisk, deserno_points
 
 
 def pair_of(lb):
@@ -219,6 +219,40 @@ def test_a_corner_stays_a_corner():
         lb = LaplaceBeltrami.from_mesh(vertices, faces, order=order)
         assert abs(float(lb.mass.sum()) - 1) < 1e-12
         assert abs(float(lb.boundary_mass.to_dense().sum()) - 4) < 1e-12
+
+
+def test_a_rim_whose_spacing_jumps_does_not_swing():
+    """A square of cells 21 times as wide as others: curves through both would have weights of thousands."""
+    x = np.concatenate([np.linspace(0, 0.5, 4), 0.5 + 0.008 * np.arange(1, 27), [0.854, 1]])
+    grid = np.stack(np.meshgrid(x, x, indexing="ij"), -1).reshape(-1, 2)
+    i = np.arange(len(grid)).reshape(len(x), len(x))
+    a, b, c, d = (part.ravel() for part in (i[:-1, :-1], i[1:, :-1], i[1:, 1:], i[:-1, 1:]))
+    faces = np.concatenate([np.stack([a, b, c], 1), np.stack([a, c, d], 1)])
+    lb = LaplaceBeltrami.from_mesh(grid, faces, order=5, certify=False)
+    stiffness, mass = pair_of(lb)
+    linear = lb.linear_pair[2][0].abs().max()
+    assert abs(stiffness).max() < 10 * linear
+    assert abs(mass).max() < 0.2
+    expected = np.pi**2 * np.array([1, 1, 2])
+    np.testing.assert_allclose(eigenvalues(lb, 4)[1:], expected, rtol=0.1)
+
+
+@pytest.mark.parametrize(("order", "bound"), [(1, 2e-4), (3, 2e-4), (5, 5e-7)])
+def test_meshes_of_any_codimension_have_a_pair(order, bound):
+    """Clifford's torus in R⁴: λ_1 to λ_24, the area, and K about as stiff as that of linear elements."""
+    surface = CliffordTorus()
+    vertices, faces = surface.mesh(2000)
+    lb = LaplaceBeltrami.from_mesh(vertices, faces, order=order)
+    assert lb.certificate is None
+    error = eigenvalues(lb, 25)[1:] / surface.eigenvalues(25)[1:].numpy() - 1
+    assert np.abs(error).max() < bound
+    assert abs(float(lb.mass.sum()) / surface.area - 1) < bound
+    stiffness, _ = pair_of(lb)
+    if order < 4:
+        assert stiffness.nnz < (60 if order == 1 else 90) * 2000
+    crow, col, (linear, _) = lb.linear_pair
+    linear = sparse.csr_array((linear.numpy(), col.numpy(), crow.numpy())).diagonal()
+    assert (stiffness.diagonal() < 2.5 * linear).all()
 
 
 def test_curves_of_the_rim_reproduce_polynomials_of_arc_length():

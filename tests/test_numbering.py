@@ -116,7 +116,7 @@ def test_a_conductivity_has_the_users_numbers():
 def test_fits_are_handed_over_once():
     vertices, faces = UnitDisk().mesh(100)
     balls = GraphBalls(vertices, mesh_graph(faces, 100), mesh_frames(vertices, faces))
-    fits = VertexFits(balls, (2,)).complete(balls)
+    fits = VertexFits(balls, (2,)).complete()
     assert sum(len(part.vertices) for part in fits.hand_over()) == int((fits.degree > 0).sum()) > 90
     with pytest.raises(RuntimeError, match="before"):
         fits.hand_over()

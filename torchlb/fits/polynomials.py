@@ -44,6 +44,8 @@ def exponents(dim: int, degree: int) -> Int[Tensor, "M d"]:
 def monomials(coords: Float[Tensor, "*batch d"], degree: int) -> Float[Tensor, "*batch M"]:
     """Values y^α of the monomials 1 ≤ |α| ≤ `degree` at the points y, in the order of `exponents`; none of degree 0.
 
+    One after the other in memory where there are many places, as LAPACK wants the columns of a matrix.
+
     >>> monomials(torch.tensor([2.0, 3.0]), 2).tolist()
     [2.0, 3.0, 4.0, 6.0, 9.0]
     """
@@ -60,7 +62,7 @@ def monomials(coords: Float[Tensor, "*batch d"], degree: int) -> Float[Tensor, "
             current += [coords[..., c] * monomial for monomial in previous[first[c] :]]
         columns += current
         previous, first = current, starts
-    return torch.stack(columns, dim=-1)
+    return torch.stack(columns, dim=-2).mT if coords.ndim > 1 else torch.stack(columns)
 
 
 def monomial_derivatives(
@@ -76,22 +78,6 @@ def monomial_derivatives(
     factor, place = _lowered(dim, degree)
     taken = lower.index_select(-1, place.to(coords.device).flatten())
     return factor.to(coords) * taken.unflatten(-1, place.shape)
-
-
-def derivative_coefficients(
-    coefficients: Float[Tensor, "*batch M"], dim: int, degree: int
-) -> Float[Tensor, "*batch d L"]:
-    """Coefficients of the derivatives ∂_c of polynomials without constant, those of the constant first.
-
-    >>> derivative_coefficients(torch.tensor([1.0, 2.0, 3.0, 4.0, 5.0]), 2, 2).tolist()
-    [[1.0, 6.0, 4.0], [2.0, 4.0, 10.0]]
-    """
-    factor, place = _lowered(dim, degree)
-    shape = *coefficients.shape[:-1], dim, num_monomials(dim, degree - 1)
-    result = coefficients.new_zeros(shape)
-    for c in range(dim):
-        result[..., c, :].index_add_(-1, place[:, c], factor[:, c].to(coefficients) * coefficients)
-    return result
 
 
 @lru_cache(maxsize=64)

@@ -14,7 +14,7 @@ CHUNK = 2**14
 
 
 def metric(
-    places: Float[Tensor, "NX 3"], elements: Int[Tensor, "T n"], shape: Element
+    places: Float[Tensor, "NX D"], elements: Int[Tensor, "T n"], shape: Element
 ) -> Float[Tensor, "T Q 3"]:
     """G = JᵀJ at the Gauss points of elements with nodes at `places`, as (g_ξξ, g_ξη, g_ηη), ℓ²."""
     slopes = torch.cat([*shape.gradients.unbind(-1)]).T.contiguous()  # (n, 2Q)

@@ -7,44 +7,28 @@ from dataclasses import dataclass, replace
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
-from torch.nn.functional import normalize
 
-from torchlb.fits.polynomials import derivative_coefficients, monomials, num_monomials
+from torchlb.fits.polynomials import monomials
 from torchlb.galerkin.assembly import CHUNK, area_element, flat_metric, metric
 from torchlb.galerkin.elements import EDGES, lattice, triangle
 from torchlb.galerkin.nodes import Nodes
 from torchlb.galerkin.rim import RimCurves, rim_curves
+from torchlb.geometry.frames import vertex_normals
 from torchlb.geometry.stars import pieces_of
-from torchlb.geometry.vectors import at, dot
+from torchlb.geometry.vectors import at
 from torchlb.geometry.vertex_fits import VertexFits
 
-NEWTON_STEPS = 4
-AGREE, STEEP = 0.15, 0.3
-"""Of an edge's length: how far the heights of its two ends may differ, and how large they may be."""
+ROUNDS = 2
+RIM = {2: 6, 3: 6, 4: 8}
+"""Vertices that a curve along the boundary goes through, by the degree of the elements."""
+AGREE, STEEP = 0.075, 0.3
+"""Of an edge's length: how far a graph may be from the mean of a node's, and the node from the edge."""
 FLAT = 1e-3
 """Height of a triangle over its longest edge, below which it is flat."""
 STRETCH = 3.0
 """Largest ratio of the curved area element and the flat one, or of the flat one and the curved one."""
 SLACK = 1e-5
 """Of the mean length: what two edges of a triangle are to be longer than the third, by mollification."""
-
-
-@dataclass(frozen=True)
-class Surface:
-    """A mesh, and the fits of its vertices.
-
-    Attributes
-    ----------
-    points : (N, 3), ℓ.
-    frames : (N, 3, 2), orthonormal, under the fits.
-    normals : (N, 3), orthogonal to the frames, on the side of the faces; zero where these have none.
-    fits : of functions, and of the surface.
-    """
-
-    points: Float[Tensor, "N 3"]
-    frames: Float[Tensor, "N 3 2"]
-    normals: Float[Tensor, "N 3"]
-    fits: VertexFits
 
 
 @dataclass(frozen=True)
@@ -63,7 +47,7 @@ class CurvedMesh:
     Attributes
     ----------
     nodes : the numbering.
-    places : (N + X, 3), ℓ.
+    places : (N + X, n), ℓ.
     curved : (E,), which edges are.
     bent : (X,), which nodes stand on the surface instead of on a flat triangle.
     lengths : (F, 3), mollified.
@@ -71,7 +55,7 @@ class CurvedMesh:
     """
 
     nodes: Nodes
-    places: Float[Tensor, "NX 3"]
+    places: Float[Tensor, "NX n"]
     curved: Bool[Tensor, " E"]
     bent: Bool[Tensor, " X"]
     lengths: Float[Tensor, "F 3"]
@@ -79,30 +63,33 @@ class CurvedMesh:
     curves: RimCurves
 
 
-def curve(surface: Surface, nodes: Nodes) -> tuple[CurvedMesh, Float[Tensor, "F Q 3"]]:
-    """Stand the nodes on the fits where these agree, and flatten what they would distort.
+def curve(
+    points: Float[Tensor, "N n"], fits: VertexFits, nodes: Nodes
+) -> tuple[CurvedMesh, Float[Tensor, "F Q 3"]]:
+    """Stand the nodes on the graphs of their vertices where these agree, and flatten what they would distort.
 
     With it comes the metric at the Gauss points, of flat triangles from mollified lengths.
     """
-    points, fits = surface.points, surface.fits
     rim = (nodes.uses == 1).nonzero()[:, 0]
-    degree = max(int(fits.degree.max()), 2)
-    curves = rim_curves(points, nodes.edges[rim], degree + 2 + degree % 2)
+    curves = rim_curves(points, nodes.edges[rim], RIM[nodes.degree])
     flat = torch.einsum("xv,xvn->xn", nodes.shares, at(points, nodes.corners))
     start = flat + _rim_displacement(points, nodes, rim, curves)
-    along = normalize(torch.einsum("xv,xvn->xn", nodes.shares, at(surface.normals, nodes.corners)))
-    ends = node_ends(nodes)
-    height, sound = _heights(surface, nodes, ends, start, along)
+    standing, sound = _moved(points, fits, nodes, start)
     outside = torch.zeros(len(nodes.faces), dtype=torch.bool)
-    height = torch.where(_by_node(nodes, nodes.uses == 1, outside), 0.0, height)  # they are there
+    of_rim = _by_node(nodes, nodes.uses == 1, outside)
+    standing = torch.where(of_rim[:, None], start, standing)
     ratio = (start - flat).norm(dim=1) / _sizes(points, nodes)
     curved, whole = _by_edge(nodes, sound & (ratio <= STEEP))
-    opposed = surface.normals[nodes.edges].sum(1).norm(dim=1) <= 1
-    curved &= ~opposed & (nodes.uses <= 2)
-    standing = start + height[:, None] * along
-    stand = flat, standing
-    places, curved, bent, g, lengths = _flattened(points, nodes, stand, curved, whole)
+    curved &= ~_opposed(points, nodes) & (nodes.uses <= 2)
+    places, curved, bent, g, lengths = _flattened(points, nodes, (flat, standing), curved, whole)
     return CurvedMesh(nodes, places, curved, bent, lengths, rim, curves), g
+
+
+def _opposed(points: Tensor, nodes: Nodes) -> Bool[Tensor, " E"]:
+    """Edges whose ends' normals are more than 120° apart, or none."""
+    if points.shape[1] != 3:
+        return torch.zeros(len(nodes.edges), dtype=torch.bool)
+    return vertex_normals(points, nodes.faces)[nodes.edges].sum(1).norm(dim=1) <= 1
 
 
 def node_ends(nodes: Nodes) -> Ends:
@@ -130,7 +117,7 @@ def _by_edge(nodes: Nodes, good: Bool[Tensor, " X"]) -> tuple[Tensor, Tensor]:
 
 def _rim_displacement(
     points: Tensor, nodes: Nodes, rim: Int[Tensor, " G"], curves: RimCurves
-) -> Float[Tensor, "X 3"]:
+) -> Float[Tensor, "X n"]:
     """From the flat nodes to the boundary's curves; inside of a triangle by (b_i + b_j)² of the edge's (i, j).
 
     A quadratic displacement b_i b_j of the edge is so continued by itself.
@@ -166,49 +153,36 @@ def _rim_displacement(
     return result
 
 
-def _heights(
-    surface: Surface, nodes: Nodes, ends: Ends, start: Tensor, along: Tensor
-) -> tuple[Float[Tensor, " X"], Bool[Tensor, " X"]]:
-    """t of every node, where the line start + tν meets the graphs of its vertices' fits; and whether they agree."""
-    size = _sizes(surface.points, nodes)
-    if not surface.fits.degree.any():
-        return torch.zeros_like(size), torch.zeros_like(size, dtype=torch.bool)
-    pairs = zip(ends.node.split(CHUNK), ends.vertex.split(CHUNK), strict=True)
-    t = torch.cat([_met(surface, node, vertex, start, along) for node, vertex in pairs])
-    least = torch.full_like(size, torch.inf).scatter_reduce(0, ends.node, t, "amin")
-    most = torch.full_like(size, -torch.inf).scatter_reduce(0, ends.node, t, "amax")
-    sound = (most - least <= AGREE * size) & (
-        torch.maximum(most.abs(), least.abs()) <= STEEP * size
-    )
-    mean = torch.zeros_like(size).index_add(0, ends.node, ends.share * t.nan_to_num(0, 0, 0))
-    return mean, sound
+def _moved(
+    points: Tensor, fits: VertexFits, nodes: Nodes, start: Float[Tensor, "X n"]
+) -> tuple[Float[Tensor, "X n"], Bool[Tensor, " X"]]:
+    """Where the graphs of its vertices take every node, in the mean; and whether they agree.
+
+    Asked again from there they do so at the same place, but for h⁶.
+    """
+    ends, size, place = node_ends(nodes), _sizes(points, nodes), start
+    parts = list(zip(ends.node.split(CHUNK), ends.vertex.split(CHUNK), strict=True))
+    apart = torch.zeros_like(size[ends.node])
+    for _ in range(ROUNDS):
+        moves = torch.cat(
+            [_to_graph(points, fits, at(place, node), vertex) for node, vertex in parts]
+        )
+        mean = torch.zeros_like(start).index_add_(0, ends.node, ends.share[:, None] * moves)
+        place, apart = place + mean, (moves - at(mean, ends.node)).norm(dim=1)
+    bad = (apart > AGREE * at(size, ends.node)) | (fits.degree[ends.vertex] == 0)
+    sound = (place - start).norm(dim=1) <= STEEP * size
+    sound[ends.node[bad]] = False
+    return place, sound
 
 
-def _met(
-    surface: Surface,
-    node: Int[Tensor, " E"],
-    vertex: Int[Tensor, " E"],
-    start: Tensor,
-    along: Tensor,
-) -> Float[Tensor, " E"]:
-    """t where the lines of the nodes meet the graphs of the vertices' fits, by Newton's method; ∞ where they do not."""
-    fits, frame, normal = surface.fits, at(surface.frames, vertex), at(surface.normals, vertex)
-    top, radius = int(fits.degree.max()), fits.radius[vertex, None]
-    terms = num_monomials(2, top) - 1
-    heights = (at(fits.heights, vertex)[:, :terms] @ normal[..., None])[..., 0]
-    slopes = derivative_coefficients(heights, 2, top)
-    direction = at(along, node)
-    turn = (direction[:, None] @ frame)[:, 0] / radius
-    offset, t = at(start, node) - at(surface.points, vertex), torch.zeros_like(radius[:, 0])
-    for _ in range(NEWTON_STEPS):
-        p = offset + t[:, None] * direction
-        y = (p[:, None] @ frame)[:, 0] / radius
-        powers = monomials(y, top)
-        value = dot(p, normal) - dot(powers, heights)
-        lower = powers[:, None, : slopes.shape[2] - 1]
-        slope = slopes[..., 0] + dot(lower, slopes[..., 1:])
-        t = t - value / (dot(direction, normal) - dot(slope, turn))
-    return torch.where(t.isfinite() & (fits.degree[vertex] > 0), t, torch.inf)
+def _to_graph(
+    points: Tensor, fits: VertexFits, places: Float[Tensor, "E n"], vertex: Int[Tensor, " E"]
+) -> Float[Tensor, "E n"]:
+    """From places to the graph of the surface at a vertex, orthogonally to its frame."""
+    surface, frame, offset = fits.surface, at(fits.frames, vertex), places - at(points, vertex)
+    along = offset[:, None] @ frame
+    powers = monomials(along / surface.radius[vertex, None, None], surface.highest)
+    return (powers @ at(surface.heights, vertex) + along @ frame.mT)[:, 0] - offset
 
 
 def mollified(sides: Float[Tensor, "F 3"], faces: Int[Tensor, "F 3"]) -> Float[Tensor, "F 3"]:
@@ -224,9 +198,9 @@ def mollified(sides: Float[Tensor, "F 3"], faces: Int[Tensor, "F 3"]) -> Float[T
 
 
 def _flattened(
-    points: Float[Tensor, "N 3"],
+    points: Float[Tensor, "N n"],
     nodes: Nodes,
-    stand: tuple[Float[Tensor, "X 3"], Float[Tensor, "X 3"]],
+    stand: tuple[Float[Tensor, "X n"], Float[Tensor, "X n"]],
     curved: Bool[Tensor, " E"],
     whole: Bool[Tensor, " I"],
 ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:

@@ -12,12 +12,13 @@ from scipy import sparse
 from torch import Tensor
 
 from torchlb.galerkin.assembly import CHUNK, area_element, element_matrices, flat_metric, summed
-from torchlb.galerkin.curving import Surface, curve
+from torchlb.galerkin.curving import curve
 from torchlb.galerkin.elements import Element, triangle
 from torchlb.galerkin.nodes import lagrange_nodes
 from torchlb.galerkin.pair import upper_product
 from torchlb.galerkin.prolongation import prolongation
 from torchlb.geometry.numbering import Numbering
+from torchlb.geometry.vertex_fits import VertexFits
 from torchlb.linalg.once import once_differentiable
 
 
@@ -43,10 +44,12 @@ class Medium:
     element: Element
 
     @classmethod
-    def curved(cls, surface: Surface, faces: Int[Tensor, "F 3"], degree: int) -> Medium:
-        """That of `weak_pair` with elements of degree r ≥ 2."""
-        mesh, metric = curve(surface, lagrange_nodes(faces, len(surface.points), degree))
-        p = prolongation(surface, mesh)
+    def curved(
+        cls, points: Float[Tensor, "N n"], faces: Int[Tensor, "F 3"], fits: VertexFits, degree: int
+    ) -> Medium:
+        """That of `mesh_pair` with elements of degree r ≥ 2."""
+        mesh, metric = curve(points, fits, lagrange_nodes(faces, len(points), degree))
+        p = prolongation(points, fits, mesh)
         return cls(faces, mesh.lengths, p, mesh.nodes.elements, metric, triangle(degree))
 
     @classmethod

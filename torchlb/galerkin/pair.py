@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from copy import copy
 from dataclasses import dataclass
 from typing import Any
 
@@ -11,14 +10,12 @@ import torch
 from jaxtyping import Float, Int
 from scipy import sparse
 from torch import Tensor
-from torch.nn.functional import pad
 
 from torchlb.galerkin.assembly import assemble_mass, element_matrices, flat_metric, summed
-from torchlb.galerkin.curving import CurvedMesh, Surface, curve, mollified
+from torchlb.galerkin.curving import CurvedMesh, curve, mollified
 from torchlb.galerkin.elements import segment, triangle
 from torchlb.galerkin.nodes import lagrange_nodes
 from torchlb.galerkin.prolongation import prolongation
-from torchlb.geometry.frames import normals_of_frames, vertex_normals
 from torchlb.geometry.numbering import Numbering
 from torchlb.geometry.vertex_fits import VertexFits
 
@@ -69,8 +66,8 @@ class WeakPair:
         return found
 
 
-ELEMENTS = {1: (2, (2,)), 2: (2, (2,)), 3: (2, (4, 2)), 4: (3, (4, 2)), 5: (4, (6, 4, 2))}
-"""Degree r of the elements, and degrees m of the fits, best first, by the order p; above 5 as for 5."""
+ELEMENTS = {1: (2, (2,)), 2: (2, (2,)), 3: (2, (3, 2)), 4: (3, (4, 2)), 5: (4, (6, 4, 2))}
+"""Degree r of the elements, and degrees m of the fits of functions, best first, by the order p; above 5 as for 5."""
 
 
 def mesh_pair(
@@ -81,18 +78,17 @@ def mesh_pair(
     stars: Int[Tensor, "S 3"] | None = None,
     numbering: Numbering | None = None,
 ) -> WeakPair:
-    """The pair of a mesh in the plane or in space, from the fits of its vertices, with elements of degree r ≥ 2.
+    """The pair of a triangle mesh, from the fits of its vertices, with elements of degree r ≥ 2.
 
     Symmetric, K1 = 0, K ≥ 0, M > 0 whatever the fits are: rows of P sum to one, and it has full column rank. A third of
     the flat triangles `stars` is added. The matrices have the user's numbers where there is a numbering. What is large
     is let go as soon as it was used.
     """
-    surface = fitted_surface(points, faces, fits)
-    count = len(surface.points)
-    mesh, metric = curve(surface, lagrange_nodes(faces, count, degree))
-    del surface.fits.heights
+    count = len(points)
+    mesh, metric = curve(points, fits, lagrange_nodes(faces, count, degree))
+    del fits.surface.heights
     linear = _linear(mesh.lengths, faces, count)
-    p = prolongation(surface, mesh)
+    p = prolongation(points, fits, mesh)
     blocks = element_matrices(metric, triangle(degree))
     del metric
     elements = summed(blocks, mesh.nodes.elements, len(mesh.places))
@@ -105,26 +101,14 @@ def mesh_pair(
     upper = [upper_product(p, elements), sparse.triu(linear)]
     del p, elements
     if stars is not None and len(stars):
-        extra = _star_pair(surface.points, stars)
+        extra = _star_pair(points, stars)
         upper = [part + sparse.triu(extra) for part in upper]
         mass = mass + _row_sums(extra)
     near = stored(upper.pop(), None, numbering)
     pair = stored(upper.pop(), rim, numbering)
-    counts = torch.stack([surface.fits.degree, surface.fits.reason, *edges])
+    reached = torch.where(fits.degree > 0, fits.surface.degree, 0)
+    counts = torch.stack([reached, fits.surface.reason, *edges])
     return WeakPair(pair, near, torch.from_numpy(mass), counts)
-
-
-def fitted_surface(
-    points: Float[Tensor, "N n"], faces: Int[Tensor, "F 3"], fits: VertexFits
-) -> Surface:
-    """A mesh in the plane or in space with the fits of its vertices, in space."""
-    if points.shape[1] == 2:
-        points, fits = pad(points, (0, 1)), copy(fits)
-        fits.frames, fits.heights = pad(fits.frames, (0, 0, 0, 1)), pad(fits.heights, (0, 1))
-    outward = vertex_normals(points, faces)
-    normals = normals_of_frames(fits.frames)
-    normals = normals * (normals * outward).sum(1, keepdim=True).sign()
-    return Surface(points, fits.frames, normals, fits)
 
 
 def upper_product(p: Any, matrix: sparse.csr_array) -> sparse.csr_array:

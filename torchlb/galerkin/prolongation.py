@@ -10,30 +10,32 @@ from scipy import sparse
 from torch import Tensor
 
 from torchlb.fits.weights import cardinal
-from torchlb.galerkin.curving import CurvedMesh, Ends, Surface, node_ends
+from torchlb.galerkin.curving import CurvedMesh, Ends, node_ends
 from torchlb.geometry.vectors import at
-from torchlb.geometry.vertex_fits import Fits
+from torchlb.geometry.vertex_fits import Fits, VertexFits
 
 AT_ONCE = 2**11
 """Vertices whose nodes are looked at together: some 10 MB at degree 4."""
 
 
-def prolongation(surface: Surface, mesh: CurvedMesh) -> sparse.csr_array:
+def prolongation(
+    points: Float[Tensor, "N n"], fits: VertexFits, mesh: CurvedMesh
+) -> sparse.csr_array:
     """P, (N + X, N): what the vertices' fits say at the nodes, weighted by barycentrics. Its rows sum to one.
 
     Identity rows at the vertices, linear ones at flat nodes, and those of the boundary's own curves along it.
     """
-    count, ends = len(surface.points), node_ends(mesh.nodes)
-    row, col, value, by_fit = _without_fits(surface, mesh, ends)
+    count, ends = len(points), node_ends(mesh.nodes)
+    row, col, value, by_fit = _without_fits(points, mesh, ends)
     rows = torch.cat([row, count + ends.node[by_fit]])
-    length = torch.cat([torch.ones_like(row), surface.fits.size[ends.vertex[by_fit]]])
+    length = torch.cat([torch.ones_like(row), fits.size[ends.vertex[by_fit]]])
     indptr, start = _places(rows, length, len(mesh.places))
     total = int(indptr[-1])
     indices, data = torch.empty(total, dtype=torch.int32), value.new_empty(total)
     alone, first = start[: len(row)], torch.zeros_like(ends.node)
     indices[alone], data[alone] = col.int(), value
     first[by_fit] = start[len(row) :]
-    _fill(indices, data, first, surface, mesh, ends, by_fit)
+    _fill((indices, data, first), points, fits, mesh, ends, by_fit)
     shape = len(mesh.places), count
     p = sparse.csr_array((data.numpy(), indices.numpy(), indptr.numpy()), shape=shape)
     p.sum_duplicates()
@@ -42,13 +44,13 @@ def prolongation(surface: Surface, mesh: CurvedMesh) -> sparse.csr_array:
 
 
 def _without_fits(
-    surface: Surface, mesh: CurvedMesh, ends: Ends
+    points: Tensor, mesh: CurvedMesh, ends: Ends
 ) -> tuple[Tensor, Tensor, Tensor, Bool[Tensor, " E"]]:
     """(row, column, value) of the vertices, of flat nodes and of those along the boundary; and which ends are left."""
-    vertices = torch.arange(len(surface.points))
+    vertices = torch.arange(len(points))
     of_rim, flat, by_fit = _rim_entries(mesh), ~mesh.bent[ends.node], mesh.bent.clone()
     by_fit[of_rim[0]] = False
-    entries = [(vertices, vertices, surface.points.new_ones(len(vertices)))]
+    entries = [(vertices, vertices, points.new_ones(len(vertices)))]
     for node, vertex, weight in (of_rim, (ends.node[flat], ends.vertex[flat], ends.share[flat])):
         entries.append((len(vertices) + node, vertex, weight))
     row, col, value = (torch.cat(parts) for parts in zip(*entries, strict=True))
@@ -56,24 +58,24 @@ def _without_fits(
 
 
 def _fill(
-    indices: Int[Tensor, " nnz"],
-    data: Float[Tensor, " nnz"],
-    first: Int[Tensor, " E"],
-    surface: Surface,
+    entries: tuple[Int[Tensor, " nnz"], Float[Tensor, " nnz"], Int[Tensor, " E"]],
+    points: Float[Tensor, "N n"],
+    fits: VertexFits,
     mesh: CurvedMesh,
     ends: Ends,
     by_fit: Bool[Tensor, " E"],
 ) -> None:
-    """The entries that come from fits, of each end from its `first` on; the fits are gone thereafter."""
-    count = len(surface.points)
-    for block, part, own in _of_fits(surface.fits.hand_over(), ends, by_fit, count):
+    """The indices and data that come from fits, of each end from its `first` on; the fits are gone thereafter."""
+    indices, data, first = entries
+    for block, part, own in _of_fits(fits.hand_over(), ends, by_fit, len(points)):
         used, vertex = own >= 0, block.vertices[part]
         end = own.clamp_min(0)
-        offset = at(mesh.places, count + at(ends.node, end)) - surface.points[vertex, None]
-        y = offset @ surface.frames[vertex] / surface.fits.radius[vertex, None, None]
-        weights = (
-            cardinal(block.coefficients[part], y, block.degree) * at(ends.share, end)[..., None]
+        offset = fits.reach * (
+            at(mesh.places, len(points) + at(ends.node, end)) - points[vertex, None]
         )
+        y = offset @ fits.frames[vertex] / fits.radius[vertex, None, None]
+        weights = cardinal(block.coefficients[part], y, block.degree)
+        weights = weights * at(ends.share, end)[..., None]
         place = first[own[used]][:, None] + torch.arange(weights.shape[2])
         indices[place] = block.points[part].int()[used.nonzero()[:, 0]]
         data[place] = weights[used]

@@ -97,8 +97,8 @@ def refine_frames(
 ) -> tuple[Float[Tensor, "B n d"], Int[Tensor, " B"]]:
     """Frames of order q at `centers`, by fits of degree q to the heights over those of `balls`.
 
-    Each centre takes the first candidate whose fit is regular, and has a tilt below 60°. Such fits are kept in `fits`,
-    too, where the weak form finds them.
+    Each centre takes the first candidate whose fit is regular, and has a tilt below 60°. What such fits say of the
+    surface is kept in `fits`, and these try the same neighbourhoods.
 
     Returns
     -------
@@ -121,7 +121,9 @@ def refine_frames(
         regular = is_regular(fit, middles[rows])
         passed = regular & _cosine_bound(slope) & refined.isfinite().all(-1).all(-1)
         if fits is not None:
-            fits.take(centers[rows], index, fit, heights, regular)
+            fits.surface.take(centers[rows], fit, heights, regular)
+            if number == 0:
+                fits.offer(centers[rows], index)
         frames[rows[passed]] = refined[passed]
         order[rows[passed]] = candidates[number].degree
         search.settle(rows[passed])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from math import ceil
 from typing import NamedTuple
 
@@ -39,7 +40,7 @@ class Fits(NamedTuple):
     Attributes
     ----------
     vertices : (b,).
-    degree : m.
+    degree : to which they are kept.
     points : (b, K), the vertex first; padded by the vertex, whose coefficients are then zero.
     coefficients : (b, M − 1, K − 1), as in `CenteredFit`.
     """
@@ -56,11 +57,13 @@ class _Pile:
     In large pieces: thousands of arrays that stay, between those that come and go, would scatter the memory.
     """
 
-    def __init__(self, degree: int, room: int, size: int, terms: int, like: Tensor) -> None:
+    def __init__(
+        self, degree: int, size: int, room: int, like: Float[Tensor, "b M neighbors"]
+    ) -> None:
         self.degree, self.filled = degree, 0
         self.vertices = torch.empty(room, dtype=torch.int64)
         self.points = torch.empty(room, size, dtype=torch.int64)
-        self.coefficients = like.new_empty(room, terms, size - 1)
+        self.coefficients = like.new_empty(room, *like.shape[1:])
 
     def add(
         self,
@@ -81,35 +84,77 @@ class _Pile:
         return Fits(self.vertices[:n], self.degree, self.points[:n], self.coefficients[:n])
 
 
-class VertexFits:
-    """Fits of the highest degree that passes at each vertex.
+class Graphs:
+    """The surface near each vertex as a graph over its initial frame, by the fit of the highest degree that follows it.
 
-    A fit passes if its Lebesgue constant is bounded and the heights are followed. Those of the first degree come from
-    `refine_frames`, which makes them anyway; `complete` makes the others, also of fewer points.
+    Attributes
+    ----------
+    degree : (N,), m of each fit; 0 where there is none.
+    heights : (N, M − 1, n), ℓ: over the tangent plane, as vectors; zero beyond a fit's own monomials.
+    radius : (N,), ℓ.
+    reason : (N,), why the highest degree was not reached, a place in `REASONS`.
+    """
+
+    def __init__(self, balls: GraphBalls, degree: int) -> None:
+        points, self.highest = balls.points, degree
+        self.degree = torch.zeros(len(points), dtype=torch.int64)
+        self.heights = points.new_zeros(len(points), num_monomials(2, degree) - 1, points.shape[1])
+        self.radius = points.new_ones(len(points))
+        self.reason = torch.ones_like(self.degree)
+
+    def take(
+        self,
+        vertices: Int[Tensor, " B"],
+        fit: CenteredFit,
+        heights: Float[Tensor, "B neighbors n"],
+        regular: Bool[Tensor, " B"],
+    ) -> Bool[Tensor, " B"]:
+        """Keep the regular fits that follow the heights where there was none of their degree; and which do follow."""
+        good = regular & (fit.misfit(heights) <= MAX_MISFIT.get(fit.degree, FAITHFUL))
+        vacant = self.degree[vertices] < fit.degree
+        if fit.degree == self.highest:
+            reason = torch.where(good, 0, torch.where(regular, 3, 2))
+            self.reason[vertices] = torch.where(vacant, reason, self.reason[vertices])
+        new = good & vacant
+        kept, terms = vertices[new], fit.coefficients.shape[1]
+        self.heights[kept, :terms] = fit.coefficients[new] @ heights[new]
+        self.radius[kept], self.degree[kept] = fit.radius[new], fit.degree
+        return good
+
+
+class VertexFits:
+    """Fits of functions at the vertices: the first of the degrees whose Lebesgue constant is bounded there.
+
+    Of fits of degree 2 and 3 only the gradient is kept, for the cubic Hermite interpolant in the middles of edges:
+    (u_a + u_b)/2 + (∂u_a − ∂u_b)/8, ∂ along the edge, which is the mean of u_a + ∇u_a·y half of the way there.
 
     Parameters
     ----------
     balls : neighbourhoods, and the frames that the fits are over.
     degrees : m, best first.
+    surface_degree : the highest degree of the `surface`, which those of functions are the last resort for.
 
     Attributes
     ----------
+    surface : the graphs that the nodes stand on.
     frames : (N, n, d).
     degree : (N,), m of each fit; 0 where none passed, which leaves the vertex flat.
-    heights : (N, M − 1, n), ℓ: of the surface over the tangent plane, as vectors; zero beyond a fit's own monomials.
+    reach : of the way to a node, where fits are asked.
     radius : (N,), ℓ.
     size : (N,), number of points of each fit, the vertex among them.
-    reason : (N,), why the first degree was not reached, a place in `REASONS`.
     """
 
-    def __init__(self, balls: GraphBalls, degrees: tuple[int, ...]) -> None:
-        points, self.frames, self.degrees = balls.points, balls.frames, degrees
-        count, terms = len(points), num_monomials(2, degrees[0]) - 1
-        self.degree = torch.zeros(count, dtype=torch.int64)
-        self.heights = points.new_zeros(count, terms, points.shape[1])
-        self.radius = points.new_ones(count)
+    def __init__(
+        self, balls: GraphBalls, degrees: tuple[int, ...], surface_degree: int = 0
+    ) -> None:
+        self._balls, self._degrees = balls, degrees
+        self.surface = Graphs(balls, max(surface_degree, degrees[0]))
+        self.frames = balls.frames
+        self._jet, self.reach = (1, 0.5) if degrees[0] <= 3 else (degrees[0], 1.0)
+        self.degree = torch.zeros(len(balls.points), dtype=torch.int64)
+        self.radius = balls.points.new_ones(len(balls.points))
         self.size = torch.zeros_like(self.degree)
-        self.reason = torch.ones_like(self.degree)
+        self._tried = torch.zeros_like(self.degree)
         self._piles: dict[tuple[int, int], list[_Pile]] = {}
 
     def hand_over(self) -> list[Fits]:
@@ -120,66 +165,42 @@ class VertexFits:
         self._piles.clear()
         return found
 
-    def take(
-        self,
-        vertices: Int[Tensor, " B"],
-        index: Int[Tensor, "B K"],
-        fit: CenteredFit,
-        heights: Float[Tensor, "B neighbors n"],
-        regular: Bool[Tensor, " B"],
-    ) -> None:
-        """Keep those of the regular fits that follow the heights, for vertices that have none yet."""
-        degree, terms = fit.degree, fit.coefficients.shape[1]
-        if degree not in self.degrees:
-            return
-        good = regular & (fit.misfit(heights) <= MAX_MISFIT.get(degree, FAITHFUL))
-        vacant = self.degree[vertices] == 0
-        if degree == self.degrees[0]:
-            reason = torch.where(good, 0, torch.where(regular, 3, 2))
-            self.reason[vertices] = torch.where(vacant, reason, self.reason[vertices])
-        good &= vacant
-        if not good.any():
-            return
-        kept, coefficients, kind = vertices[good], fit.coefficients[good], (degree, index.shape[1])
-        piles = self._piles.setdefault(kind, [])
-        if not piles or piles[-1].filled + len(kept) > len(piles[-1].vertices):
-            room = max(len(kept), min(ROOM, int((self.degree == 0).sum())))
-            piles.append(_Pile(degree, room, index.shape[1], terms, coefficients))
-        piles[-1].add(kept, index[good], coefficients)
-        self.degree[kept], self.size[kept] = kind
-        self.heights[kept, :terms] = coefficients @ heights[good]
-        self.radius[kept] = fit.radius[good]
+    def offer(self, vertices: Int[Tensor, " B"], index: Int[Tensor, "B K"]) -> None:
+        """Neighbourhoods that are there anyway: the nearest of them are the first that a fit tries."""
+        size = list_candidates(2, self._degrees)[0].size
+        if index.shape[1] >= size:
+            self._tried[vertices] = 1
+            self._try(vertices, index[:, :size], self._degrees[0])
 
-    def complete(self, balls: GraphBalls) -> VertexFits:
-        """The same; the vertices without a fit have tried the degrees in turn."""
-        for degree in self.degrees:
+    def complete(self) -> VertexFits:
+        """The same; vertices without a fit have tried the degrees, with more neighbours in turn, or with all of few."""
+        for degree in self._degrees:
             sizes = list_candidates(2, [degree])
-            left = self.degree == 0
-            if degree == self.degrees[0]:
-                left &= self.reason == 1
-            for vertices in left.nonzero()[:, 0].split(AT_ONCE):
-                search = Search(balls, vertices, sizes)
+            for vertices in (self.degree == 0).nonzero()[:, 0].split(AT_ONCE):
+                start = self._tried[vertices] if degree == self._degrees[0] else None
+                search = Search(self._balls, vertices, sizes, start)
                 for _, rows, index in search:
-                    self._try(balls, vertices[rows], index, degree)
-                    search.settle(rows[self.degree[vertices[rows]] > 0])
-                least, few = 1 + ceil(LEAST * (num_monomials(2, degree) - 1)), sizes[0].size
+                    search.settle(rows[self._try(vertices[rows], index, degree)])
                 vertices = vertices[self.degree[vertices] == 0]
-                index, count = balls(vertices, few)
+                least, few = 1 + ceil(LEAST * (num_monomials(2, degree) - 1)), sizes[0].size
+                index, count = self._balls(vertices, few)
                 some = (count >= least) & (count < few)
                 keep = torch.arange(1, few) < count[some, None]
-                self._try(balls, vertices[some], index[some], degree, keep)
+                self._try(vertices[some], index[some], degree, keep)
+        del self._balls
         return self
 
     def _try(
         self,
-        balls: GraphBalls,
         vertices: Int[Tensor, " B"],
         index: Int[Tensor, "B K"],
         degree: int,
         keep: Bool[Tensor, "B neighbors"] | None = None,
-    ) -> None:
+    ) -> Bool[Tensor, " B"]:
+        """Keep the fits of the degree that pass; which do."""
         if len(vertices) == 0:
-            return
+            return torch.zeros(0, dtype=torch.bool)
+        balls = self._balls
         here, frame = balls.points[vertices, None], balls.frames[vertices]
         offset = balls.points[index[:, 1:]] - here
         coords = offset @ frame
@@ -188,18 +209,33 @@ class VertexFits:
             heights = heights * keep[..., None]
         fit = centered_fit(coords, degree, keep)
         middles = (balls.points[balls.longest[vertices]] - here) @ frame / 2
-        self.take(vertices, index, fit, heights, is_regular(fit, middles))
+        jet = min(degree, self._jet)
+        terms = num_monomials(2, jet) - 1
+        kept = replace(
+            fit,
+            coefficients=fit.coefficients[:, :terms],
+            values=fit.values[..., :terms],
+            degree=jet,
+        )
+        regular = is_regular(kept, middles)
+        good = self.surface.take(vertices, fit, heights, regular)
+        if good.any():
+            found, size = vertices[good], index.shape[1]
+            pile = self._pile((kept.degree, size), kept.coefficients[good])
+            pile.add(found, index[good], kept.coefficients[good])
+            self.degree[found], self.size[found] = degree, size
+            self.radius[found] = fit.radius[good]
+        return good
+
+    def _pile(self, kind: tuple[int, int], like: Float[Tensor, "b M neighbors"]) -> _Pile:
+        """With room for as many as `like`."""
+        piles = self._piles.setdefault(kind, [])
+        if not piles or piles[-1].filled + len(like) > len(piles[-1].vertices):
+            room = max(len(like), min(ROOM, int((self.degree == 0).sum())))
+            piles.append(_Pile(*kind, room, like))
+        return piles[-1]
 
 
 def is_regular(fit: CenteredFit, middles: Float[Tensor, "B E d"]) -> Bool[Tensor, " B"]:
     """Whether the neighbours determine a fit, and well in the middles of the edges, ℓ: `MAX_LEBESGUE`."""
     return (fit.residual <= MAX_RESIDUAL) & (fit.lebesgue(middles) <= MAX_LEBESGUE)
-
-
-def fit_size(dim: int, degree: int) -> int:
-    """Points of a fit, the centre among them: those of the first candidate.
-
-    >>> [fit_size(2, m) for m in (2, 4, 6)]
-    [10, 24, 45]
-    """
-    return list_candidates(dim, [degree])[0].size

@@ -99,8 +99,15 @@ def checked_method(method: str) -> Method:
 def _flow(
     lb: LaplaceBeltrami, x: Tensor, time: Tensor, method: str, k: int, tolerance: float
 ) -> Tensor:
-    """e^{tΔ}x in the type of x, which is float32 or float64; autocast has to be off."""
+    """e^{tΔ}x in the type of x, which is float32 or float64; autocast has to be off.
+
+    The surfaces of a stack (B, N, C) become channels.
+    """
     check_tolerance(tolerance)
+    if x.ndim == 3:
+        columns, times = x.transpose(0, 1).flatten(1), time.repeat(len(x))
+        y = _flow(lb, columns, times, method, k, tolerance)
+        return y.view(x.shape[1], x.shape[0], x.shape[2]).transpose(0, 1)
     if method == "spectral":
         return _spectral(lb.eigenbasis(k), x, time)
     if method == "deflated":

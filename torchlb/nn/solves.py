@@ -143,9 +143,9 @@ def potential(
     check_tolerance(tolerance)
     products = []
     if source is not None:
-        products.append(_weights(lb, source)[:, None] * source)
+        products.append(lb.mass.to(source.dtype)[:, None] * source)
     if field is not None:
-        weighted = _weights(lb, field)[:, None, None] * field
+        weighted = lb.mass.to(field.dtype)[:, None, None] * field
         products += [
             lb._apply_rows(values, part, transposed=True)
             for values, part in zip(lb.gradient_values, weighted.unbind(-2), strict=True)
@@ -157,11 +157,6 @@ def potential(
     assert source is not None, "neither field nor source"
     u = _solve(columns, None, None, None, lb, tolerance)
     return _shaped(u, source, source.dtype)
-
-
-def _weights(lb: LaplaceBeltrami, x: Tensor) -> Tensor:
-    """The mass in the type of x, at least float32: areas leave the range of float16."""
-    return lb.mass.to(torch.promote_types(x.dtype, torch.float32))
 
 
 def _columns(

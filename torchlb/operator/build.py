@@ -78,7 +78,7 @@ class Options:
         """With the choices that were left open: a pair where there can be one, the certificate where there is none."""
         if self.weak_form and not triangles:
             raise InputError(
-                "weak_form: only triangle meshes and clouds of surfaces in R² and R³ have one; leave it out, and the "
+                "weak_form: only triangle meshes, and clouds of surfaces in R² and R³, have one; leave it out, and the "
                 "certificate makes the stencil stable instead"
             )
         weak = triangles if self.weak_form is None else self.weak_form
@@ -239,7 +239,7 @@ def numbered_mesh(
     """
     numbering = Numbering.along_tree(points)
     here, (corners, order) = numbering.sorted(points), numbering.faces(faces)
-    if flip:
+    if flip and points.shape[1] <= 3:
         corners = flipped(pad(here, (0, 3 - here.shape[1])), corners)
     return numbering, here, corners, order
 
@@ -258,7 +258,7 @@ def build_mesh(
     corners = check_faces(faces, len(vertices))
     options.check(len(vertices), vertices.shape[1], corners.shape[1] - 1)
     corners = given = mended_faces(vertices, corners)
-    options = options.settled(corners.shape[1] == 3 and vertices.shape[1] <= 3)
+    options = options.settled(corners.shape[1] == 3)
     degree, degrees = options.elements
     if isinstance(boundary, str) and boundary in CONDITIONS:
         raise InputError(

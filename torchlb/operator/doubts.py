@@ -28,7 +28,7 @@ ASTRAY = 0.02
 def warn_of_doubts(surface: CloudSurface, fits: VertexFits, mass: Float[Tensor, " N"]) -> None:
     """Warnings that name points where a cloud does not resolve its surface, if they are many or hold much of it."""
     apart = ~torch.isin(torch.arange(len(surface.points)), surface.faces)
-    doubtful = (fits.reason == REASONS.index("points do not resolve the surface")) | apart
+    doubtful = (fits.surface.reason == REASONS.index("points do not resolve the surface")) | apart
     flat = (fits.degree == 0) | apart
     large = float(mass[flat].sum() / mass.sum()) >= DOUBTFUL
     doubtful |= flat & large

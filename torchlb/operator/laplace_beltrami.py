@@ -143,8 +143,8 @@ class LaplaceBeltrami(StencilFace, WeakFace):
         boundary : (N,) mask of the part of the boundary where the condition holds; the rest has none. By default, or
             for "detect", all the boundary that the faces have, if any.
         order, normal_order, projection, weights, num_neighbors, condition, weak_form, certify, progress : as for
-            `from_points`. The order chooses the elements of the weak pair, too (degree of elements, of fits): 1 and 2
-            (2, 2), 3 (2, 4), 4 (3, 4), 5 and above (4, 6).
+            `from_points`. The order chooses the weak pair, too (degree of elements, of fits of functions): 1 and 2
+            (2, 2), 3 (2, 3), 4 (3, 4), 5 and above (4, 6); its surface is that of the frames, of degree q.
 
         Raises
         ------

@@ -8,7 +8,6 @@ from torch.utils.weak import WeakIdKeyDictionary
 
 from torchlb.errors import InputError
 from torchlb.galerkin.medium import Medium
-from torchlb.galerkin.pair import fitted_surface
 from torchlb.operator.build import Options, numbered_mesh
 from torchlb.operator.laplace_beltrami import LaplaceBeltrami
 from torchlb.stencils.shape import mesh_shape
@@ -47,10 +46,9 @@ def _made(lb: LaplaceBeltrami) -> Medium:
         options.q,
         num_neighbors=options.num_neighbors,
         condition=None,
-        areas=points.new_ones(len(points)),
         fit_degrees=degrees,
         progress=False,
     )
     assert shape.fits is not None
-    medium = Medium.curved(fitted_surface(points, faces, shape.fits), faces, degree)
+    medium = Medium.curved(points, faces, shape.fits, degree)
     return medium.restored(numbering, order)

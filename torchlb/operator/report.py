@@ -30,7 +30,7 @@ class StencilReport:
     off_diagonal_ratio : (N,), Σ_{j≠i}|w_ij| / |w_ii|; 1 for an M-matrix row.
     rule : (N,), place of the rule for the weights in `WEIGHT_RULES`; their number for a low-order row.
     reason : (N,), why the row is below the requested order, a `Reason`.
-    fit_degree : (N,), degree of the fit behind the weak pair; 0 where the surface is left flat.
+    fit_degree : (N,), degree of the surface of the weak pair; 0 where it is left flat.
     fit_reason : (N,), why that is not higher, a place in `REASONS`.
     edges, curved_edges : (N,), number of edges at each vertex, and of those that are curved; zero without a weak pair.
     surface : what was found of the surface through a cloud; None on a mesh.
@@ -125,7 +125,7 @@ class StencilReport:
         if self.edges.any():
             lines.append(f"weak pair: {100 * self.curved_share:.2f} % of the edges curved")
             for degree, count in self.fit_counts.items():
-                name = f"fit of degree {degree}" if degree else "flat"
+                name = f"surface of degree {degree}" if degree else "flat"
                 lines.append(f"  {name:<31}{count:>9}  {100 * count / total:6.2f} %")
             below = torch.bincount(self.fit_reason, minlength=len(REASONS)).tolist()
             for text, count in zip(REASONS[1:], below[1:], strict=True):

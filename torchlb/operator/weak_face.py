@@ -7,6 +7,7 @@ from torch import Tensor
 
 from torchlb.errors import InputError
 from torchlb.linalg.sparse import csr_tensor, to_scipy
+from torchlb.operator.batching import shapes_of
 from torchlb.operator.checks import check_tolerance
 from torchlb.operator.storage import OperatorStorage
 from torchlb.spectral.eigenbasis import (
@@ -91,9 +92,8 @@ class WeakFace(OperatorStorage):
         """At least k eigenpairs, all that are solved, so that their span is invariant under Δ; else as `eigenbasis`."""
         k = check_num_pairs(k)
         check_tolerance(tolerance)
-        missing = self.basis_left.shape[-1] < min(k, max(self.sizes or (self.num_points,)))
-        if missing or (tolerance is not None and (self.basis_relative_errors > tolerance).any()):
-            pair = self.has_weak_form
+        errors = self.basis_relative_errors[..., :k]
+        if not self.has_pairs(k) or (tolerance is not None and (errors > tolerance).any()):
             with torch.inference_mode(False):  # it is kept, and a training may follow
                 self.keep_basis(self._solved_basis(max(k, self.num_pairs), tolerance))
         if store:

@@ -34,7 +34,7 @@ from torchlb.geometry.orientation import (
     thin_sides,
 )
 from torchlb.geometry.surface import CloudSurface
-from torchlb.geometry.vertex_fits import VertexFits, fit_size
+from torchlb.geometry.vertex_fits import VertexFits
 from torchlb.stencils.conditions import Condition, Neumann
 from torchlb.stencils.low_order import (
     CloudLowOrder,
@@ -105,7 +105,7 @@ def cloud_shape(
         oriented = orient_normals(points, normals_of_frames(initial), pairs)
         normals = oriented if normals is None else normals
         sides = thin_sides(points, oriented, pairs)
-    balls, order = _refined(
+    balls, order, _ = _refined(
         GraphBalls(points, graph, initial, sides), normal_order, num_neighbors, progress
     )
     frames = balls.frames
@@ -152,8 +152,7 @@ def mesh_shape(
             candidates = nearest_neighbors(vertices, min(CANDIDATES[2], len(vertices)))
             sides = thin_sides(vertices, reference, nearest_pairs(candidates))
     start = GraphBalls(vertices, graph, initial, sides)
-    fits = VertexFits(start, fit_degrees) if fit_degrees else None
-    balls, order = _refined(start, normal_order, num_neighbors, progress, fits)
+    balls, order, fits = _refined(start, normal_order, num_neighbors, progress, fit_degrees)
     edge = None
     if condition is not None or boundary is not None:
         edge = boundary_of_mesh(vertices, faces, balls.frames, normal_order)
@@ -170,7 +169,6 @@ def mesh_shape(
         of_mesh = isinstance(low_order, MeshLowOrder)
         areas = low_order.areas() if of_mesh else simplex_shares(vertices, faces)
     shape = _oriented(balls, reference, order, areas, low_order, edge, condition)
-    fits = None if fits is None else fits.complete(start)
     return replace(shape, on_mesh=isinstance(low_order, MeshLowOrder), fits=fits)
 
 
@@ -197,8 +195,7 @@ def surface_shape(
     if not flat:
         sides = thin_sides(points, surface.normals, nearest_pairs(surface.neighbors))
     start = GraphBalls(points, mesh_graph(triangles, len(points)), initial, sides)
-    fits = VertexFits(start, fit_degrees) if fit_degrees else None
-    balls, order = _refined(start, normal_order, num_neighbors, progress, fits)
+    balls, order, fits = _refined(start, normal_order, num_neighbors, progress, fit_degrees)
     edge = None
     if condition is not None:
         edge = boundary_of_mesh(points, surface.faces, balls.frames, normal_order)
@@ -210,7 +207,7 @@ def surface_shape(
     low_order = MeshLowOrder(points, triangles)
     reference = None if flat else surface.normals if normals is None else normals
     shape = _oriented(balls, reference, order, low_order.areas(), low_order, edge, condition)
-    return replace(shape, fits=None if fits is None else fits.complete(start))
+    return replace(shape, fits=fits)
 
 
 def _part(boundary: Boundary | None, mask: Bool[Tensor, " N"]) -> Boundary | None:
@@ -243,29 +240,25 @@ def _refined(
     degree: int,
     num_neighbors: int | None,
     progress: bool,
-    fits: VertexFits | None = None,
-) -> tuple[GraphBalls, Int[Tensor, " N"]]:
+    fit_degrees: tuple[int, ...] = (),
+) -> tuple[GraphBalls, Int[Tensor, " N"], VertexFits | None]:
     """The same neighbourhoods with frames of order q, in chunks; the initial ones if q = 0 or in a flat space.
 
-    The `fits` are filled on the way where they ask for the same polynomials of the same points.
+    And fits of functions, if `fit_degrees` asks for some, with what the frames' fits say of the surface.
     """
-    points, initial = balls.points, balls.frames
-    if degree == 0 or initial.shape[1] == initial.shape[2]:
-        return balls, torch.full((len(points),), degree)
-    candidates = list_candidates(
-        initial.shape[-1], range(degree, 0, -1), num_neighbors=num_neighbors
-    )
-    shared = candidates[0].size == fit_size(initial.shape[-1], degree)
-    fits = fits if fits is not None and shared and degree == fits.degrees[0] else None
-    parts = torch.arange(len(points)).split(AT_ONCE)
-    bar = tqdm(parts, "tangent frames", delay=2, disable=not progress, leave=False)
-    found, order = zip(
-        *(refine_frames(balls, centers, candidates, fits) for centers in bar),
-        strict=True,
-    )
-    frames = torch.cat(found)
-    sides = _follow(balls.sides, frames)
-    return balls.with_frames(frames, sides), torch.cat(order)
+    points, frames, refined = balls.points, balls.frames, balls
+    surface_degree = 0 if frames.shape[1] == frames.shape[2] else degree
+    fits = VertexFits(balls, fit_degrees, surface_degree) if fit_degrees else None
+    order = torch.full((len(points),), degree)
+    if surface_degree > 0:
+        degrees = range(degree, 0, -1)
+        candidates = list_candidates(frames.shape[-1], degrees, num_neighbors=num_neighbors)
+        parts = torch.arange(len(points)).split(AT_ONCE)
+        bar = tqdm(parts, "tangent frames", delay=2, disable=not progress, leave=False)
+        found = [refine_frames(balls, centers, candidates, fits) for centers in bar]
+        frames, order = (torch.cat(part) for part in zip(*found, strict=True))
+        refined = balls.with_frames(frames, _follow(balls.sides, frames))
+    return refined, order, None if fits is None else fits.complete()
 
 
 def _oriented(
