@@ -19,6 +19,7 @@ from torchlb.geometry.vectors import at
 from torchlb.geometry.vertex_fits import VertexFits
 
 ROUNDS = 2
+"""Of moving the nodes to the graphs of their vertices."""
 RIM = {2: 6, 3: 6, 4: 8}
 """Vertices that a curve along the boundary goes through, by the degree of the elements."""
 AGREE, STEEP = 0.075, 0.3

@@ -123,7 +123,7 @@ def refine_frames(
         if fits is not None:
             fits.surface.take(centers[rows], fit, heights, regular)
             if number == 0:
-                fits.offer(centers[rows], index)
+                fits.offer(centers[rows], index, fit, heights)
         frames[rows[passed]] = refined[passed]
         order[rows[passed]] = candidates[number].degree
         search.settle(rows[passed])

@@ -165,12 +165,22 @@ class VertexFits:
         self._piles.clear()
         return found
 
-    def offer(self, vertices: Int[Tensor, " B"], index: Int[Tensor, "B K"]) -> None:
-        """Neighbourhoods that are there anyway: the nearest of them are the first that a fit tries."""
-        size = list_candidates(2, self._degrees)[0].size
-        if index.shape[1] >= size:
-            self._tried[vertices] = 1
-            self._try(vertices, index[:, :size], self._degrees[0])
+    def offer(
+        self,
+        vertices: Int[Tensor, " B"],
+        index: Int[Tensor, "B K"],
+        fit: CenteredFit,
+        heights: Float[Tensor, "B neighbors n"],
+    ) -> None:
+        """Neighbourhoods that are there anyway: the nearest are tried first, by the same fit if it is that."""
+        first = list_candidates(2, self._degrees)[0]
+        if index.shape[1] < first.size:
+            return
+        self._tried[vertices] = 1
+        if (fit.degree, index.shape[1]) == (first.degree, first.size):
+            self._keep(vertices, index, fit, heights)
+        else:
+            self._try(vertices, index[:, : first.size], first.degree)
 
     def complete(self) -> VertexFits:
         """The same; vertices without a fit have tried the degrees, with more neighbours in turn, or with all of few."""
@@ -197,7 +207,7 @@ class VertexFits:
         degree: int,
         keep: Bool[Tensor, "B neighbors"] | None = None,
     ) -> Bool[Tensor, " B"]:
-        """Keep the fits of the degree that pass; which do."""
+        """Make the fits of the degree, and keep those that pass; which do."""
         if len(vertices) == 0:
             return torch.zeros(0, dtype=torch.bool)
         balls = self._balls
@@ -207,9 +217,20 @@ class VertexFits:
         heights = offset - coords @ frame.mT
         if keep is not None:
             heights = heights * keep[..., None]
-        fit = centered_fit(coords, degree, keep)
-        middles = (balls.points[balls.longest[vertices]] - here) @ frame / 2
-        jet = min(degree, self._jet)
+        return self._keep(vertices, index, centered_fit(coords, degree, keep), heights)
+
+    def _keep(
+        self,
+        vertices: Int[Tensor, " B"],
+        index: Int[Tensor, "B K"],
+        fit: CenteredFit,
+        heights: Float[Tensor, "B neighbors n"],
+    ) -> Bool[Tensor, " B"]:
+        """Keep the fits that pass; which do."""
+        balls = self._balls
+        longest = balls.points[balls.longest[vertices]] - balls.points[vertices, None]
+        middles = longest @ balls.frames[vertices] / 2
+        jet = min(fit.degree, self._jet)
         terms = num_monomials(2, jet) - 1
         kept = replace(
             fit,
@@ -223,7 +244,7 @@ class VertexFits:
             found, size = vertices[good], index.shape[1]
             pile = self._pile((kept.degree, size), kept.coefficients[good])
             pile.add(found, index[good], kept.coefficients[good])
-            self.degree[found], self.size[found] = degree, size
+            self.degree[found], self.size[found] = fit.degree, size
             self.radius[found] = fit.radius[good]
         return good
 
