@@ -254,6 +254,23 @@ def test_factors_take_over_where_sweeps_stall(monkeypatch):
         LaplaceBeltrami.from_mesh(*Ellipsoid().mesh(900)).eigenbasis(10, tolerance=1e-10)
 
 
+def test_a_rough_start_costs_no_digits():
+    """Where the linear pair is far from (K, M): what is kept of the start had products in float32 once."""
+    size, random = 40, np.random.default_rng(0)
+    step = sparse.diags_array([-1.0, 1.0], offsets=[0, 1], shape=(size - 1, size))
+    line = sparse.eye_array(size)
+    edges = sparse.csr_array(sparse.vstack([sparse.kron(step, line), sparse.kron(line, step)]))
+    weights = np.where(random.random(edges.shape[0]) < 0.3, 4.0, 1.0)
+    stiffness = sparse.csr_array(edges.T @ sparse.diags_array(weights) @ edges)
+    near = sparse.csr_array(edges.T @ edges)
+    mass = sparse.csr_array(sparse.eye_array(size**2))
+    basis = pencil_eigenbasis(
+        stiffness, mass, torch.ones(size**2), 20, linear=(near, mass), tolerance=1e-12
+    )
+    exact = linalg.eigh(stiffness.toarray(), subset_by_index=(0, 19), eigvals_only=True)
+    np.testing.assert_allclose(basis.eigenvalues[1:], exact[1:], rtol=1e-11)
+
+
 def test_a_correction_of_zero_leaves_the_space_as_it_is():
     """As where K − λM is not positive in its first direction."""
     stiffness, mass_matrix, _ = weak_pair(5, 6)

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import partial
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -25,7 +25,7 @@ from torchlb.errors import EigenbasisError, warn
 from torchlb.linalg.krylov import prefers_krylov
 from torchlb.linalg.lanczos import Inverse, inverse, lanczos
 from torchlb.linalg.sparse import multiply
-from torchlb.linalg.two_levels import absolute_row_sums, main_entries, two_levels
+from torchlb.linalg.two_levels import Matrix, absolute_row_sums, main_entries, two_levels
 from torchlb.spectral.eigenbasis import Eigenbasis
 from torchlb.spectral.eigensolver import GAP
 
@@ -39,8 +39,10 @@ SHIFT = 10.0
 """Of the factor, over the area of a component: about half of its first eigenvalue, were it a disk."""
 START, EXACT = 3e-3, 1e-8
 """Residuals of Lanczos for the linear pair, whose distance from (K, M) is of that order, and for a pair alone."""
-STEPS, MOST_STEPS, SWEEPS = 3, 24, 20
-"""Steps of conjugate gradients in a sweep, doubled in the next ones up to a bound; bound on the sweeps."""
+REDUCTION, STEPS, SWEEPS = 1e-3, 24, 20
+"""What a sweep leaves of the error of an eigenvalue at least; bounds on its steps and on the sweeps."""
+LAST = 3.0
+"""Energy that the last step takes off, over that of what is left: from step to step it falls to a quarter or less."""
 ROUGH = 0.5
 """Estimated error above which vectors are no start for more than one step, and are kept beside what it gives."""
 SAFETY = 4.0
@@ -218,42 +220,50 @@ def _swept(
     part: _Part, u: np.ndarray, k: int, solve: Inverse, tolerance: float
 ) -> tuple[np.ndarray, ...] | None:
     """Sweeps from the linear pair's eigenvectors until the first k eigenvalues are accurate; None if some never are."""
-    stiffness, mass_matrix = part.stiffness, part.mass_matrix
     assert part.linear is not None
-    cycle, product = _two_levels(stiffness, solve)
-    linear_mass, single = (m.astype(np.float32) for m in (part.linear[1], mass_matrix))
+    whole = part.stiffness, part.mass_matrix
+    exact, single = ([_product(m.astype(t)) for m in whole] for t in (np.float64, np.float32))
+    on_linear_mass, cycle = (
+        _product(part.linear[1].astype(np.float32)),
+        _two_levels(whole[0], solve),
+    )
 
     def shifted(p: np.ndarray, shifts: np.ndarray) -> np.ndarray:
-        return product(p) - (linear_mass @ p) * shifts
+        return single[0](p) - on_linear_mass(p) * shifts
 
-    count, zero, steps = u.shape[1], int(part.conserving), STEPS
+    count, zero = u.shape[1], int(part.conserving)
     u = np.ascontiguousarray(u, dtype=np.float32)
-    values, known = _ritz((u, product(u), single @ u), count)
+    values, known = _ritz((u, *(on(u) for on in single)), count)
     for sweep in range(SWEEPS + 1):
-        u, ku, mu = known
-        residual = ku - mu * values.astype(u.dtype)
+        keep = _closed(values, k, tolerance) if sweep else count
+        (u, ku, mu), shifts = known, values[:keep].astype(known[0].dtype)
+        residual = ku[:, :keep] - mu[:, :keep] * shifts
         size = np.maximum(linalg.norm(residual, axis=0), TINY)
         r = (residual / size).astype(np.float32)
         z = cycle(r)
-        errors = SAFETY * np.abs(_dots(r, z)) * size**2 / np.maximum(np.abs(values), TINY)
+        scale = SAFETY * size**2 / np.maximum(np.abs(values[:keep]), TINY)
+        errors = scale * np.abs(_dots(r, z))
         errors[:zero] = 0.0
-        keep = _closed(values, k, tolerance)
-        if sweep and errors[:keep].max() <= tolerance:
-            return values, errors, u, mu
-        rough = errors[:keep].max() > ROUGH
-        active = np.flatnonzero(errors[:keep] > tolerance) if sweep else np.arange(len(values))
+        if sweep and errors.max() <= tolerance:
+            return values[:keep], errors, u[:, :keep], mu[:, :keep]
+        rough = errors[:k].max() > ROUGH
+        active = np.flatnonzero(errors > tolerance) if sweep else np.arange(keep)
+        enough = LAST * np.maximum(REDUCTION * errors, tolerance) / scale
         small = (u.astype(np.float32), mu.astype(np.float32))
-        right = (r[:, active], z[:, active], values[active].astype(np.float32))
-        w = _correction(shifted, cycle, small, right, 1 if rough else steps).astype(np.float64)
-        if beside := rough or sweep > 0:
+        right = (r, z, values[:keep].astype(np.float32), enough)
+        right = tuple(x.take(active, -1) for x in right)
+        w = _correction(shifted, cycle, small, right, 1 if rough else STEPS).astype(np.float64)
+        if sweep:
             w -= u @ (mu.T @ w)
+        elif rough:
+            w = np.column_stack([u.astype(np.float64), w])
         else:
-            w = u - w * size
-        new = (w, stiffness @ w, mass_matrix @ w)
-        if beside:
+            w, u = u.astype(np.float64), w
+            w[:, active] -= u * size
+        new = (w, *(on(w) for on in exact))
+        if sweep:
             new = tuple(np.column_stack(both) for both in zip(known, new, strict=True))
         values, known = _ritz(new, count)
-        steps = steps if rough else min(2 * steps, MOST_STEPS)
     if prefers_krylov(len(part.points)):
         raise EigenbasisError(
             f"eigenbasis: after {SWEEPS} sweeps the estimated relative error of some of {k} eigenvalues is above "
@@ -266,12 +276,16 @@ def _correction(
     shifted: Callable[[np.ndarray, np.ndarray], np.ndarray],
     cycle: Inverse,
     known: tuple[np.ndarray, np.ndarray],
-    right: tuple[np.ndarray, np.ndarray, np.ndarray],
+    right: tuple[np.ndarray, ...],
     steps: int,
 ) -> np.ndarray:
-    """Conjugate gradients for every column of (K − λM)w = r, M-orthogonal to U; of [U, MU] and [r, cycle(r), λ]."""
-    (u, mu), (r, z, shifts) = known, right
-    w, p, square = np.zeros_like(r), np.zeros_like(r), np.ones(r.shape[1], dtype=r.dtype)
+    """Conjugate gradients for every column of (K − λM)w = r, M-orthogonal to U; of [U, MU] and [r, cycle(r), λ, ε].
+
+    A column ends with a step that takes less than ε off its energy, or the last.
+    """
+    (u, mu), (r, z, shifts, enough) = known, right
+    w, p, square = np.zeros_like(r), np.zeros_like(r), np.ones(r.shape[1], r.dtype)
+    at, found = np.arange(r.shape[1]), []
     for step in range(steps):
         z = z - u @ (mu.T @ z)
         before, square = square, np.maximum(_dots(r, z), 0)  # below zero by rounding alone
@@ -280,24 +294,38 @@ def _correction(
         curvature = _dots(p, product)
         length = np.where(curvature > 0, square / np.where(curvature > 0, curvature, 1), 0)
         w += p * length
-        if step < steps - 1:
-            r = r - product * length
-            z = cycle(r)
-    return w
+        goes_on = (length * square > enough) & (step < steps - 1)
+        ends, stays = np.flatnonzero(~goes_on), np.flatnonzero(goes_on)
+        found.append((at[ends], w.take(ends, 1)))
+        if len(stays) == 0:
+            break
+        parts = r - product * length, w, p, at, square, shifts, enough
+        r, w, p, at, square, shifts, enough = (x.take(stays, -1) for x in parts)
+        z = cycle(r)
+    order, w = (np.concatenate(x, -1) for x in zip(*found, strict=True))
+    return w.take(order.argsort(), 1)
 
 
-def _two_levels(stiffness: Sparse, coarse: Inverse) -> list[Inverse]:
-    """An approximate inverse of K, around a coarse solve, and the product with K, both in float32."""
-    parts = stiffness.indptr, stiffness.indices, stiffness.data.astype(np.float32)
-    crow, col, values = (torch.from_numpy(part) for part in parts)
-    rough = main_entries(crow, col, values)
+def _two_levels(stiffness: Sparse, coarse: Inverse) -> Inverse:
+    """An approximate inverse of K around a coarse solve, in float32."""
+    rough = main_entries(*_tensors(stiffness))
     cycle = two_levels(
         partial(multiply, *rough),
         absolute_row_sums(rough[0], rough[2]),
         lambda r: torch.from_numpy(coarse(r.numpy())),
     )
-    both = cycle, partial(multiply, crow, col, values)
-    return [lambda x, apply=apply: apply(torch.from_numpy(x)).numpy() for apply in both]
+    return lambda r: cycle(torch.from_numpy(r)).numpy()
+
+
+def _product(matrix: Any) -> Inverse:
+    """The product with a matrix, for right sides of its type: scipy's own takes two to four times as long."""
+    parts = _tensors(matrix)
+    return lambda x: multiply(*parts, torch.from_numpy(x)).numpy()
+
+
+def _tensors(matrix: Any) -> Matrix:
+    crow, col, values = map(torch.from_numpy, (matrix.indptr, matrix.indices, matrix.data))
+    return crow, col, values
 
 
 def _dots(x: np.ndarray, y: np.ndarray) -> np.ndarray:
