@@ -254,6 +254,7 @@ def test_factors_take_over_where_sweeps_stall(monkeypatch):
         LaplaceBeltrami.from_mesh(*Ellipsoid().mesh(900)).eigenbasis(10, tolerance=1e-10)
 
 
+@pytest.mark.filterwarnings("error:eigenbasis")
 def test_a_rough_start_costs_no_digits():
     """Where the linear pair is far from (K, M): what is kept of the start had products in float32 once."""
     size, random = 40, np.random.default_rng(0)
