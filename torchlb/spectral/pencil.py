@@ -248,7 +248,7 @@ def _swept(
             return values[:keep], errors, u[:, :keep], mu[:, :keep]
         rough = errors[:k].max() > ROUGH
         active = np.flatnonzero(errors > tolerance) if sweep else np.arange(keep)
-        enough = LAST * np.maximum(REDUCTION * errors, tolerance) / scale
+        enough = LAST * np.maximum(REDUCTION * errors, tolerance) / np.maximum(scale, TINY)
         small = (u.astype(np.float32), mu.astype(np.float32))
         right = (r, z, values[:keep].astype(np.float32), enough)
         right = tuple(x.take(active, -1) for x in right)
