@@ -138,7 +138,7 @@ def _parts(
         whole = order[component[order] == c]
         free = whole[~fixed[whole]]
         k, m, *own = (
-            sparse.csr_array(matrix[free][:, free].T)  # symmetric, and so its columns ascend
+            sparse.csr_array(matrix[free].T)[free]  # symmetric; and so its columns ascend
             for matrix in (stiffness, mass_matrix, *near)
         )
         if len(free):
@@ -356,13 +356,14 @@ def _merged(
     order = np.concatenate([np.array(constants, dtype=int), rest])
     values, errors = values[order], errors[order]
     keep = _closed(values, k, tolerance) if len(values) else 0
-    place = np.full(len(values), keep)
-    place[order[:keep]] = np.arange(keep)
     phi, left = np.zeros((2, len(mass), keep))
     for part, (_, _, *vectors), at in zip(parts, found, columns[:-1], strict=True):
-        to = place[at : at + vectors[0].shape[1]]
+        mine = order[:keep] - at
+        others = (mine < 0) | (mine >= vectors[0].shape[1])
         for whole, own in zip((phi, left), vectors, strict=True):
-            whole[np.ix_(part.points, to[to < keep])] = own[:, to < keep]
+            block = own.take(np.where(others, 0, mine), 1)
+            block[:, others] = 0.0
+            whole[part.points] = block
     count = len(constants)
     if count:
         nulls = [part for part in parts if part.conserving]
