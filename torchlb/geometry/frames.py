@@ -107,7 +107,7 @@ def refine_frames(
     """
     points, frames = balls.points, balls.frames[centers]
     order = torch.zeros(len(centers), dtype=torch.int64)
-    middles = (at(points, balls.longest[centers]) - points[centers, None]) @ frames / 2
+    middles = balls.middles(centers)
     search = Search(balls, centers, candidates)
     for number, rows, index in search:
         frame, places = at(frames, rows), at(points, index)

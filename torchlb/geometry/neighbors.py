@@ -263,6 +263,11 @@ class GraphBalls:
         """The other ends of the longest `EDGES` edges of every point, see `longest_edges`."""
         return longest_edges(self.points, self.graph, EDGES)
 
+    def middles(self, centers: Int[Tensor, " B"]) -> Float[Tensor, "B edges d"]:
+        """The middles of those edges in the centre's tangent plane, in its frame, ℓ."""
+        ends = at(self.points, self.longest[centers])
+        return (ends - self.points[centers, None]) @ self.frames[centers] / 2
+
     def __call__(
         self, centers: Int[Tensor, " B"], size: int
     ) -> tuple[Int[Tensor, "B K"], Int[Tensor, " B"]]:

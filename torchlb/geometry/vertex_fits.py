@@ -227,9 +227,6 @@ class VertexFits:
         heights: Float[Tensor, "B neighbors n"],
     ) -> Bool[Tensor, " B"]:
         """Keep the fits that pass; which do."""
-        balls = self._balls
-        longest = balls.points[balls.longest[vertices]] - balls.points[vertices, None]
-        middles = longest @ balls.frames[vertices] / 2
         jet = min(fit.degree, self._jet)
         terms = num_monomials(2, jet) - 1
         kept = replace(
@@ -238,7 +235,7 @@ class VertexFits:
             values=fit.values[..., :terms],
             degree=jet,
         )
-        regular = is_regular(kept, middles)
+        regular = is_regular(kept, self._balls.middles(vertices))
         good = self.surface.take(vertices, fit, heights, regular)
         if good.any():
             found, size = vertices[good], index.shape[1]

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import partial
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -222,11 +222,9 @@ def _swept(
     """Sweeps from the linear pair's eigenvectors until the first k eigenvalues are accurate; None if some never are."""
     assert part.linear is not None
     whole = part.stiffness, part.mass_matrix
-    exact, single = ([_product(m.astype(t)) for m in whole] for t in (np.float64, np.float32))
-    on_linear_mass, cycle = (
-        _product(part.linear[1].astype(np.float32)),
-        _two_levels(whole[0], solve),
-    )
+    exact, single = ([_product(m, kind) for m in whole] for kind in (torch.float64, torch.float32))
+    on_linear_mass = _product(part.linear[1], torch.float32)
+    cycle = _two_levels(part.stiffness, solve)
 
     def shifted(p: np.ndarray, shifts: np.ndarray) -> np.ndarray:
         return single[0](p) - on_linear_mass(p) * shifts
@@ -250,16 +248,15 @@ def _swept(
         active = np.flatnonzero(errors > tolerance) if sweep else np.arange(keep)
         enough = LAST * np.maximum(REDUCTION * errors, tolerance) / np.maximum(scale, TINY)
         small = (u.astype(np.float32), mu.astype(np.float32))
-        right = (r, z, values[:keep].astype(np.float32), enough)
+        right = (r, z, shifts.astype(np.float32), enough)
         right = tuple(x.take(active, -1) for x in right)
         w = _correction(shifted, cycle, small, right, 1 if rough else STEPS).astype(np.float64)
         if sweep:
             w -= u @ (mu.T @ w)
         elif rough:
-            w = np.column_stack([u.astype(np.float64), w])
+            w = np.column_stack([u, w])
         else:
-            w, u = u.astype(np.float64), w
-            w[:, active] -= u * size
+            w = u - w * size
         new = (w, *(on(w) for on in exact))
         if sweep:
             new = tuple(np.column_stack(both) for both in zip(known, new, strict=True))
@@ -317,13 +314,15 @@ def _two_levels(stiffness: Sparse, coarse: Inverse) -> Inverse:
     return lambda r: cycle(torch.from_numpy(r)).numpy()
 
 
-def _product(matrix: Any) -> Inverse:
-    """The product with a matrix, for right sides of its type: scipy's own takes two to four times as long."""
-    parts = _tensors(matrix)
-    return lambda x: multiply(*parts, torch.from_numpy(x)).numpy()
+def _product(matrix: Sparse, dtype: torch.dtype) -> Inverse:
+    """The product with a matrix in a type, that of its right sides: scipy's own takes two to four times as long."""
+    crow, col, values = _tensors(matrix)
+    values = values.to(dtype)
+    return lambda x: multiply(crow, col, values, torch.from_numpy(x)).numpy()
 
 
-def _tensors(matrix: Any) -> Matrix:
+def _tensors(matrix: Sparse) -> Matrix:
+    """Its parts, in the same memory."""
     crow, col, values = map(torch.from_numpy, (matrix.indptr, matrix.indices, matrix.data))
     return crow, col, values
 
