@@ -53,3 +53,6 @@ fi
 
 echo "installing torchlb[$extra]"
 "$python" -m pip install --quiet --editable ".[$extra]"
+
+# Numba keeps what it compiles beside the source.
+"$python" -c 'import torchlb.geometry.compiled'

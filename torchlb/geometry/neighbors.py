@@ -8,9 +8,10 @@ pool, ordered by distance. A path across a crease is cut there, where the tangen
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from functools import cached_property
 from math import ceil
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import torch
@@ -38,6 +39,8 @@ WALKS_AT_ONCE = 2**22
 """Walks of two edges whose ends are looked at together: through the middle of a fan of n triangles there are n²."""
 EDGES = 6
 """The longest edges of a point, in whose middles its fit is judged."""
+PATIENCE = 2**15
+"""Balls that a process grows by sparse matrices before it loads the compiled walk, which takes about as long."""
 BALL_SURPLUS = 1.5
 """A graph ball holds this many times the points asked for, so that its round core lies inside the ragged edge."""
 
@@ -231,6 +234,9 @@ class GraphBalls:
     sides : (N, n) from `thin_sides`: also refused is a point on the other side of a thin shape. None if not known.
     """
 
+    walked: ClassVar[int] = 0
+    """Balls that this process has grown without the compiled walk."""
+
     def __init__(
         self,
         points: Float[Tensor, "N n"],
@@ -284,15 +290,46 @@ class GraphBalls:
             self._kept.append(level)
         missing = centers[level.place[centers] < 0]
         if len(missing):
-            number = self._walks[missing].cumsum(0) // WALKS_AT_ONCE
-            for part in missing.split(number.unique_consecutive(return_counts=True)[1].tolist()):
-                level.add(part, *self._grown(part, level.size))
+            for found in self._grown(missing, level.size):
+                level.add(*found)
         place = level.place[centers]
         return level.index[place, :size].long(), level.count[place].long().clamp_max(size)
 
     def _grown(
         self, centers: Int[Tensor, " B"], size: int
+    ) -> Iterator[tuple[Int[Tensor, " b"], Int[Tensor, "b K"], Int[Tensor, " b"]]]:
+        """Some of the centres, their balls, and how many points these hold, until all were there."""
+        kernel, (dim, d) = self._kernel(), self.frames.shape[1:]
+        if kernel is None:
+            GraphBalls.walked += len(centers)
+            number = self._walks[centers].cumsum(0) // WALKS_AT_ONCE
+            for part in centers.split(number.unique_consecutive(return_counts=True)[1].tolist()):
+                yield part, *self._walked(part, size)
+            return
+        normals = torch.zeros_like(self.points) if dim == d else self._planes
+        sides = normals[:0] if self.sides is None else self.sides
+        arrays = (x.contiguous().numpy() for x in (self.points, normals, sides))
+        graph = (x.astype(np.int32, copy=False) for x in (self.graph.indptr, self.graph.indices))
+        wanted, alignment = BALL_SURPLUS * size, 0.0 if dim == d else MIN_ALIGNMENT
+        bounds = wanted, ceil(wanted ** (1 / d)), MAX_SLOPE, alignment
+        index, count = kernel(*arrays, *graph, centers.numpy(), size, *bounds)
+        yield centers, torch.from_numpy(index), torch.from_numpy(count)
+
+    def _kernel(self) -> Any:
+        """The compiled walk; None where it has no case, without numba, and for the first `PATIENCE` balls."""
+        codimension = self.points.shape[1] - self.frames.shape[2]
+        if GraphBalls.walked < PATIENCE or (codimension and self._planes.ndim == 3):
+            return None
+        try:
+            from torchlb.geometry.compiled import graph_balls
+        except (ImportError, RuntimeError):  # not there; no place to keep what is compiled
+            return None
+        return graph_balls
+
+    def _walked(
+        self, centers: Int[Tensor, " B"], size: int
     ) -> tuple[Int[Tensor, "B K"], Int[Tensor, " B"]]:
+        """The same by sparse matrices, for all codimensions, and where nothing is compiled."""
         local, others = self._reach(centers, size)
         center = at(centers, local)
         offset = at(self.points, others) - at(self.points, center)
@@ -346,9 +383,8 @@ class GraphBalls:
             if not grows.all():
                 active, total = active[grows], total[grows]
                 before, frontier = before[grows], frontier[grows]
-            recent = sparse.csr_array(
-                before + frontier
-            )  # neighbours are in this ring, the last, or the next
+            # Neighbours are in this ring, the last, or the next.
+            recent = sparse.csr_array(before + frontier)
         where = tuple(np.concatenate(ends) for ends in zip(*found, strict=True))
         balls = sparse.csr_array((np.ones(len(where[0]), np.int8), where), (len(centers), width))
         balls.sort_indices()
