@@ -260,6 +260,12 @@ class GraphBalls:
         return balls
 
     @cached_property
+    def _normals(self) -> Float[Tensor, "N n"]:
+        """What the compiled walk admits by; zeros in a flat space, where everything is in the plane."""
+        flat = self.frames.shape[1] == self.frames.shape[2]
+        return torch.zeros_like(self.points) if flat else self._planes
+
+    @cached_property
     def _walks(self) -> Int[Tensor, " N"]:
         """Of how many walks of two edges every point is the start."""
         return torch.from_numpy(self.graph @ np.diff(self.graph.indptr).astype(np.int64)).long()
@@ -298,20 +304,19 @@ class GraphBalls:
     def _grown(
         self, centers: Int[Tensor, " B"], size: int
     ) -> Iterator[tuple[Int[Tensor, " b"], Int[Tensor, "b K"], Int[Tensor, " b"]]]:
-        """Some of the centres, their balls, and how many points these hold, until all were there."""
-        kernel, (dim, d) = self._kernel(), self.frames.shape[1:]
+        """In turn some of the centres, their balls, and how many points these hold."""
+        kernel, dim = self._kernel(), self.frames.shape[2]
         if kernel is None:
             GraphBalls.walked += len(centers)
             number = self._walks[centers].cumsum(0) // WALKS_AT_ONCE
             for part in centers.split(number.unique_consecutive(return_counts=True)[1].tolist()):
                 yield part, *self._walked(part, size)
             return
-        normals = torch.zeros_like(self.points) if dim == d else self._planes
-        sides = normals[:0] if self.sides is None else self.sides
-        arrays = (x.contiguous().numpy() for x in (self.points, normals, sides))
+        sides = self._normals[:0] if self.sides is None else self.sides
+        arrays = (x.contiguous().numpy() for x in (self.points, self._normals, sides))
         graph = (x.astype(np.int32, copy=False) for x in (self.graph.indptr, self.graph.indices))
-        wanted, alignment = BALL_SURPLUS * size, 0.0 if dim == d else MIN_ALIGNMENT
-        bounds = wanted, ceil(wanted ** (1 / d)), MAX_SLOPE, alignment
+        wanted, flat = BALL_SURPLUS * size, self._normals is not self._planes
+        bounds = wanted, ceil(wanted ** (1 / dim)), MAX_SLOPE, 0.0 if flat else MIN_ALIGNMENT
         index, count = kernel(*arrays, *graph, centers.numpy(), size, *bounds)
         yield centers, torch.from_numpy(index), torch.from_numpy(count)
 
