@@ -260,10 +260,13 @@ class GraphBalls:
         return balls
 
     @cached_property
-    def _normals(self) -> Float[Tensor, "N n"]:
-        """What the compiled walk admits by; zeros in a flat space, where everything is in the plane."""
+    def _arrays(self) -> tuple[np.ndarray, ...]:
+        """What the compiled walk takes; normals are zero in a flat space, where all is in the plane."""
         flat = self.frames.shape[1] == self.frames.shape[2]
-        return torch.zeros_like(self.points) if flat else self._planes
+        normals = torch.zeros_like(self.points) if flat else self._planes
+        sides = normals[:0] if self.sides is None else self.sides
+        shape = (x.contiguous().numpy() for x in (self.points, normals, sides))
+        return *shape, self.graph.indptr.astype(np.int32), self.graph.indices.astype(np.int32)
 
     @cached_property
     def _walks(self) -> Int[Tensor, " N"]:
@@ -312,12 +315,9 @@ class GraphBalls:
             for part in centers.split(number.unique_consecutive(return_counts=True)[1].tolist()):
                 yield part, *self._walked(part, size)
             return
-        sides = self._normals[:0] if self.sides is None else self.sides
-        arrays = (x.contiguous().numpy() for x in (self.points, self._normals, sides))
-        graph = (x.astype(np.int32, copy=False) for x in (self.graph.indptr, self.graph.indices))
-        wanted, flat = BALL_SURPLUS * size, self._normals is not self._planes
+        wanted, flat = BALL_SURPLUS * size, dim == self.points.shape[1]
         bounds = wanted, ceil(wanted ** (1 / dim)), MAX_SLOPE, 0.0 if flat else MIN_ALIGNMENT
-        index, count = kernel(*arrays, *graph, centers.numpy(), size, *bounds)
+        index, count = kernel(*self._arrays, centers.numpy(), size, *bounds)
         yield centers, torch.from_numpy(index), torch.from_numpy(count)
 
     def _kernel(self) -> Any:
