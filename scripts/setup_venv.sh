@@ -55,4 +55,4 @@ echo "installing torchlb[$extra]"
 "$python" -m pip install --quiet --editable ".[$extra]"
 
 # Numba keeps what it compiles beside the source.
-"$python" -c 'import torchlb.geometry.compiled'
+"$python" -c 'from torchlb.compiled import _loaded; _loaded("graph_balls"), _loaded("left_inverse")'

@@ -9,6 +9,7 @@ import pytest
 import torch
 from scipy.sparse import csgraph
 
+from torchlb import compiled
 from torchlb.geometry import neighbors
 from torchlb.geometry.frames import cloud_frames, mesh_frames
 from torchlb.geometry.neighbors import (
@@ -238,7 +239,7 @@ def test_balls_around_a_fan_are_grown_a_few_at_a_time(monkeypatch):
     faces = torch.stack([rim, (rim + 1) % 300, torch.full((300,), 300)], 1)
     graph, frames = mesh_graph(faces, 301), mesh_frames(points, faces)
     whole = GraphBalls(points, graph, frames)(torch.arange(301), 20)
-    monkeypatch.setattr(neighbors, "PATIENCE", math.inf)
+    monkeypatch.setattr(compiled, "PATIENCE", math.inf)
     monkeypatch.setattr(neighbors, "WALKS_AT_ONCE", 2**12)
     balls, sizes = GraphBalls(points, graph, frames), []
     walked = balls._walked
@@ -249,7 +250,7 @@ def test_balls_around_a_fan_are_grown_a_few_at_a_time(monkeypatch):
 
 @pytest.mark.parametrize("case", ["cloud", "coincident", "thin", "flat"])
 def test_compiled_balls_are_the_same_to_the_bit(case, monkeypatch):
-    """Which of the two walks is taken depends on how many balls the process has grown before."""
+    """Which of the two walks is taken depends on what the process has done before."""
     pytest.importorskip("numba")
     points = Sphere().random_points(400)
     if case == "coincident":  # and a ball that ends before it is full
@@ -266,20 +267,21 @@ def test_compiled_balls_are_the_same_to_the_bit(case, monkeypatch):
         balls = GraphBalls(points, graph, frames)
     every, found = torch.arange(len(points)), {}
     for patience in (0, math.inf):
-        monkeypatch.setattr(neighbors, "PATIENCE", patience)
+        monkeypatch.setattr(compiled, "PATIENCE", patience)
         balls._kept = []
         found[patience] = [balls(every, size) for size in (5, 24, 300)]
-        assert (balls._kernel() is None) == (patience > 0)
+        assert (compiled.kernel("graph_balls") is None) == (patience > 0)
     for one, other in zip(*found.values(), strict=True):
         assert torch.equal(one[0], other[0])
         assert torch.equal(one[1], other[1])
 
 
 def test_without_numba_balls_are_grown_all_the_same(monkeypatch):
-    monkeypatch.setattr(neighbors, "PATIENCE", 0)
-    monkeypatch.setitem(sys.modules, "torchlb.geometry.compiled", None)
+    monkeypatch.setattr(compiled, "PATIENCE", 0)
+    monkeypatch.setitem(sys.modules, "torchlb.compiled.graph_balls", None)
+    compiled._loaded.cache_clear()
     balls = cloud_balls(Sphere().random_points(100))
-    assert balls._kernel() is None
+    assert compiled.kernel("graph_balls") is None
     assert (balls(torch.arange(100), 12)[1] == 12).all()
 
 

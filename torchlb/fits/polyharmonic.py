@@ -6,16 +6,14 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from torchlb.fits.least_squares import left_inverse
 from torchlb.fits.polynomials import monomials
 from torchlb.fits.weights import (
     Weights,
-    _condition,
-    _finish,
-    _functionals,
-    _height_residual,
-    _inverse,
-    _scaled_qr,
-    _scaled_system,
+    finish,
+    functionals_of,
+    height_residual,
+    scaled_system,
 )
 
 
@@ -30,10 +28,10 @@ def polyharmonic_weights(
     p = 5 (`method.md`, section 2). Same arguments and result as `least_squares_weights`; m ≥ 2.
     """
     exponent = 2 * degree + 3
-    radius, scaled, values, root = _scaled_system(coords, degree)
+    radius, scaled, values, root = scaled_system(coords, degree)
     batch, _, dim = coords.shape
-    functionals = _functionals(dim, degree).to(coords)
-    q, r, _ = _scaled_qr(root, values)
+    functionals = functionals_of(dim, degree).to(coords)
+    coefficients, condition = left_inverse(values, root)
 
     nodes = torch.cat([scaled.new_zeros(batch, 1, dim), scaled], dim=1)
     # Distances from differences: |a|² − 2ab + |b|² would lose half the digits.
@@ -55,10 +53,10 @@ def polyharmonic_weights(
     weights = torch.linalg.lu_solve(factors, pivots, right)[:, :num_points]
     moments = values.mT @ weights[:, 1:]
     residual = (moments - functionals).abs().amax((1, 2)) / functionals.abs().max()
-    left = (
-        torch.zeros_like(radius) if heights is None else _height_residual(q, root, coords, heights)
-    )
-    return _finish(weights, residual, radius, _condition(_inverse(r)), left, dim)
+    left = torch.zeros_like(radius)
+    if heights is not None:
+        left = height_residual(values, coefficients, root, coords, heights)
+    return finish(weights, residual, radius, condition, left, dim)
 
 
 def _kernel_derivatives(nodes: Float[Tensor, "B K d"], s: int) -> Float[Tensor, "B K F"]:

@@ -12,6 +12,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from torchlb.fits.least_squares import left_inverse
 from torchlb.fits.polynomials import (
     gradient_functional,
     laplacian_functional,
@@ -34,8 +35,8 @@ class Weights:
     gradient : (B, K, d), 1/ℓ. Entry 0 along K is the centre, as below.
     laplacian : (B, K), 1/ℓ²: Δ = Σ_c ∂_c²; zero below degree 2.
     radius : (B,), ℓ: distance ρ of the farthest neighbour in local coordinates.
-    condition : (B,): Frobenius norm of the inverse of the R of √ω V with its columns scaled to length one, which is its
-        condition up to a factor √M; above 1e10, or not finite, without full rank.
+    condition : (B,), of √ω V with its columns scaled to length one, as `left_inverse` gives it; above 1e10, or not
+        finite, without full rank.
     residual : (B,): largest violation of the moment equations, in units of the largest right-hand side.
     height_residual : (B,): what a polynomial leaves of the heights over the distances; 0 where no heights were given.
     """
@@ -72,12 +73,12 @@ def window(radius: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
     return (1 - (radius / 1.1).square()).clamp_min(0).pow(4)
 
 
-def _functionals(dim: int, degree: int) -> Float[Tensor, "M F"]:
+def functionals_of(dim: int, degree: int) -> Float[Tensor, "M F"]:
     """Right-hand sides: the d first derivatives, then Δ, which is zero below degree 2."""
     return torch.cat([gradient_functional(dim, degree), laplacian_functional(dim, degree)], dim=1)
 
 
-def _finish(
+def finish(
     weights: Float[Tensor, "B K F"],
     residual: Float[Tensor, " B"],
     radius: Float[Tensor, " B"],
@@ -97,25 +98,25 @@ def _finish(
     )
 
 
-def _height_residual(
-    basis: Float[Tensor, "B neighbors M"],
+def height_residual(
+    values: Float[Tensor, "B neighbors M"],
+    coefficients: Float[Tensor, "B M neighbors"],
     root: Float[Tensor, "B neighbors"],
     coords: Float[Tensor, "B neighbors d"],
     heights: Float[Tensor, "B neighbors n"],
 ) -> Float[Tensor, " B"]:
     """Scatter of the heights about their fit over root mean square distance, both weighted by ω.
 
-    `basis` spans the polynomials, times √ω. The scatter is per degree of freedom, so their number does not matter.
+    The scatter is per degree of freedom, so their number does not matter.
     """
-    weighted = root[..., None] * heights
-    left = (weighted - basis @ (basis.mT @ weighted)).flatten(1)
-    freedom = max(basis.shape[1] - basis.shape[2], 1) / basis.shape[1]
+    left = root[..., None] * (heights - values @ (coefficients @ heights))
+    freedom = max(values.shape[1] - values.shape[2], 1) / values.shape[1]
     square = coords.norm(dim=-1).square() + heights.norm(dim=-1).square()
     distance = (root.square() * square).sum(1)
-    return left.norm(dim=1) / (freedom * distance).sqrt()
+    return left.flatten(1).norm(dim=1) / (freedom * distance).sqrt()
 
 
-def _scaled_system(
+def scaled_system(
     coords: Float[Tensor, "B neighbors d"],
     degree: int,
     keep: Bool[Tensor, "B neighbors"] | None = None,
@@ -126,25 +127,6 @@ def _scaled_system(
     scaled = coords / radius[:, None, None]
     root = window(distance / radius[:, None]).sqrt()
     return radius, scaled, monomials(scaled, degree), root if keep is None else root * keep
-
-
-def _scaled_qr(
-    root: Float[Tensor, "B neighbors"], values: Float[Tensor, "B neighbors M"]
-) -> tuple[Tensor, Tensor, Tensor]:
-    """Q, R of √ω V with its columns scaled to length one, and the lengths."""
-    system = root[..., None] * values
-    scale = system.square().sum(1).sqrt().clamp_min(torch.finfo(values.dtype).tiny)
-    q, r = torch.linalg.qr(system / scale[:, None])
-    return q, r, scale
-
-
-def _inverse(r: Float[Tensor, "B M M"]) -> Float[Tensor, "B M M"]:
-    return torch.linalg.solve_triangular(r, torch.eye(r.shape[-1]).to(r).expand_as(r), upper=True)
-
-
-def _condition(inverse: Float[Tensor, "B M M"]) -> Float[Tensor, " B"]:
-    """‖R⁻¹‖: as columns of R have length one, ‖R‖ is between 1 and √M."""
-    return inverse.flatten(1).norm(dim=1)
 
 
 @dataclass(frozen=True)
@@ -184,7 +166,7 @@ def centered_fit(
     degree: int,
     keep: Bool[Tensor, "B neighbors"] | None = None,
 ) -> CenteredFit:
-    """The polynomials behind `least_squares_weights`, as functions of the values: R⁻¹Qᵀ√ω, by the same QR.
+    """The polynomials behind `least_squares_weights`, as functions of the values.
 
     Arguments as there; K − 1 ≥ M − 1. Neighbours that are not kept have zero coefficients.
 
@@ -192,12 +174,10 @@ def centered_fit(
     >>> centered_fit(line, 2).coefficients.round(decimals=12).tolist()
     [[[-0.5, 0.5], [0.5, 0.5]]]
     """
-    radius, _, values, root = _scaled_system(coords, degree, keep)
-    q, r, scale = _scaled_qr(root, values)
-    inverse = _inverse(r)
-    coefficients = (inverse / scale[..., None]) @ (q * root[..., None]).mT
+    radius, _, values, root = scaled_system(coords, degree, keep)
+    coefficients, _ = left_inverse(values, root)
     dim = coords.shape[-1]
-    first = coefficients[:, :dim] @ values - torch.eye(r.shape[-1])[:dim].to(r)
+    first = coefficients[:, :dim] @ values - torch.eye(values.shape[-1])[:dim].to(values)
     residual = first.abs().amax((1, 2))
     return CenteredFit(coefficients, radius, residual, values, root, degree)
 
@@ -232,7 +212,7 @@ def least_squares_weights(
               w_i = -\sum_{j \ne i} w_j .
 
     The polynomial passes through the centre's value; that is what makes the operator stable (`method.md`, section 2).
-    Solved by QR of √ω V in coordinates scaled by ρ: w = √ω Q R⁻ᵀ b. A stencil without full rank comes out with a
+    Solved by `left_inverse` in coordinates scaled by ρ: w = Cᵀb. A stencil without full rank comes out with a
     large `condition` and unusable weights; nothing is raised.
 
     Parameters
@@ -251,17 +231,15 @@ def least_squares_weights(
     >>> least_squares_weights(line, 2).laplacian.round(decimals=12).tolist()
     [[-2.0, 1.0, 1.0]]
     """
-    radius, scaled, values, root = _scaled_system(coords, degree)
+    radius, scaled, values, root = scaled_system(coords, degree)
     if keep is not None:
         root = root * keep
     constant = torch.ones_like(root)
     if flux is not None:
         values, constant, root = _with_data(scaled, values, root, flux, share * radius, degree)
-    functionals = _functionals(coords.shape[-1], degree).to(coords)
-    q, r, scale = _scaled_qr(root, values)
-    right = functionals / scale[..., None]
-    inverse = _inverse(r)
-    solution = root[..., None] * (q @ (inverse.mT @ right))
+    functionals = functionals_of(coords.shape[-1], degree).to(coords)
+    coefficients, condition = left_inverse(values, root)
+    solution = coefficients.mT @ functionals
     residual = (values.mT @ solution - functionals).abs().amax((1, 2)) / functionals.abs().max()
     if flux is not None:
         # What the data add would hide that points on a line say nothing of what is across.
@@ -269,10 +247,10 @@ def least_squares_weights(
         residual = torch.where(spread[:, -1] < ON_LINE * spread[:, 0], torch.inf, residual)
     center = -(constant[..., None] * solution).sum(1, keepdim=True)
     weights = torch.cat([center, solution[:, : coords.shape[1]]], dim=1)
-    left = (
-        torch.zeros_like(radius) if heights is None else _height_residual(q, root, coords, heights)
-    )
-    return _finish(weights, residual, radius, _condition(inverse), left, coords.shape[-1])
+    left = torch.zeros_like(radius)
+    if heights is not None:
+        left = height_residual(values, coefficients, root, coords, heights)
+    return finish(weights, residual, radius, condition, left, coords.shape[-1])
 
 
 def _with_data(

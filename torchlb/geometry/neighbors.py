@@ -11,7 +11,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from functools import cached_property
 from math import ceil
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 import torch
@@ -20,6 +20,7 @@ from scipy import sparse
 from scipy.spatial import KDTree
 from torch import Tensor
 
+from torchlb import compiled
 from torchlb.geometry.vectors import at, dot
 from torchlb.geometry.voronoi import natural_neighbors, rows_at_once
 
@@ -39,8 +40,6 @@ WALKS_AT_ONCE = 2**22
 """Walks of two edges whose ends are looked at together: through the middle of a fan of n triangles there are n²."""
 EDGES = 6
 """The longest edges of a point, in whose middles its fit is judged."""
-PATIENCE = 2**15
-"""Balls that a process grows by sparse matrices before it loads the compiled walk, which takes about as long."""
 BALL_SURPLUS = 1.5
 """A graph ball holds this many times the points asked for, so that its round core lies inside the ragged edge."""
 
@@ -234,9 +233,6 @@ class GraphBalls:
     sides : (N, n) from `thin_sides`: also refused is a point on the other side of a thin shape. None if not known.
     """
 
-    walked: ClassVar[int] = 0
-    """Balls that this process has grown without the compiled walk."""
-
     def __init__(
         self,
         points: Float[Tensor, "N n"],
@@ -308,29 +304,20 @@ class GraphBalls:
         self, centers: Int[Tensor, " B"], size: int
     ) -> Iterator[tuple[Int[Tensor, " b"], Int[Tensor, "b K"], Int[Tensor, " b"]]]:
         """In turn some of the centres, their balls, and how many points these hold."""
-        kernel, dim = self._kernel(), self.frames.shape[2]
+        dim, codimension = self.frames.shape[2], self.points.shape[1] - self.frames.shape[2]
+        curved = codimension and self._planes.ndim == 3  # for which nothing is compiled
+        kernel = None if curved else compiled.kernel("graph_balls")
         if kernel is None:
-            GraphBalls.walked += len(centers)
             number = self._walks[centers].cumsum(0) // WALKS_AT_ONCE
             for part in centers.split(number.unique_consecutive(return_counts=True)[1].tolist()):
                 yield part, *self._walked(part, size)
             return
-        wanted, flat = BALL_SURPLUS * size, dim == self.points.shape[1]
-        bounds = wanted, ceil(wanted ** (1 / dim)), MAX_SLOPE, 0.0 if flat else MIN_ALIGNMENT
+        wanted = BALL_SURPLUS * size
+        bounds = wanted, ceil(wanted ** (1 / dim)), MAX_SLOPE, MIN_ALIGNMENT if codimension else 0.0
         index, count = kernel(*self._arrays, centers.numpy(), size, *bounds)
         yield centers, torch.from_numpy(index), torch.from_numpy(count)
 
-    def _kernel(self) -> Any:
-        """The compiled walk; None where it has no case, without numba, and for the first `PATIENCE` balls."""
-        codimension = self.points.shape[1] - self.frames.shape[2]
-        if GraphBalls.walked < PATIENCE or (codimension and self._planes.ndim == 3):
-            return None
-        try:
-            from torchlb.geometry.compiled import graph_balls
-        except (ImportError, RuntimeError):  # not there; no place to keep what is compiled
-            return None
-        return graph_balls
-
+    @compiled.standing_in()
     def _walked(
         self, centers: Int[Tensor, " B"], size: int
     ) -> tuple[Int[Tensor, "B K"], Int[Tensor, " B"]]:

@@ -1,8 +1,4 @@
-"""Graph balls of surfaces in R³ and of flat domains, compiled by numba: the same to the bit, six times as fast.
-
-Of the other kernels none won twofold (`decisions.md`, *Compiled kernels*). Numba keeps what it has compiled, so that it
-takes two seconds once in an installation, and to load half a second in a process.
-"""
+"""Graph balls of surfaces in R³ and of flat domains, compiled: six times as fast."""
 
 from __future__ import annotations
 

@@ -1,0 +1,40 @@
+"""Kernels compiled by numba, each the same to the bit as what stands in for it (`decisions.md`, *Compiled kernels*).
+
+`graph_balls`: neighbourhoods of surfaces in R³ and of flat domains. `left_inverse`: local fits. Numba keeps what it has
+compiled, which takes some seconds once in an installation.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from functools import cache
+from importlib import import_module
+from time import perf_counter
+from typing import Any
+
+PATIENCE = 0.5
+"""Seconds that a process spends in what stands in for kernels before it loads them, which takes as long."""
+
+_spent = [0.0]
+
+
+def kernel(name: str) -> Any:
+    """The function of that name; None without numba, and until a process has spent `PATIENCE` without."""
+    return _loaded(name) if _spent[0] >= PATIENCE else None
+
+
+@cache
+def _loaded(name: str) -> Any:
+    try:
+        return getattr(import_module(f"torchlb.compiled.{name}"), name)
+    except (ImportError, RuntimeError):  # not there; no place to keep what is compiled
+        return None
+
+
+@contextmanager
+def standing_in() -> Iterator[None]:
+    """What a kernel would do: its time counts."""
+    start = perf_counter()
+    yield
+    _spent[0] += perf_counter() - start
