@@ -7,19 +7,9 @@ from pathlib import Path
 
 PACKAGE = Path(__file__).parents[1] / "torchlb"
 # Lowest first. `import torchlb` counts as an import of __init__, which stands on all the rest.
-ORDER = ["errors", "version", "compiled", "surfaces", "linalg", "fits", "geometry", "baseline", "stencils"]
-ORDER += [
-    "galerkin",
-    "stability",
-    "spectral",
-    "operator",
-    "nn",
-    "io",
-    "interop",
-    "plot",
-    "__init__",
-    "__main__",
-]
+ORDER = ["errors", "version", "compiled", "surfaces", "linalg", "fits", "geometry", "baseline"]
+ORDER += ["stencils", "galerkin", "stability", "spectral", "operator", "nn", "io", "interop"]
+ORDER += ["plot", "__init__", "__main__"]
 FILES = sorted(PACKAGE.rglob("*.py"))
 
 

@@ -2,7 +2,6 @@
 
 import itertools
 import math
-import sys
 
 import numpy as np
 import pytest
@@ -274,15 +273,6 @@ def test_compiled_balls_are_the_same_to_the_bit(case, monkeypatch):
     for one, other in zip(*found.values(), strict=True):
         assert torch.equal(one[0], other[0])
         assert torch.equal(one[1], other[1])
-
-
-def test_without_numba_balls_are_grown_all_the_same(monkeypatch):
-    monkeypatch.setattr(compiled, "PATIENCE", 0)
-    monkeypatch.setitem(sys.modules, "torchlb.compiled.graph_balls", None)
-    compiled._loaded.cache_clear()
-    balls = cloud_balls(Sphere().random_points(100))
-    assert compiled.kernel("graph_balls") is None
-    assert (balls(torch.arange(100), 12)[1] == 12).all()
 
 
 def test_balls_do_not_depend_on_the_chunk():

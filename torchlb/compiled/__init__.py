@@ -1,6 +1,7 @@
 """Kernels compiled by numba, each the same to the bit as what stands in for it (`decisions.md`, *Compiled kernels*).
 
-`graph_balls`: neighbourhoods of surfaces in R³ and of flat domains. `left_inverse`: local fits. Numba keeps what it has
+`graph_balls`: neighbourhoods of surfaces in R³ and of flat domains. `left_inverse`: local fits. `upper_product`: the
+weak pair from its elements. Numba keeps what it has
 compiled, which takes some seconds once in an installation.
 """
 
@@ -13,6 +14,7 @@ from importlib import import_module
 from time import perf_counter
 from typing import Any
 
+KERNELS = "graph_balls", "left_inverse", "upper_product"
 PATIENCE = 0.5
 """Seconds that a process spends in what stands in for kernels before it loads them, which takes as long."""
 
@@ -22,6 +24,11 @@ _spent = [0.0]
 def kernel(name: str) -> Any:
     """The function of that name; None without numba, and until a process has spent `PATIENCE` without."""
     return _loaded(name) if _spent[0] >= PATIENCE else None
+
+
+def prepare() -> bool:
+    """Compile all of them now, for later processes; whether there is a numba that does."""
+    return None not in [_loaded(name) for name in KERNELS]
 
 
 @cache

@@ -35,11 +35,11 @@ def _subtract(factor: np.ndarray, x: np.ndarray, y: np.ndarray) -> None:
 
 @njit(error_model="numpy")
 @no_type_check
-def _divide(x: np.ndarray, factor: np.ndarray) -> None:
+def _scale(x: np.ndarray, factor: np.ndarray) -> None:
     size, lanes = x.shape
     for k in range(size):
         for a in range(lanes):
-            x[k, a] /= factor[a]
+            x[k, a] *= factor[a]
 
 
 @njit(
@@ -49,9 +49,7 @@ def _divide(x: np.ndarray, factor: np.ndarray) -> None:
     nogil=True,
 )
 @no_type_check
-def left_inverse(
-    columns: np.ndarray, root: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
+def left_inverse(columns: np.ndarray, root: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """As `torchlb.fits.left_inverse`, from the columns of V one after the other, (B, M, K), and √ω, (B, K)."""
     batch, terms, size = columns.shape
     lanes = max(min(LANES, batch), 1)
@@ -60,23 +58,23 @@ def left_inverse(
     square, total, some = np.empty((terms, lanes)), np.empty(lanes), np.empty(lanes)
     for first in range(0, batch, lanes):
         count = min(lanes, batch - first)
-        for b in range(count):
-            for j in range(terms):
-                for k in range(size):
+        for j in range(terms):
+            for k in range(size):
+                for b in range(count):
                     a[j, k, b] = columns[first + b, j, k] * root[first + b, k]
         for j in range(terms):
             _product(a[j], a[j], square[j])
         for j in range(terms):
             _product(a[j], a[j], total)
             for b in range(lanes):
-                r[j, j, b] = np.sqrt(total[b])
-            _divide(a[j], r[j, j])
+                r[j, j, b] = 1 / np.sqrt(total[b])
+            _scale(a[j], r[j, j])
             for i in range(j + 1, terms):
                 _product(a[i], a[j], r[j, i])
                 _subtract(r[j, i], a[j], a[i])
         total[:] = 0.0
         for j in range(terms - 1, -1, -1):
-            _divide(a[j], r[j, j])
+            _scale(a[j], r[j, j])
             for i in range(j):
                 _subtract(r[i, j], a[j], a[i])
         for j in range(terms):
@@ -85,7 +83,8 @@ def left_inverse(
                 total[b] += some[b] * square[j, b]
         for b in range(count):
             condition[first + b] = np.sqrt(total[b])
-            for j in range(terms):
-                for k in range(size):
+        for j in range(terms):
+            for k in range(size):
+                for b in range(count):
                     found[first + b, j, k] = a[j, k, b] * root[first + b, k]
     return found, condition

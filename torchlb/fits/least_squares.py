@@ -18,7 +18,7 @@ def left_inverse(
 ) -> tuple[Float[Tensor, "B M K"], Float[Tensor, " B"]]:
     """C = (VᵀΩV)⁻¹VᵀΩ, with which Cu are the coefficients of the weighted fit to u, and its condition.
 
-    By the modified Gram–Schmidt process on √ω V = QR and back substitution, C = R⁻¹Qᵀ√ω: its rows have the accuracy of
+    By the modified Gram–Schmidt process on √ω V = QR and back substitution, C = R⁻¹Qᵀ√ω: every row has the accuracy of
     Householder's QR (`decisions.md`, *Compiled kernels*). Columns that are dependent to the last digit leave what is
     not finite.
 
@@ -67,12 +67,12 @@ def _side_by_side(
     square = (a * a).sum(1)
     with np.errstate(all="ignore"):
         for j in range(terms):
-            r[j, j] = np.sqrt((a[j] * a[j]).sum(0))
-            a[j] /= r[j, j]
+            r[j, j] = 1 / np.sqrt((a[j] * a[j]).sum(0))
+            a[j] *= r[j, j]
             r[j, j + 1 :] = (a[j + 1 :] * a[j]).sum(1)
             a[j + 1 :] -= r[j, j + 1 :, None] * a[j]
         for j in reversed(range(terms)):
-            a[j] /= r[j, j]
+            a[j] *= r[j, j]
             a[:j] -= r[:j, j, None] * a[j]
         condition = np.sqrt(((a * a).sum(1) * square).sum(0))
     return a[..., :batch].transpose(2, 0, 1) * root[:, None], condition[:batch]

@@ -22,8 +22,9 @@ from torchlb.fits.polynomials import (
 
 ON_LINE = 1e-5
 """Spread of points across over that along their longest direction, below which they lie on a line, or in a plane."""
-MAX_RESIDUAL = 1e-10
-"""Moment equations are met if nothing larger is left; what a system without full rank leaves is."""
+MAX_RESIDUAL = 1e-6
+"""Moment equations are met if nothing larger is left; what a system without full rank leaves is. Rounding leaves about
+1e-16 times the square of the condition, which is below 1e3 in what is accepted."""
 
 
 @dataclass(frozen=True)

@@ -11,6 +11,7 @@ from jaxtyping import Float, Int
 from scipy import sparse
 from torch import Tensor
 
+from torchlb import compiled
 from torchlb.galerkin.assembly import assemble_mass, element_matrices, flat_metric, summed
 from torchlb.galerkin.curving import CurvedMesh, curve, mollified
 from torchlb.galerkin.elements import segment, triangle
@@ -21,6 +22,8 @@ from torchlb.geometry.vertex_fits import VertexFits
 
 ROWS = 2**13
 """Rows of a product at a time."""
+ROOM = 2**20
+"""Entries of a product at a time, where it is compiled."""
 SMALLEST = 0.1
 """Share of its linear mass that the mass of a vertex has at least."""
 
@@ -113,22 +116,45 @@ def mesh_pair(
 
 def upper_product(p: Any, matrix: sparse.csr_array) -> sparse.csr_array:
     """Upper triangle of PᵀAP for a symmetric A, a few rows at a time: neither the rest nor AP is ever held."""
+    p.sort_indices()
     left: Any = sparse.csr_array(p.T)
-    count, filled, length = p.shape[1], 0, []
+    kernel = compiled.kernel("upper_product") if np.iscomplexobj(matrix) else None
+    arrays = [] if kernel is None else [part for m in (left, matrix, p) for part in _arrays(m)]
+    count, first, filled, length = p.shape[1], 0, 0, []
     indices, data = np.empty(0, dtype=np.int32), np.empty(0, dtype=matrix.dtype)
-    for first in range(0, count, ROWS):
-        half = left[first : first + ROWS] @ matrix
-        met = np.flatnonzero(np.bincount(half.indices, minlength=p.shape[0]))
-        part = half[:, met] @ p[met]  # of the type of A: of P only what is met is converted
-        row = np.arange(part.shape[0], dtype=np.int32).repeat(np.diff(part.indptr))
-        upper = part.indices >= first + row
-        length.append(np.bincount(row[upper], minlength=part.shape[0]))
-        start, filled = filled, filled + int(length[-1].sum())
-        for whole, piece in ((indices, part.indices), (data, part.data)):
+    while first < count:
+        if kernel is None:
+            rows = _upper_rows(first, left[first : first + ROWS], matrix, p)
+        else:
+            rows = kernel(first, max(ROOM, count), *arrays)
+        length.append(rows[0])
+        first += len(rows[0])
+        start, filled = filled, filled + len(rows[1])
+        for whole, piece in zip((indices, data), rows[1:], strict=True):
             whole.resize(filled, refcheck=False)  # where it is: pieces would be held twice
-            whole[start:] = piece[upper]
+            whole[start:] = piece
     indptr = np.concatenate([[0], np.cumsum(np.concatenate(length))])
     return sparse.csr_array((data, indices, indptr), shape=(count, count))
+
+
+def _arrays(matrix: Any) -> tuple[np.ndarray, ...]:
+    """Row pointers, columns and values, of the types that are compiled for."""
+    indices = matrix.indices.astype(np.int32, copy=False)
+    return matrix.indptr.astype(np.int64), indices, matrix.data
+
+
+@compiled.standing_in()
+def _upper_rows(
+    first: int, left: Any, matrix: sparse.csr_array, p: Any
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Entries in each of the rows from `first` on, their columns and values."""
+    half = left @ matrix
+    met = np.flatnonzero(np.bincount(half.indices, minlength=p.shape[0]))
+    part = half[:, met] @ p[met]  # of the type of A: of P only what is met is converted
+    row = np.arange(part.shape[0], dtype=np.int32).repeat(np.diff(part.indptr))
+    upper = part.indices >= first + row
+    length = np.bincount(row[upper], minlength=part.shape[0])
+    return length, part.indices[upper], part.data[upper]
 
 
 def _linear(lengths: Tensor, faces: Tensor, count: int) -> sparse.csr_array:

@@ -64,15 +64,16 @@ class Acceptance:
         max_ratio = FACTOR * torch.where(touching, edge.off_diagonal_ratio, 1.0)
         resolved, resolvable = self._resolved(candidate)
         center, others = weights.laplacian[:, 0], weights.laplacian[:, 1:].abs().sum(1)
+        determined = weights.residual <= MAX_RESIDUAL  # false for NaN
         failure = torch.zeros(len(center), dtype=torch.int64)
         for reason, passed in (
-            (Reason.MOMENTS, weights.residual <= MAX_RESIDUAL),  # false for NaN
+            (Reason.MOMENTS, determined),
             (Reason.UNRESOLVED, weights.height_residual <= resolved),
             (Reason.RATIO, others <= -max_ratio * center),
             (Reason.GROWTH, weights.radius.square() * (others + center.abs()) <= max_growth),
         ):
             failure = torch.where((failure == 0) & ~passed, reason, failure)
-        return failure, weights.height_residual > resolvable
+        return failure, determined & (weights.height_residual > resolvable)
 
     def follows(self, weights: Weights, candidate: Candidate) -> Bool[Tensor, " B"]:
         """Whether the points resolve the surface for this candidate."""

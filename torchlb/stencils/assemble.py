@@ -177,9 +177,12 @@ class Stencils:
             )
         rows = replace(rows, candidate=torch.full_like(centers, len(self.candidates)))
         fitted = ((reason == Reason.RATIO) | (reason == Reason.GROWTH)).nonzero()[:, 0]
-        for local, index, gradient in self._gradients(centers[fitted]):
-            rows = rows.with_gradient(fitted[local], index, gradient)
-        return rows
+        found = list(self._gradients(centers[fitted]))
+        if not found:
+            return rows
+        local = [fitted[row].repeat_interleave(index.shape[1]) for row, index, _ in found]
+        index, gradient = (torch.cat([f[i].flatten(0, 1) for f in found]) for i in (1, 2))
+        return rows.with_gradient(torch.cat(local), index, gradient)
 
     def _gradients(
         self, centers: Int[Tensor, " B"]

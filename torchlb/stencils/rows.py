@@ -86,19 +86,18 @@ class Rows:
         )
 
     def with_gradient(
-        self, local: Int[Tensor, " b"], index: Int[Tensor, "b K"], gradient: Float[Tensor, "b K d"]
+        self, local: Int[Tensor, " e"], index: Int[Tensor, " e"], gradient: Float[Tensor, "e d"]
     ) -> Rows:
-        """The same with another gradient in the rows `local`, over the points `index`."""
-        dim = self.gradient.shape[1]
+        """The same with another gradient in the rows `local`: entries, all of a row, at the points `index`."""
         taken = torch.zeros_like(self.length, dtype=torch.bool).index_fill(0, local, True)
         row = torch.arange(len(self.length)).repeat_interleave(self.length)
         old = torch.where(taken[row, None], 0.0, self.gradient)
         span = int(max(self.col.max(), index.max())) + 1
-        key = torch.cat([row * span + self.col, (local[:, None] * span + index).flatten()])
+        key = torch.cat([row * span + self.col, local * span + index])
         key, place = key.unique(return_inverse=True)
-        values = torch.zeros(len(key), 1 + dim, dtype=old.dtype)
+        values = torch.zeros(len(key), 1 + old.shape[1], dtype=old.dtype)
         values.index_add_(0, place[: len(row)], torch.cat([self.laplacian[:, None], old], 1))
-        values[:, 1:].index_add_(0, place[len(row) :], gradient.reshape(-1, dim))
+        values[:, 1:].index_add_(0, place[len(row) :], gradient)
         length = torch.bincount(key // span, minlength=len(self.length))
         entries = {"col": key % span, "laplacian": values[:, 0], "gradient": values[:, 1:]}
         return replace(self, length=length, **entries)

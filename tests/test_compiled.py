@@ -1,0 +1,114 @@
+"""Kernels and what stands in for them: the same to the bit, whichever a process takes."""
+
+import math
+import sys
+
+import mpmath
+import numpy as np
+import pytest
+import torch
+from scipy import sparse
+
+from torchlb import LaplaceBeltrami, compiled
+from torchlb.fits.least_squares import left_inverse
+from torchlb.fits.weights import scaled_system
+from torchlb.galerkin import pair
+from torchlb.galerkin.pair import upper_product
+from torchlb.surfaces import Hemisphere
+
+
+@pytest.fixture
+def both(monkeypatch):
+    """A function of what to compute: that without kernels, and with them."""
+    pytest.importorskip("numba")
+
+    def computed(function, name):
+        found = []
+        for patience in (math.inf, 0):
+            monkeypatch.setattr(compiled, "PATIENCE", patience)
+            assert (compiled.kernel(name) is None) == (patience > 0)
+            found.append(function())
+        return found
+
+    return computed
+
+
+@pytest.mark.parametrize(("dim", "degree"), [(1, 3), (2, 1), (2, 4), (2, 8), (3, 2)])
+@pytest.mark.parametrize("batch", [0, 1, 2, 64, 300])
+def test_left_inverses_are_the_same_to_the_bit(dim, degree, batch, both):
+    coords = torch.randn(batch, 90, dim, dtype=torch.float64)
+    coords[1::7, :, 0] = 0.0  # on a line, and in a point: what is left has to be the same, too
+    _, _, values, root = scaled_system(coords, degree)
+    one, other = both(lambda: left_inverse(values, root), "left_inverse")
+    for x, y in zip(one, other, strict=True):
+        assert torch.equal(x.view(torch.int64) * ~x.isnan(), y.view(torch.int64) * ~y.isnan())
+
+
+@pytest.mark.parametrize("degree", [1, 2, 4, 8])
+def test_left_inverses_are_as_accurate_as_their_condition_allows(degree):
+    """Every row, beside one computed with 50 digits."""
+    mpmath.mp.dps = 50
+    coords = torch.randn(2, int(0.8 * (degree + 1) * (degree + 2)), 2, dtype=torch.float64)
+    _, _, values, root = scaled_system(coords, degree)
+    inverse, condition = left_inverse(values, root)
+    for v, w, found, bound in zip(values, root, inverse, condition, strict=True):
+        v = mpmath.matrix(v.tolist())
+        weighted = v.T * mpmath.diag([mpmath.mpf(x) ** 2 for x in w.tolist()])
+        exact = torch.tensor(((weighted * v) ** -1 * weighted).tolist(), dtype=torch.float64)
+        error = ((found - exact).norm(dim=1) / exact.norm(dim=1)).max()
+        assert error < torch.finfo(torch.float64).eps * 2 * bound
+
+
+def test_upper_products_are_the_same_to_the_bit(both, monkeypatch):
+    """With few entries at a time, zeros that cancel, and columns that do not ascend."""
+    generator = np.random.default_rng(0)
+    p = sparse.csr_array(sparse.random_array((400, 90), density=0.05, rng=generator))
+    matrix = sparse.random_array((400, 400), density=0.02, rng=generator)
+    matrix = sparse.csr_array(matrix + matrix.T + 1j * sparse.eye_array(400))
+    matrix.data[::5] = 0.0
+    shuffled = p[:, ::-1]
+    shuffled.indices = 89 - shuffled.indices
+    monkeypatch.setattr(pair, "ROOM", 200)
+    monkeypatch.setattr(pair, "ROWS", 40)
+    one, other = both(lambda: upper_product(shuffled.copy(), matrix), "upper_product")
+    expected = sparse.triu(p.T @ matrix @ p)
+    assert abs(one - expected).max() < 1e-14 * abs(expected).max()
+    for x in (one, other):
+        x.sort_indices()
+    assert np.array_equal(one.indptr, other.indptr)
+    assert np.array_equal(one.indices, other.indices)
+    assert np.array_equal(one.data, other.data)
+
+
+def test_operators_are_the_same_to_the_bit(both):
+    vertices, faces = Hemisphere().mesh(400)
+    one, other = both(
+        lambda: LaplaceBeltrami.from_mesh(vertices, faces).state_dict(), "graph_balls"
+    )
+    assert one.keys() == other.keys()
+    for name, x in one.items():
+        if isinstance(x, torch.Tensor):
+            torch.testing.assert_close(x, other[name], rtol=0, atol=0, equal_nan=True, msg=name)
+
+
+def test_without_numba_all_works(monkeypatch):
+    monkeypatch.setattr(compiled, "PATIENCE", 0)
+    for name in compiled.KERNELS:
+        monkeypatch.setitem(sys.modules, f"torchlb.compiled.{name}", None)
+    compiled._loaded.cache_clear()
+    assert not compiled.prepare()
+    lb = LaplaceBeltrami.from_mesh(*Hemisphere().mesh(300))
+    compiled._loaded.cache_clear()
+    assert (lb.mass.sum() - 2 * math.pi).abs() < 1e-3
+
+
+def test_kernels_are_loaded_when_waiting_took_as_long(monkeypatch):
+    pytest.importorskip("numba")
+    monkeypatch.setattr(compiled, "_spent", [0.0])
+    monkeypatch.setattr(compiled, "PATIENCE", 1e-3)
+    assert compiled.kernel("left_inverse") is None
+    while compiled._spent[0] < 1e-3:
+        before = compiled._spent[0]
+        left_inverse(torch.ones(1, 2, 1).double(), torch.ones(1, 2).double())
+        assert compiled._spent[0] > before
+    assert compiled.kernel("left_inverse") is not None
