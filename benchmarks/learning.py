@@ -77,7 +77,7 @@ class Original:
         )
         self.num_pairs = k
         gradients = tangent_gradients(points, None if faces is None else faces.numpy())
-        self.gradient_values = torch.stack(gradients)
+        self.gradient_values = Gradients(gradients)
 
     def to(self, device: str) -> Original:
         """Itself, on another device."""
@@ -95,6 +95,17 @@ class Original:
 
     def _apply_rows(self, values: Tensor, x: Tensor) -> Tensor:
         return torch.mm(values, x)
+
+    def local_gradient(self, x: Tensor) -> Tensor:
+        return torch.stack([torch.mm(values, x) for values in self.gradient_values], dim=1)
+
+
+class Gradients(tuple[Tensor, ...]):
+    """The sparse matrices of the two components."""
+
+    def to(self, where: Any) -> Gradients:
+        """The same of another type, or on another device."""
+        return Gradients(matrix.to(where) for matrix in self)
 
 
 def tensor(array: Any) -> Tensor:

@@ -128,23 +128,35 @@ def _parts(
 
     They are numbered along the surface (Cuthill–McKee), which halves the time of the products.
     """
-    joint = _joined(stiffness, mass_matrix)
-    count, component = csgraph.connected_components(joint, directed=False)
-    near = [] if linear is None else [_narrow(matrix) for matrix in linear]
-    pattern = _joined(near[0], near[1]) if near else joint
+    near = None if linear is None else (_narrow(linear[0]), _narrow(linear[1]))
+    pattern = _joined(*(near or (stiffness, mass_matrix)))
+    count, component = csgraph.connected_components(pattern, directed=False)
+    if near and count > 1:  # fits may reach from one to the other
+        joint = _joined(stiffness, mass_matrix)
+        count, component = csgraph.connected_components(joint, directed=False)
     order = csgraph.reverse_cuthill_mckee(pattern, symmetric_mode=True)
     parts = []
     for c in range(count):
         whole = order[component[order] == c]
         free = whole[~fixed[whole]]
-        k, m, *own = (
-            sparse.csr_array(matrix[free].T)[free]  # symmetric; and so its columns ascend
-            for matrix in (stiffness, mass_matrix, *near)
-        )
         if len(free):
-            linear = (own[0], own[1]) if own else None
-            parts.append(_Part(free, k, m, linear, len(free) == len(whole)))
+            own = None if near is None else _renumbered(near, free)
+            k, m = _renumbered((stiffness, mass_matrix), free)
+            parts.append(_Part(free, k, m, own, len(free) == len(whole)))
     return parts
+
+
+def _renumbered(pair: tuple[Sparse, Sparse], order: np.ndarray) -> tuple[Sparse, Sparse]:
+    """Symmetric matrices with these rows and columns, in this order."""
+    if not _on_one_pattern(*pair):
+        one, other = (sparse.csr_array(matrix[order].T)[order] for matrix in pair)
+        return one, other
+    number = np.arange(pair[0].nnz, dtype=np.int32)
+    places = sparse.csr_array((number, pair[0].indices, pair[0].indptr), pair[0].shape)
+    places = sparse.csr_array(places[order].T)[order]  # and so its columns ascend
+    pattern = places.indices, places.indptr
+    one, other = (sparse.csr_array((m.data[places.data], *pattern), places.shape) for m in pair)
+    return one, other
 
 
 def _narrow(matrix: Sparse) -> Sparse:
@@ -153,9 +165,13 @@ def _narrow(matrix: Sparse) -> Sparse:
     return sparse.csr_array((matrix.data.astype(float, copy=False), *ends), shape=matrix.shape)
 
 
+def _on_one_pattern(one: Sparse, other: Sparse) -> bool:
+    return np.array_equal(one.indptr, other.indptr) and np.array_equal(one.indices, other.indices)
+
+
 def _joined(one: Sparse, other: Sparse) -> Sparse:
     """|A| + |B|, without zeros; in a tenth of the time where they are on one pattern."""
-    if np.array_equal(one.indptr, other.indptr) and np.array_equal(one.indices, other.indices):
+    if _on_one_pattern(one, other):
         data = abs(one.data) + abs(other.data)
         if data.all():
             return sparse.csr_array((data, one.indices, one.indptr), shape=one.shape)
