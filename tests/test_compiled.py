@@ -1,5 +1,6 @@
 """Kernels and what stands in for them: the same to the bit, whichever a process takes."""
 
+import itertools
 import math
 import sys
 
@@ -14,6 +15,8 @@ from torchlb.fits.least_squares import left_inverse
 from torchlb.fits.weights import scaled_system
 from torchlb.galerkin import pair
 from torchlb.galerkin.pair import upper_product
+from torchlb.geometry.cocone import best_manifold
+from torchlb.geometry.manifold import edges_of
 from torchlb.surfaces import Hemisphere
 
 
@@ -78,6 +81,18 @@ def test_upper_products_are_the_same_to_the_bit(both, monkeypatch):
     assert np.array_equal(one.indptr, other.indptr)
     assert np.array_equal(one.indices, other.indices)
     assert np.array_equal(one.data, other.data)
+
+
+def test_manifolds_are_the_same(both):
+    """Of random triangles, most of which do not fit to others, and of none."""
+    points = np.random.default_rng(0).standard_normal((60, 3))
+    some = np.array([c for c in itertools.combinations(range(60), 3) if sum(c) % 7 == 0])
+    for faces in (some, some[:0], np.random.default_rng(1).permutation(some)):
+        one, other = both(lambda faces=faces: best_manifold(points, faces), "best_manifold")
+        assert np.array_equal(one, other)
+        assert len(one) >= min(len(faces), 60)
+        if len(one):
+            assert edges_of(one, 60).uses.max() == 2
 
 
 def test_operators_are_the_same_to_the_bit(both):

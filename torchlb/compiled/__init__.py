@@ -1,8 +1,8 @@
 """Kernels compiled by numba, each the same to the bit as what stands in for it (`decisions.md`, *Compiled kernels*).
 
-`graph_balls`: neighbourhoods of surfaces in R³ and of flat domains. `left_inverse`: local fits. `upper_product`: the
-weak pair from its elements. Numba keeps what it has
-compiled, which takes some seconds once in an installation.
+`best_manifold`: triangles for a cloud. `graph_balls`: neighbourhoods of surfaces in R³ and of flat domains.
+`left_inverse`: local fits. `upper_product`: the weak pair from its elements. Numba keeps what it has compiled, which
+takes some seconds once in an installation.
 """
 
 from __future__ import annotations
@@ -14,16 +14,19 @@ from importlib import import_module
 from time import perf_counter
 from typing import Any
 
-KERNELS = "graph_balls", "left_inverse", "upper_product"
-PATIENCE = 0.5
-"""Seconds that a process spends in what stands in for kernels before it loads them, which takes as long."""
+KERNELS = "best_manifold", "graph_balls", "left_inverse", "upper_product"
+PATIENCE = 0.25
+"""Seconds that a process spends in what stands in for kernels before it loads them, which takes twice as long."""
 
 _spent = [0.0]
 
 
-def kernel(name: str) -> Any:
-    """The function of that name; None without numba, and until a process has spent `PATIENCE` without."""
-    return _loaded(name) if _spent[0] >= PATIENCE else None
+def kernel(name: str, seconds: float = 0.0) -> Any:
+    """The function of that name; None without numba, and until a process has spent `PATIENCE` without.
+
+    `seconds` are those that it would take without this time.
+    """
+    return _loaded(name) if _spent[0] + seconds >= PATIENCE else None
 
 
 def prepare() -> bool:

@@ -17,6 +17,7 @@ from scipy.spatial import Delaunay
 from torch import Tensor
 from torch.nn.functional import normalize
 
+from torchlb import compiled
 from torchlb.fits.polynomials import monomials
 from torchlb.fits.weights import window
 from torchlb.geometry.frames import complete_frames
@@ -43,6 +44,8 @@ RAISED = 1e-2
 """Of that, along the normals: points on a circle then have one layer of triangles, not several that mix."""
 FLAT = 1e-10
 """Tetrahedra of less volume, over the cube of their longest side, have no circumcentre to speak of; triangles alike."""
+IN_ROUNDS = 5e-6
+"""Seconds a triangle to choose in rounds."""
 RIDGE = 1e-13
 TINY = np.finfo(float).tiny
 
@@ -294,25 +297,32 @@ def wings(
 
 
 def best_manifold(points: Float[np.ndarray, "N 3"], faces: Faces) -> Faces:
-    """Of triangles, best first, each that leaves no edge with three faces or two that fold back.
-
-    Taken in rounds, those first that are the best at all their edges; the result is that of taking them one by one.
-    """
+    """Of triangles, best first, each that leaves no edge with three faces or two that fold back."""
     edges = edges_of(faces, len(points))
     of = edges.of.reshape(-1, 3)
     tail, head = (end.reshape(-1, 3) for end in edges.ends)
     wing = wings(points, tail, head, faces)
-    uses, first = np.zeros(len(edges.keys), dtype=int), np.zeros((len(edges.keys), 3))
-    left, taken = np.arange(len(faces)), []
+    kernel = compiled.kernel("best_manifold", IN_ROUNDS * len(faces))
+    one_by_one = _in_rounds if kernel is None else kernel
+    return faces[one_by_one(of, wing, len(edges.keys), FOLD)]
+
+
+@compiled.standing_in()
+def _in_rounds(
+    of: Int[np.ndarray, "F 3"], wing: Float[np.ndarray, "F 3 3"], count: int, fold: float
+) -> Bool[np.ndarray, " F"]:
+    """Those first that are the best at all their edges: the result is that of taking them one by one."""
+    uses, first = np.zeros(count, dtype=int), np.zeros((count, 3))
+    left, taken = np.arange(len(of)), np.zeros(len(of), dtype=bool)
     while len(left):
-        best = np.full(len(uses), len(faces))
+        best = np.full(count, len(of))
         np.minimum.at(best, of[left].ravel(), left.repeat(3))
         now = (best[of[left]] == left[:, None]).all(1)
         chosen, left = left[now], left[~now]
-        taken.append(chosen)
+        taken[chosen] = True
         uses[of[chosen].ravel()] += 1
         first[of[chosen].ravel()] = wing[chosen].reshape(-1, 3)
-        folds = (first[of[left]] * wing[left]).sum(-1) > FOLD
+        folds = (first[of[left]] * wing[left]).sum(-1) > fold
         there = uses[of[left]]
         left = left[~((there > 1) | ((there == 1) & folds)).any(1)]
-    return faces[np.concatenate(taken)] if taken else faces
+    return taken
