@@ -2,6 +2,8 @@
 
 import itertools
 import math
+import os
+import subprocess
 import sys
 
 import mpmath
@@ -115,6 +117,16 @@ def test_without_numba_all_works(monkeypatch):
     lb = LaplaceBeltrami.from_mesh(*Hemisphere().mesh(300))
     compiled._loaded.cache_clear()
     assert (lb.mass.sum() - 2 * math.pi).abs() < 1e-3
+
+
+def test_where_numba_does_not_compile_there_are_no_kernels():
+    pytest.importorskip("numba")
+    program = "from torchlb import compiled; print(compiled.prepare())"
+    for disabled, expected in (("0", "True"), ("1", "False")):
+        environment = os.environ | {"NUMBA_DISABLE_JIT": disabled}
+        command = [sys.executable, "-c", program]
+        done = subprocess.run(command, env=environment, capture_output=True, text=True, check=True)
+        assert done.stdout.strip() == expected
 
 
 def test_kernels_are_loaded_when_waiting_took_as_long(monkeypatch):

@@ -11,6 +11,7 @@ import trimesh
 from builders import stencil_of_cloud
 from torchlb import InputError, LaplaceBeltrami
 from torchlb.geometry.manifold import (
+    _ascending,
     boundary_loops,
     edges_of,
     with_single_fans,
@@ -464,3 +465,10 @@ def test_a_declared_boundary_that_was_closed_is_told():
         LaplaceBeltrami.from_points(
             points, order=1, boundary=torch.from_numpy(edge | (distance < 2.6))
         )
+
+
+def test_keys_too_large_to_be_sorted_with_their_places_are_sorted_alike():
+    key = np.random.default_rng(0).integers(0, 50, 400)
+    for one, other in zip(_ascending(key, 50), _ascending(key, 2**62), strict=True):
+        assert np.array_equal(one, other)
+    assert all(len(part) == 0 for part in _ascending(key[:0], 50))

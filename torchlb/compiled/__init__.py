@@ -37,9 +37,10 @@ def prepare() -> bool:
 @cache
 def _loaded(name: str) -> Any:
     try:
-        return getattr(import_module(f"torchlb.compiled.{name}"), name)
+        found = getattr(import_module(f"torchlb.compiled.{name}"), name)
     except (ImportError, RuntimeError):  # not there; no place to keep what is compiled
         return None
+    return found if hasattr(found, "signatures") else None  # it was told not to compile
 
 
 @contextmanager

@@ -50,7 +50,7 @@ def _scale(x: np.ndarray, factor: np.ndarray) -> None:
 )
 @no_type_check
 def left_inverse(columns: np.ndarray, root: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """As `torchlb.fits.left_inverse`, from the columns of V one after the other, (B, M, K), and √ω, (B, K)."""
+    """As `fits.least_squares.left_inverse`, from the columns of V one after the other, (B, M, K), and √ω, (B, K)."""
     batch, terms, size = columns.shape
     lanes = max(min(LANES, batch), 1)
     found, condition = np.empty_like(columns), np.empty(batch)

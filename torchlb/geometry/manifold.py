@@ -73,6 +73,25 @@ class Edges:
         return place, np.where(there, self.uses[place] if len(self.uses) else 0, 0)
 
 
+def _ascending(
+    key: Int[np.ndarray, " K"], bound: int
+) -> tuple[Int[np.ndarray, " K"], Int[np.ndarray, " K"]]:
+    """The stable order of keys below a bound, and the keys in it.
+
+    >>> _ascending(np.array([5, 3, 5, 0]), 6)
+    (array([3, 1, 0, 2]), array([0, 3, 5, 5]))
+    """
+    if (
+        bound * len(key) < 2**63
+    ):  # with the place as one number, that is sorted in a sixth of the time
+        both = key * len(key) + np.arange(len(key))
+        both.sort()
+        ascending = both // max(len(key), 1)
+        return both - ascending * len(key), ascending
+    order = key.argsort(kind="stable")
+    return order, key[order]
+
+
 def edges_of(faces: Faces, count: int) -> Edges:
     """The edges of triangles.
 
@@ -81,8 +100,7 @@ def edges_of(faces: Faces, count: int) -> Edges:
     """
     tail, head = np.roll(faces, -1, 1).ravel(), np.roll(faces, -2, 1).ravel()
     key = np.minimum(tail, head) * count + np.maximum(tail, head)
-    order = key.argsort(kind="stable")
-    ascending = key[order]
+    order, ascending = _ascending(key, count**2)
     first = np.flatnonzero(np.diff(ascending, prepend=-1))
     uses = np.diff(first, append=len(key))
     of = np.empty_like(order)
