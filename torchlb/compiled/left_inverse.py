@@ -8,7 +8,7 @@ import numpy as np
 from numba import njit
 
 LANES = 64
-"""Matrices at a time; with 16 to 128 it takes up to twice as long."""
+"""Matrices at a time; 16 to 128 take about as long."""
 
 
 @njit(error_model="numpy")

@@ -37,10 +37,8 @@ def left_inverse(
     [[[0.25, 0.25, 0.25, 0.25]]]
     """
     columns, weights = values.mT.contiguous().numpy(), root.contiguous().numpy()
-    kernel = compiled.kernel("left_inverse")
-    if kernel is None:
-        kernel = _left_inverse
-    found, condition = kernel(columns, weights)
+    inverses = compiled.kernel("left_inverse") or _left_inverse
+    found, condition = inverses(columns, weights)
     return torch.from_numpy(found), torch.from_numpy(condition)
 
 

@@ -110,11 +110,19 @@ def height_residual(
 
     The scatter is per degree of freedom, so their number does not matter.
     """
-    left = root[..., None] * (heights - values @ (coefficients @ heights))
+    left = root[..., None] * _left_by_fit(values, coefficients, heights)
     freedom = max(values.shape[1] - values.shape[2], 1) / values.shape[1]
     square = coords.norm(dim=-1).square() + heights.norm(dim=-1).square()
     distance = (root.square() * square).sum(1)
     return left.flatten(1).norm(dim=1) / (freedom * distance).sqrt()
+
+
+def _left_by_fit(
+    values: Float[Tensor, "B neighbors M"],
+    coefficients: Float[Tensor, "B M neighbors"],
+    heights: Float[Tensor, "B neighbors n"],
+) -> Float[Tensor, "B neighbors n"]:
+    return heights - values @ (coefficients @ heights)
 
 
 def scaled_system(
@@ -158,7 +166,7 @@ class CenteredFit:
 
     def misfit(self, heights: Float[Tensor, "B neighbors n"]) -> Float[Tensor, " B"]:
         """Largest weighted distance of the heights from their fit, over ρ."""
-        left = heights - self.values @ (self.coefficients @ heights)
+        left = _left_by_fit(self.values, self.coefficients, heights)
         return (self.root * left.norm(dim=-1)).amax(1) / self.radius
 
 

@@ -302,8 +302,7 @@ def best_manifold(points: Float[np.ndarray, "N 3"], faces: Faces) -> Faces:
     of = edges.of.reshape(-1, 3)
     tail, head = (end.reshape(-1, 3) for end in edges.ends)
     wing = wings(points, tail, head, faces)
-    kernel = compiled.kernel("best_manifold", IN_ROUNDS * len(faces))
-    one_by_one = _in_rounds if kernel is None else kernel
+    one_by_one = compiled.kernel("best_manifold", IN_ROUNDS * len(faces)) or _in_rounds
     return faces[one_by_one(of, wing, len(edges.keys), FOLD)]
 
 

@@ -81,9 +81,8 @@ def _ascending(
     >>> _ascending(np.array([5, 3, 5, 0]), 6)
     (array([3, 1, 0, 2]), array([0, 3, 5, 5]))
     """
-    if (
-        bound * len(key) < 2**63
-    ):  # with the place as one number, that is sorted in a sixth of the time
+    if bound * len(key) < 2**63:
+        # With the place as one number, that is sorted in a sixth of the time.
         both = key * len(key) + np.arange(len(key))
         both.sort()
         ascending = both // max(len(key), 1)
