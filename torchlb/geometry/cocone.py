@@ -23,7 +23,7 @@ from torchlb.fits.weights import window
 from torchlb.geometry.frames import complete_frames
 from torchlb.geometry.manifold import Faces, edges_of, face_vectors
 from torchlb.geometry.neighbors import AT_ONCE, admissible_neighbors
-from torchlb.geometry.vectors import dot
+from torchlb.geometry.vectors import dot, inner, largest, lengths, smallest
 
 COCONE = np.sin(np.pi / 8)
 """Sine of the half-angle between a tangent plane and the double cone that a dual edge has to leave."""
@@ -71,32 +71,35 @@ class Cloud:
 
     def circles(self, faces: Faces) -> tuple[Float[np.ndarray, " F"], Float[np.ndarray, "F 3"]]:
         """Circumradii, ℓ, and unit normals of triangles."""
-        corners = self.points[faces]
-        sides = corners[:, [1, 2, 0]] - corners
-        normal = np.cross(sides[:, 0], -sides[:, 2])
-        lengths = np.linalg.norm(sides, axis=2)
-        twice = np.linalg.norm(normal, axis=1)
-        twice = np.maximum(twice, FLAT * lengths.max(1) ** 2)
-        return lengths.prod(1) / (2 * twice), normal / twice[:, None]
+        a, b, c = (self.points.take(corner, 0) for corner in faces.T)
+        sides = b - a, c - b, a - c
+        one, two, three = map(lengths, sides)
+        normal = np.cross(sides[0], -sides[2])
+        longest = np.maximum(np.maximum(one, two), three)
+        twice = np.maximum(lengths(normal), FLAT * longest**2)
+        return one * two * three / (2 * twice), normal / twice[:, None]
 
     def limits(self, faces: Faces) -> Float[np.ndarray, " F"]:
         """Their largest circumradii, ℓ: the least reach of the corners, or the largest where density changes at once.
 
         All the nearest of a dense point at such a place are on its own side. Triangles across it have to lie level.
         """
-        reach = self.reach[faces]
-        limit = reach.min(1)
-        across = np.flatnonzero(reach.max(1) > STEP * self.around[faces].min(1))
-        normal = self.circles(faces[across])[1]
-        cosine = (normal[:, None] * self.normals[faces[across]]).sum(-1)
-        across = across[np.abs(cosine).min(1) > LEVEL]
-        limit[across] = reach[across].max(1)
-        return limit / np.where(self.rim[faces].all(1), 2, 1)
+        reach = self.reach.take(faces)
+        limit, widest = smallest(reach), largest(reach)
+        across = np.flatnonzero(widest > STEP * smallest(self.around.take(faces)))
+        level = self.alignment(self.circles(faces[across])[1], faces[across]) > LEVEL
+        across = across[level]
+        limit[across] = widest[across]
+        return limit / np.where(smallest(self.rim.take(faces)), 2, 1)
+
+    def alignment(self, normal: Float[np.ndarray, "F 3"], faces: Faces) -> Float[np.ndarray, " F"]:
+        """The least cosine between a triangle's normal and those of its corners, on either side."""
+        return smallest(np.abs(inner(normal[:, None], self.normals.take(faces, 0))))
 
     @cached_property
     def around(self) -> Float[np.ndarray, " N"]:
         """The reach of each point by all its neighbours, ℓ."""
-        far = np.linalg.norm(self.points[self.neighbors[:, -1]] - self.points, axis=1)
+        far = lengths(self.points[self.neighbors[:, -1]] - self.points)
         return np.maximum(self.reach, REACH * far)
 
     def small(self, faces: Faces) -> Faces:
@@ -182,7 +185,7 @@ class Tetrahedra:
         corners, which takes Qhull a time quadratic in their number (7,000: 15 s, moved 0.3 s).
         """
         random = np.random.default_rng(0).standard_normal(points.shape)
-        random -= (1 - RAISED) * (random * normals).sum(1, keepdims=True) * normals
+        random -= (1 - RAISED) * inner(random, normals)[:, None] * normals
         moved = points + MOVED * spacing[:, None] * random
         delaunay = Delaunay(moved)
         cells, beyond = delaunay.simplices.astype(np.int64), delaunay.neighbors
@@ -203,9 +206,9 @@ class Tetrahedra:
         ends = centers[first], centers[second]
         a, b, c = moved[triangles[hull]].swapaxes(0, 1)
         normal = np.cross(b - a, c - a)
-        normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), TINY)
+        normal /= np.maximum(lengths(normal), TINY)[:, None]
         inside = a - moved[np.concatenate(apex)[hull]]
-        away = np.sign((inside * normal).sum(1, keepdims=True)) * normal
+        away = np.sign(inner(inside, normal))[:, None] * normal
         ends[1][hull] = ends[0][hull] + FAR * np.ptp(points, axis=0).max() * away
         second[hull] = len(cells) + np.arange(hull.sum())
         return cls(points, cells, centers, triangles, ends, (first, second), hull)
@@ -215,16 +218,18 @@ class Tetrahedra:
         radius, normal = cloud.circles(self.triangles)
         kept = radius <= cloud.limits(self.triangles)
         triangles, radius, normal = self.triangles[kept], radius[kept], normal[kept]
-        ends = self.ends[0][kept], self.ends[1][kept]
-        alignment = np.abs((normal[:, None] * cloud.normals[triangles]).sum(-1)).min(1)
+        ends = tuple(end[kept] for end in self.ends)
+        alignment = cloud.alignment(normal, triangles)
         tangent = alignment > TILTED
         for corner in triangles.T:
-            tangent &= _leaves_cone(cloud.points[corner], cloud.normals[corner], ends)
+            left = np.flatnonzero(tangent)
+            apex, axis = (x.take(corner[left], 0) for x in (cloud.points, cloud.normals))
+            tangent[left] = _leaves_cone(apex, axis, tuple(end.take(left, 0) for end in ends))
         one, two = (side[number[kept]] for number in self.sides)
         parting = one != two
         out = (ends[0] - ends[1])[parting] * one[parting, None]
         vector = face_vectors(cloud.points, triangles[parting])
-        vector *= np.sign((out * vector).sum(1, keepdims=True))
+        vector *= np.sign(inner(out, vector))[:, None]
         outward = np.zeros_like(cloud.points)
         np.add.at(outward, triangles[parting], vector[:, None])
         cost = radius / np.maximum(alignment, TILTED) ** 2
@@ -258,11 +263,11 @@ class Candidates:
 
 
 def _circumcenters(points: np.ndarray, cells: Int[np.ndarray, "T 4"]) -> Float[np.ndarray, "T 3"]:
-    origin = points[cells[:, 0]]
-    u, v, w = (points[cells[:, k]] - origin for k in (1, 2, 3))
+    origin = points.take(cells[:, 0], 0)
+    u, v, w = (points.take(cells[:, k], 0) - origin for k in (1, 2, 3))
     crosses = np.cross(v, w), np.cross(w, u), np.cross(u, v)
-    halves = ((x * x).sum(1, keepdims=True) / 2 for x in (u, v, w))
-    determinant = (u * crosses[0]).sum(1, keepdims=True)
+    halves = (inner(x, x)[:, None] / 2 for x in (u, v, w))
+    determinant = inner(u, crosses[0])[:, None]
     total = sum(h * c for h, c in zip(halves, crosses, strict=True))
     with np.errstate(all="ignore"):
         center = total / determinant
@@ -271,14 +276,13 @@ def _circumcenters(points: np.ndarray, cells: Int[np.ndarray, "T 4"]) -> Float[n
 
 
 def _leaves_cone(
-    apex: np.ndarray, normal: np.ndarray, ends: tuple[np.ndarray, np.ndarray]
+    apex: np.ndarray, normal: np.ndarray, ends: tuple[np.ndarray, ...]
 ) -> Bool[np.ndarray, " F"]:
     """Whether a part of the segment between `ends` lies outside of the double cone around the normal."""
     rise = []
     for end in ends:
         offset = end - apex
-        length = np.maximum(np.linalg.norm(offset, axis=1), TINY)
-        rise.append((offset * normal).sum(1) / length)
+        rise.append(inner(offset, normal) / np.maximum(lengths(offset), TINY))
     one, two = rise
     return (np.abs(one) <= COCONE) | (np.abs(two) <= COCONE) | (one * two < 0)
 
@@ -290,10 +294,11 @@ def wings(
     tip: Int[np.ndarray, "*batch"],
 ) -> Float[np.ndarray, "*batch 3"]:
     """Unit vectors at a right angle from the edges tail–head to the points `tip`."""
-    along, out = points[head] - points[tail], points[tip] - points[tail]
-    along = along / np.maximum(np.linalg.norm(along, axis=-1, keepdims=True), TINY)
-    out = out - (out * along).sum(-1, keepdims=True) * along
-    return out / np.maximum(np.linalg.norm(out, axis=-1, keepdims=True), TINY)
+    start = points.take(tail, 0)
+    along, out = points.take(head, 0) - start, points.take(tip, 0) - start
+    along /= np.maximum(lengths(along), TINY)[..., None]
+    out -= inner(out, along)[..., None] * along
+    return out / np.maximum(lengths(out), TINY)[..., None]
 
 
 def best_manifold(points: Float[np.ndarray, "N 3"], faces: Faces) -> Faces:

