@@ -1,8 +1,9 @@
 """Kernels compiled by numba, each the same to the bit as what stands in for it (`decisions.md`, *Compiled kernels*).
 
-`best_manifold`: triangles for a cloud. `components`: what hangs together, and which side is out. `graph_balls`:
-neighbourhoods of surfaces in R³ and of flat domains. `left_inverse`: local fits. `upper_product`: the weak pair from its
-elements. Numba keeps what it has compiled, which takes some seconds once in an installation.
+`admissible`: who may enter a stencil. `best_manifold`: triangles for a cloud. `components`: what hangs together, and
+which side is out. `graph_balls`: neighbourhoods of surfaces in R³ and of flat domains. `left_inverse`: local fits.
+`upper_product`: the weak pair from its elements. Numba keeps what it has compiled, which takes some seconds once in an
+installation.
 """
 
 from __future__ import annotations
@@ -14,7 +15,14 @@ from importlib import import_module
 from time import perf_counter
 from typing import Any
 
-KERNELS = "best_manifold", "components", "graph_balls", "left_inverse", "upper_product"
+KERNELS = (
+    "admissible",
+    "best_manifold",
+    "components",
+    "graph_balls",
+    "left_inverse",
+    "upper_product",
+)
 PATIENCE = 0.25
 """Seconds that a process spends in what stands in for kernels before it loads them, which takes twice as long."""
 

@@ -270,16 +270,20 @@ def _with_data(
     share: Float[Tensor, " B"],
     degree: int,
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """The system with a further row (∂_ν + a) y^α for every point of the stencil; what the rows make of 1; and √ω.
+    """The system with further rows (∂_ν + a) y^α, as many as a stencil has boundary points; what rows make of 1; and √ω.
 
-    ω = 0 off the boundary; `share` is aρ, since coordinates are over ρ.
+    ω = 0 where a stencil has fewer; `share` is aρ, since coordinates are over ρ.
     """
     nodes = torch.cat([torch.zeros_like(scaled[:, :1]), scaled], dim=1)
     on_boundary = flux.square().sum(-1) > 0
+    most = int(on_boundary.sum(1).max()) if len(flux) else 0
+    place = on_boundary.byte().argsort(dim=1, descending=True, stable=True)[:, :most]
+    nodes, flux = (x.take_along_dim(place[..., None], dim=1) for x in (nodes, flux))
+    on_boundary = on_boundary.gather(1, place)
     share = share[:, None] * on_boundary
     data = (monomial_derivatives(nodes, degree) * flux[:, :, None]).sum(-1)
     data = data + share[..., None] * monomials(nodes, degree)
-    weight = torch.cat([torch.ones_like(root[:, :1]), root], dim=1) * on_boundary
+    weight = torch.cat([torch.ones_like(root[:, :1]), root], dim=1).gather(1, place) * on_boundary
     constant = torch.cat([torch.ones_like(root), share], dim=1)
     return torch.cat([values, data], dim=1), constant, torch.cat([root, weight], dim=1)
 

@@ -200,9 +200,12 @@ def with_single_fans(faces: Faces, count: int) -> Faces:
     >>> with_single_fans(np.array([[0, 1, 2], [0, 2, 3], [0, 4, 5]]), 6).tolist()
     [[0, 1, 2], [0, 2, 3]]
     """
+    looked_at = np.ones(count, dtype=bool)  # points; later those alone that have lost a face
     while len(faces):
-        one, two = edges_of(faces, count).twins
-        corner = faces.ravel()
+        around = np.flatnonzero(looked_at.take(faces).any(1))
+        part = faces[around]
+        one, two = edges_of(part, count).twins
+        corner = part.ravel()
         left, right = [], []
         for turn in (1, 2):  # the corners of both faces at the same end of their edge
             mine = one - one % 3 + (one + turn) % 3
@@ -210,18 +213,20 @@ def with_single_fans(faces: Faces, count: int) -> Faces:
             left.append(mine)
             right.append(np.where(corner[near] == corner[mine], near, far))
         joined = np.concatenate(left)
-        fan = components(joined, np.concatenate(right), 3 * len(faces))
+        fan = components(joined, np.concatenate(right), len(corner))
         size = np.bincount(fan)
         closed = np.bincount(fan[joined], minlength=len(size)) == size
         point = np.zeros_like(size)
         point[fan] = corner
         order = np.lexsort((size + CLOSED * closed, point))
-        best = np.zeros(len(size), dtype=bool)
+        best = ~looked_at[point]
         best[order[np.append(np.diff(point[order]) > 0, True)]] = True
-        keep = best[fan].reshape(-1, 3).all(1)
-        if keep.all():
+        lost = ~best[fan].reshape(-1, 3).all(1)
+        if not lost.any():
             break
-        faces = faces[keep]
+        looked_at[:] = False
+        looked_at[part[lost]] = True
+        faces = np.delete(faces, around[lost], 0)
     return faces
 
 

@@ -92,10 +92,15 @@ def admissible(
     below the centre's plane (height ≤ 0.5 of the distance). `planes` are frames E, or the unit normals of a
     hypersurface, which tell the same in less time: σ_min(E_kᵀE_i) = |n_k·n_i|. Orientation is irrelevant.
     """
+    kernel = compiled.kernel("admissible") if planes.ndim == 2 else None
+    if kernel is not None:
+        arrays = (x.contiguous().numpy() for x in (points, planes, centers, others))
+        return torch.from_numpy(kernel(*arrays, MAX_SLOPE, MIN_ALIGNMENT))
     parts = zip(centers.split(PAIRS_AT_ONCE), others.split(PAIRS_AT_ONCE), strict=True)
     return torch.cat([_admissible_part(points, planes, *part) for part in parts])
 
 
+@compiled.standing_in()
 def _admissible_part(points: Tensor, planes: Tensor, centers: Tensor, others: Tensor) -> Tensor:
     offset = at(points, others) - at(points, centers)
     total = dot(offset, offset)
