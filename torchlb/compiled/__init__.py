@@ -1,9 +1,9 @@
 """Kernels compiled by numba, each the same to the bit as what stands in for it (`decisions.md`, *Compiled kernels*).
 
 `admissible`: who may enter a stencil. `best_manifold`: triangles for a cloud. `components`: what hangs together, and
-which side is out. `graph_balls`: neighbourhoods of surfaces in R³ and of flat domains. `left_inverse`: local fits.
-`upper_product`: the weak pair from its elements. Numba keeps what it has compiled, which takes some seconds once in an
-installation.
+which side is out. `graph_balls`: neighbourhoods of surfaces in R³ and of flat domains. `left_inverse`, `monomials`:
+local fits. `upper_product`: the weak pair from its elements. Numba keeps what it has compiled, which takes some seconds
+once in an installation.
 """
 
 from __future__ import annotations
@@ -21,6 +21,7 @@ KERNELS = (
     "components",
     "graph_balls",
     "left_inverse",
+    "monomials",
     "upper_product",
 )
 PATIENCE = 0.25

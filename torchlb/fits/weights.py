@@ -16,8 +16,8 @@ from torchlb.fits.least_squares import left_inverse
 from torchlb.fits.polynomials import (
     gradient_functional,
     laplacian_functional,
+    monomial_columns,
     monomial_derivatives,
-    monomials,
 )
 
 ON_LINE = 1e-5
@@ -71,7 +71,12 @@ def window(radius: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
     >>> window(torch.tensor([0.0, 1.1])).tolist()
     [1.0, 0.0]
     """
-    return (1 - (radius / 1.1).square()).clamp_min(0).pow(4)
+    return _root_window(radius).square()
+
+
+def _root_window(radius: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
+    """√ω."""
+    return (1 - (radius / 1.1).square()).clamp_min(0).square()
 
 
 def functionals_of(dim: int, degree: int) -> Float[Tensor, "M F"]:
@@ -134,8 +139,9 @@ def scaled_system(
     distance = coords.norm(dim=-1)
     radius = (distance if keep is None else distance * keep).amax(-1)
     scaled = coords / radius[:, None, None]
-    root = window(distance / radius[:, None]).sqrt()
-    return radius, scaled, monomials(scaled, degree), root if keep is None else root * keep
+    root = _root_window(distance / radius[:, None])
+    values = monomial_columns(scaled, degree)
+    return radius, scaled, values, root if keep is None else root * keep
 
 
 @dataclass(frozen=True)
@@ -200,7 +206,7 @@ def cardinal(
     >>> cardinal(line.coefficients, torch.tensor([[[0.5]]], dtype=torch.float64), 2).round(decimals=12).tolist()
     [[[0.75, -0.125, 0.375]]]
     """
-    others = monomials(places, degree) @ coefficients
+    others = monomial_columns(places, degree) @ coefficients
     return torch.cat([1 - others.sum(-1, keepdim=True), others], -1)
 
 
@@ -270,7 +276,7 @@ def _with_data(
     share: Float[Tensor, " B"],
     degree: int,
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """The system with further rows (∂_ν + a) y^α, as many as a stencil has boundary points; what rows make of 1; and √ω.
+    """The system with rows (∂_ν + a) y^α for the boundary points of a stencil; what the rows make of 1; and √ω.
 
     ω = 0 where a stencil has fewer; `share` is aρ, since coordinates are over ρ.
     """
@@ -282,7 +288,7 @@ def _with_data(
     on_boundary = on_boundary.gather(1, place)
     share = share[:, None] * on_boundary
     data = (monomial_derivatives(nodes, degree) * flux[:, :, None]).sum(-1)
-    data = data + share[..., None] * monomials(nodes, degree)
+    data = data + share[..., None] * monomial_columns(nodes, degree)
     weight = torch.cat([torch.ones_like(root[:, :1]), root], dim=1).gather(1, place) * on_boundary
     constant = torch.cat([torch.ones_like(root), share], dim=1)
     return torch.cat([values, data], dim=1), constant, torch.cat([root, weight], dim=1)

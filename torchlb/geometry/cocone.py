@@ -18,7 +18,7 @@ from torch import Tensor
 from torch.nn.functional import normalize
 
 from torchlb import compiled
-from torchlb.fits.polynomials import monomials
+from torchlb.fits.polynomials import monomial_columns
 from torchlb.fits.weights import window
 from torchlb.geometry.frames import complete_frames
 from torchlb.geometry.manifold import Faces, edges_of, face_vectors
@@ -139,7 +139,7 @@ def _slopes_removed(
     good[:, 0] = True
     reach = (distance * good).amax(1, keepdim=True).clamp_min(TINY)
     weight = window((distance / reach).clamp_max(1.1)) * good
-    terms = monomials(offset @ frames / reach[..., None], 2)
+    terms = monomial_columns(offset @ frames / reach[..., None], 2)
     terms = torch.cat([torch.ones_like(terms[..., :1]), terms], -1) * weight[..., None]
     heights = weight * dot(offset, own[:, None]) / reach
     square = terms.mT @ terms

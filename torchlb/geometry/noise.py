@@ -6,7 +6,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from torchlb.fits.polynomials import monomials, num_monomials
+from torchlb.fits.polynomials import monomial_columns, num_monomials
 from torchlb.geometry.frames import complete_frames
 from torchlb.geometry.neighbors import AT_ONCE, admissible_neighbors
 from torchlb.geometry.vectors import dot
@@ -66,7 +66,7 @@ def _residuals(
     radius = (offset.norm(dim=-1) * good).amax(1)
     heights = dot(offset, normals[centers, None]) * good
     scale = radius.clamp_min(torch.finfo(radius.dtype).tiny)[:, None, None]
-    terms = monomials(offset @ frames / scale, degree)
+    terms = monomial_columns(offset @ frames / scale, degree)
     terms = torch.cat([torch.ones_like(terms[..., :1]), terms], -1) * good[..., None]
     square = terms.mT @ terms
     square += RIDGE * good.sum(1)[:, None, None] * torch.eye(square.shape[-1]).to(square)
