@@ -18,6 +18,7 @@ from torchlb.fits.polynomials import (
     laplacian_functional,
     monomial_columns,
     monomial_derivatives,
+    monomials,
 )
 
 ON_LINE = 1e-5
@@ -206,7 +207,7 @@ def cardinal(
     >>> cardinal(line.coefficients, torch.tensor([[[0.5]]], dtype=torch.float64), 2).round(decimals=12).tolist()
     [[[0.75, -0.125, 0.375]]]
     """
-    others = monomial_columns(places, degree) @ coefficients
+    others = monomials(places, degree) @ coefficients
     return torch.cat([1 - others.sum(-1, keepdim=True), others], -1)
 
 
@@ -288,7 +289,7 @@ def _with_data(
     on_boundary = on_boundary.gather(1, place)
     share = share[:, None] * on_boundary
     data = (monomial_derivatives(nodes, degree) * flux[:, :, None]).sum(-1)
-    data = data + share[..., None] * monomial_columns(nodes, degree)
+    data = data + share[..., None] * monomials(nodes, degree)
     weight = torch.cat([torch.ones_like(root[:, :1]), root], dim=1).gather(1, place) * on_boundary
     constant = torch.cat([torch.ones_like(root), share], dim=1)
     return torch.cat([values, data], dim=1), constant, torch.cat([root, weight], dim=1)

@@ -8,7 +8,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from torchlb.fits.polynomials import monomial_columns
+from torchlb.fits.polynomials import monomials
 from torchlb.galerkin.assembly import CHUNK, area_element, flat_metric, metric
 from torchlb.galerkin.elements import EDGES, lattice, triangle
 from torchlb.galerkin.nodes import Nodes
@@ -182,7 +182,7 @@ def _to_graph(
     """From places to the graph of the surface at a vertex, orthogonally to its frame."""
     surface, frame, offset = fits.surface, at(fits.frames, vertex), places - at(points, vertex)
     along = offset[:, None] @ frame
-    powers = monomial_columns(along / surface.radius[vertex, None, None], surface.highest)
+    powers = monomials(along / surface.radius[vertex, None, None], surface.highest)
     return (powers @ at(surface.heights, vertex) + along @ frame.mT)[:, 0] - offset
 
 
