@@ -114,11 +114,7 @@ def pencil_eigenbasis(
     elif tolerance is None:
         tolerance = min(TOLERANCE * k**2, LOOSEST)
     found = [_pairs(part, k, tolerance) for part in parts]
-    basis = _merged(parts, found, mass, k, tolerance)
-    basis.eigenvalues /= unit
-    basis.eigenvectors /= unit**0.5
-    basis.left *= unit**0.5
-    return basis
+    return _merged(parts, found, mass, k, tolerance, unit)
 
 
 def _parts(
@@ -360,9 +356,14 @@ def _ritz(space: Blocks, count: int) -> tuple[np.ndarray, Blocks]:
 
 
 def _merged(
-    parts: list[_Part], found: list[tuple[np.ndarray, ...]], mass: Tensor, k: int, tolerance: float
+    parts: list[_Part],
+    found: list[tuple[np.ndarray, ...]],
+    mass: Tensor,
+    k: int,
+    tolerance: float,
+    unit: float,
 ) -> Eigenbasis:
-    """The components side by side, ascending; their constants recombined so that the first is global."""
+    """The components side by side, ascending, in units of `mass`; their constants recombined: the first is global."""
     values, errors = (np.concatenate([f[i] for f in found] or [np.zeros(0)]) for i in (0, 1))
     columns = np.cumsum([0, *(len(f[0]) for f in found)])
     constants = [at for part, at in zip(parts, columns[:-1], strict=True) if part.conserving]
@@ -388,13 +389,11 @@ def _merged(
         phi[:, :count], left[:, :count] = phi[:, :count] @ t, left[:, :count] @ t
         phi[np.concatenate([part.points for part in nulls]), 0] = 1 / linalg.norm(root)
     signs = np.where(-phi.min(0) > phi.max(0), -1.0, 1.0)  # the largest entry is positive
-    arrays = (values[:keep].copy(), phi * signs, left * signs, errors[:keep].copy())
+    phi *= signs / unit**0.5
+    left *= signs * unit**0.5
+    arrays = (values[:keep] / unit, phi, left, errors[:keep].copy())
     eigenvalues, eigenvectors, left, errors = (torch.from_numpy(x) for x in arrays)
+    mass = mass.detach().cpu().double()
     return Eigenbasis(
-        eigenvalues,
-        eigenvectors,
-        mass.detach().cpu().double(),
-        left,
-        is_symmetric=True,
-        relative_errors=errors,
+        eigenvalues, eigenvectors, mass, left, is_symmetric=True, relative_errors=errors
     )
