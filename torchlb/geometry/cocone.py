@@ -22,7 +22,7 @@ from torchlb.fits.polynomials import monomial_columns
 from torchlb.fits.weights import window
 from torchlb.geometry.frames import complete_frames
 from torchlb.geometry.manifold import Faces, edges_of, face_vectors
-from torchlb.geometry.neighbors import AT_ONCE, admissible_neighbors
+from torchlb.geometry.neighbors import PAIRS_AT_ONCE, admissible_neighbors
 from torchlb.geometry.vectors import dot, inner, largest, lengths, smallest
 
 COCONE = np.sin(np.pi / 8)
@@ -119,11 +119,10 @@ def refined_normals(
     The quadratics need not go through the point itself, which lessens what noise does to the slope.
     """
     centers = torch.arange(len(points)) if centers is None else centers
+    parts = centers.split(max(PAIRS_AT_ONCE // candidates.shape[1], 1))
     for _ in range(rounds):
-        parts = [
-            _slopes_removed(points, normals, candidates[part]) for part in centers.split(AT_ONCE)
-        ]
-        normals = normals.index_put((centers,), torch.cat(parts))
+        found = [_slopes_removed(points, normals, candidates[part]) for part in parts]
+        normals = normals.index_put((centers,), torch.cat(found))
     return normals
 
 
@@ -139,13 +138,13 @@ def _slopes_removed(
     good[:, 0] = True
     reach = (distance * good).amax(1, keepdim=True).clamp_min(TINY)
     weight = window((distance / reach).clamp_max(1.1)) * good
-    terms = monomial_columns(offset @ frames / reach[..., None], 2)
-    terms = torch.cat([torch.ones_like(terms[..., :1]), terms], -1) * weight[..., None]
+    terms = monomial_columns(offset @ frames / reach[..., None], 2).mT
+    terms = torch.cat([torch.ones_like(terms[:, :1]), terms], 1) * weight[:, None]
     heights = weight * dot(offset, own[:, None]) / reach
-    square = terms.mT @ terms
+    square = terms @ terms.mT
     trace = square.diagonal(dim1=-2, dim2=-1).sum(-1)
     square += RIDGE * trace[:, None, None] * torch.eye(6, dtype=points.dtype)
-    slope = torch.linalg.solve(square, terms.mT @ heights[..., None])[:, 1:3]
+    slope = torch.linalg.solve(square, terms @ heights[..., None])[:, 1:3]
     sound = (good.sum(1) > 7) & (slope[..., 0].norm(dim=1) < 1)
     return torch.where(sound[:, None], normalize(own - (frames @ slope)[..., 0]), own)
 

@@ -66,10 +66,10 @@ def _residuals(
     radius = (offset.norm(dim=-1) * good).amax(1)
     heights = dot(offset, normals[centers, None]) * good
     scale = radius.clamp_min(torch.finfo(radius.dtype).tiny)[:, None, None]
-    terms = monomial_columns(offset @ frames / scale, degree)
-    terms = torch.cat([torch.ones_like(terms[..., :1]), terms], -1) * good[..., None]
-    square = terms.mT @ terms
+    terms = monomial_columns(offset @ frames / scale, degree).mT
+    terms = torch.cat([torch.ones_like(terms[:, :1]), terms], 1) * good[:, None]
+    square = terms @ terms.mT
     square += RIDGE * good.sum(1)[:, None, None] * torch.eye(square.shape[-1]).to(square)
-    coefficients = torch.linalg.solve(square, terms.mT @ heights[..., None])
-    left = heights - (terms @ coefficients)[..., 0]
+    coefficients = torch.linalg.solve(square, terms @ heights[..., None])
+    left = heights - (terms.mT @ coefficients)[..., 0]
     return radius, good.sum(1), left.square().sum(1), coefficients[:, 0, 0]
