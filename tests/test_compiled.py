@@ -14,11 +14,13 @@ from scipy import sparse
 
 from torchlb import LaplaceBeltrami, compiled
 from torchlb.fits.least_squares import left_inverse
+from torchlb.fits.polynomials import monomial_columns, monomials
 from torchlb.fits.weights import scaled_system
 from torchlb.galerkin import pair
 from torchlb.galerkin.pair import upper_product
 from torchlb.geometry.cocone import best_manifold
-from torchlb.geometry.manifold import edges_of
+from torchlb.geometry.manifold import components, edges_of, spanning_pairs, tree_sides
+from torchlb.geometry.neighbors import admissible
 from torchlb.surfaces import Hemisphere
 
 
@@ -97,11 +99,53 @@ def test_manifolds_are_the_same(both):
             assert edges_of(one, 60).uses.max() == 2
 
 
-def test_operators_are_the_same_to_the_bit(both):
+@pytest.mark.parametrize(("count", "pairs"), [(0, 0), (1, 0), (9, 5), (80, 50), (80, 400)])
+def test_components_and_sides_are_the_same(count, pairs, both):
+    """And sides are consistent: as every pair that closed no circle says."""
+    generator = np.random.default_rng(pairs)
+    i, j = generator.integers(0, max(count, 1), (2, pairs))
+    i, j = i[i != j], j[i != j]
+    against = generator.random(len(i)) < 0.4
+    one, other = both(lambda: components(i, j, count), "components")
+    assert np.array_equal(one, other)
+    assert (one[i] == one[j]).all()
+    one, other = both(lambda: tree_sides(i, j, against, count), "components")
+    assert np.array_equal(one, other)
+    chosen = spanning_pairs(i, j, count)
+    assert np.array_equal(one[i[chosen]] ^ one[j[chosen]], against[chosen])
+
+
+def test_admission_is_the_same(both):
+    """In R², R³ and R⁴, and at points that coincide."""
+    for n in (2, 3, 4):
+        points, normals = torch.randn(2, 300, n, dtype=torch.float64)
+        points[::9] = points[0]
+        normals = normals / normals.norm(dim=1, keepdim=True)
+        pairs = torch.randint(0, 300, (2, 5000))
+        one, other = both(lambda a=points, b=normals, c=pairs: admissible(a, b, *c), "admissible")
+        assert torch.equal(one, other)
+        assert 0 < one.sum() < 5000
+
+
+@pytest.mark.parametrize(("dim", "degree"), [(1, 3), (2, 1), (2, 6), (3, 4)])
+@pytest.mark.parametrize("batch", [0, 1, 50])
+def test_monomials_are_the_same(dim, degree, batch, both):
+    coords = torch.randn(batch, 12, dim, dtype=torch.float64)
+    one, other = both(lambda: monomial_columns(coords, degree), "monomials")
+    assert torch.equal(one, other)
+    assert torch.equal(one, monomials(coords, degree))
+
+
+@pytest.mark.parametrize("on_mesh", [True, False])
+def test_operators_are_the_same_to_the_bit(on_mesh, both):
     vertices, faces = Hemisphere().mesh(400)
-    one, other = both(
-        lambda: LaplaceBeltrami.from_mesh(vertices, faces).state_dict(), "graph_balls"
-    )
+
+    def built():
+        if on_mesh:
+            return LaplaceBeltrami.from_mesh(vertices, faces).state_dict()
+        return LaplaceBeltrami.from_points(vertices).state_dict()
+
+    one, other = both(built, "graph_balls")
     assert one.keys() == other.keys()
     for name, x in one.items():
         if isinstance(x, torch.Tensor):
