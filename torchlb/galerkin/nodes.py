@@ -9,6 +9,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from torchlb.galerkin.elements import EDGES, lattice
+from torchlb.geometry.manifold import edges_of
 
 
 @dataclass(frozen=True)
@@ -49,11 +50,10 @@ def lagrange_nodes(faces: Int[Tensor, "F 3"], num_points: int, degree: int) -> N
     >>> lagrange_nodes(torch.tensor([[0, 1, 2], [1, 3, 2]]), 4, 2).elements.tolist()
     [[0, 1, 2, 4, 6, 5], [1, 3, 2, 7, 8, 6]]
     """
-    half = torch.cat([faces[:, list(ends)] for ends in EDGES])
-    key = half.amin(1) * num_points + half.amax(1)
-    unique, edge, uses = torch.unique(key, return_inverse=True, return_counts=True)
-    edges = torch.stack([unique // num_points, unique % num_points], 1)
-    edge = edge.view(3, len(faces)).T.contiguous()
+    found = edges_of(faces.numpy(), num_points)
+    keys, of, uses = (torch.from_numpy(part) for part in (found.keys, found.of, found.uses))
+    edges = torch.stack([keys // num_points, keys % num_points], 1)
+    edge = of.view(-1, 3).roll(1, 1)  # those across corners 2, 0, 1
     on_edge = degree - 1
     steps = torch.arange(1, degree, dtype=torch.float64) / degree
     shares = torch.stack([1 - steps, steps, 0 * steps], 1).repeat(len(edges), 1)

@@ -40,6 +40,8 @@ WALKS_AT_ONCE = 2**22
 """Walks of two edges whose ends are looked at together: through the middle of a fan of n triangles there are n²."""
 EDGES = 6
 """The longest edges of a point, in whose middles its fit is judged."""
+BY_MATRICES = 1.5e-6
+"""Seconds a point of a ball where nothing is compiled, and for the larger balls that follow."""
 BALL_SURPLUS = 1.5
 """A graph ball holds this many times the points asked for, so that its round core lies inside the ragged edge."""
 
@@ -311,7 +313,8 @@ class GraphBalls:
         """In turn some of the centres, their balls, and how many points these hold."""
         dim, codimension = self.frames.shape[2], self.points.shape[1] - self.frames.shape[2]
         curved = codimension and self._planes.ndim == 3  # for which nothing is compiled
-        kernel = None if curved else compiled.kernel("graph_balls")
+        seconds = BY_MATRICES * size * len(self.points)
+        kernel = None if curved else compiled.kernel("graph_balls", seconds)
         if kernel is None:
             number = self._walks[centers].cumsum(0) // WALKS_AT_ONCE
             for part in centers.split(number.unique_consecutive(return_counts=True)[1].tolist()):

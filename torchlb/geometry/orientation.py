@@ -32,9 +32,11 @@ def nearest_pairs(candidates: Int[Tensor, "N K"]) -> tuple[Int[Tensor, " P"], In
     num_points, size = candidates.shape
     i = torch.arange(num_points).repeat_interleave(size - 1)
     j = candidates[:, 1:].reshape(-1)
-    code = torch.unique(torch.minimum(i, j) * num_points + torch.maximum(i, j))
-    code = code[code // num_points != code % num_points]
-    return code // num_points, code % num_points
+    code = (torch.minimum(i, j) * num_points + torch.maximum(i, j)).numpy()
+    code.sort()  # in a quarter of the time of `torch.unique`
+    code = torch.from_numpy(code[np.flatnonzero(np.diff(code, prepend=-1))])
+    low, high = code // num_points, code % num_points
+    return low[low != high], high[low != high]
 
 
 def _across(
