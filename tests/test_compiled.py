@@ -17,10 +17,11 @@ from torchlb.fits.least_squares import left_inverse
 from torchlb.fits.polynomials import monomial_columns, monomials
 from torchlb.fits.weights import scaled_system
 from torchlb.galerkin import pair
-from torchlb.galerkin.pair import upper_product
+from torchlb.galerkin.pair import stored, upper_product
 from torchlb.geometry.cocone import best_manifold
 from torchlb.geometry.manifold import components, edges_of, spanning_pairs, tree_sides
 from torchlb.geometry.neighbors import admissible
+from torchlb.geometry.numbering import Numbering
 from torchlb.surfaces import Hemisphere
 
 
@@ -85,6 +86,26 @@ def test_upper_products_are_the_same_to_the_bit(both, monkeypatch):
     assert np.array_equal(one.indptr, other.indptr)
     assert np.array_equal(one.indices, other.indices)
     assert np.array_equal(one.data, other.data)
+
+
+@pytest.mark.parametrize("count", [1, 200])
+def test_mirrored_matrices_are_the_same_to_the_bit(count, both):
+    """Symmetric, rows of K sum to zero, in whatever order points are numbered."""
+    generator = np.random.default_rng(count)
+    parts = [sparse.random_array((count, count), density=0.1, rng=generator) for _ in range(2)]
+    upper = sparse.triu(parts[0] + 1j * parts[1]) + (1 + 1j) * sparse.eye_array(count)
+    numbering = Numbering.along_tree(torch.rand(count, 3, dtype=torch.float64))
+    for given in (None, numbering):
+        one, other = both(lambda given=given: stored(upper, None, given), "mirrored")
+        for name, x in vars(one).items():
+            assert torch.equal(x, vars(other)[name])
+        shape = (count, count)
+        k, m = (sparse.csr_array((v, one.col, one.crow), shape).toarray() for v in one.values)
+        assert np.array_equal(k, k.T)
+        assert np.abs(k.sum(1)).max() < 1e-14 * max(np.abs(k).max(), 1)
+        whole = (upper + upper.T).imag.toarray() / (1 + np.eye(count))
+        place = np.arange(count) if given is None else given.here.numpy()
+        assert np.array_equal(m, whole[np.ix_(place, place)])
 
 
 def test_manifolds_are_the_same(both):

@@ -2,8 +2,8 @@
 
 `admissible`: who may enter a stencil. `best_manifold`: triangles for a cloud. `components`: what hangs together, and
 which side is out. `graph_balls`: neighbourhoods of surfaces in R³ and of flat domains. `left_inverse`, `monomials`:
-local fits. `upper_product`: the weak pair from its elements. Numba keeps what it has compiled, which takes some seconds
-once in an installation.
+local fits. `mirrored`, `upper_product`: the weak pair from its elements. Numba keeps what it has compiled, which takes
+some seconds once in an installation.
 """
 
 from __future__ import annotations
@@ -21,6 +21,7 @@ KERNELS = (
     "components",
     "graph_balls",
     "left_inverse",
+    "mirrored",
     "monomials",
     "upper_product",
 )

@@ -222,16 +222,43 @@ def stored(upper: Any, rim: Any = None, numbering: Numbering | None = None) -> S
 
     From a numbering back to the user's, if there is one; `rim` is the mass of the boundary, whole.
     """
-    upper = sparse.coo_array(upper)
-    count, (row, col) = upper.shape[0], upper.coords
-    given = None if numbering is None else numbering.given.int().numpy()
-    if given is not None:
-        row, col = given[row], given[col]
-        row, col = np.minimum(row, col), np.maximum(row, col)
-    lower: Any = sparse.coo_array((upper.data, (col, row)), shape=upper.shape)
+    upper = sparse.csr_array(upper)
+    count = upper.shape[0]
+    given = np.arange(count) if numbering is None else numbering.given.numpy()
+    kernel = compiled.kernel("mirrored")
+    if kernel is None:
+        crow, col, values, diagonal = _mirrored(upper, given)
+    else:
+        crow, col, values, diagonal = kernel(*_arrays(upper), given)
+    del upper
+    values[0, diagonal] -= np.add.reduceat(values[0], crow[:-1])
+    crow, col, values = (torch.from_numpy(part) for part in (crow, col, values))
+    if rim is not None:
+        line: Any = sparse.coo_array((rim + rim.T) / 2)
+        i, j = (given[ends] for ends in line.coords)
+        extra = torch.zeros_like(values[:1])
+        place = torch.arange(count).repeat_interleave(crow.diff()) * count + col
+        wanted = torch.from_numpy(i * count + j)
+        extra[0, torch.searchsorted(place, wanted)] = torch.from_numpy(line.data)
+        values = torch.cat([values, extra])
+    return SparsePair(crow, col, values)
+
+
+@compiled.standing_in()
+def _mirrored(
+    upper: Any, given: Int[np.ndarray, " N"]
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """The whole of a matrix that has one entry for each pair of rows, in other numbers, columns ascending.
+
+    Row pointers, columns, (2, nnz) real and imaginary parts, and where the diagonal is.
+    """
+    entries = sparse.coo_array(upper)
+    count, (row, col) = upper.shape[0], (given.astype(np.int32)[ends] for ends in entries.coords)
+    ends = np.maximum(row, col), np.minimum(row, col)
+    lower: Any = sparse.coo_array((entries.data, ends), shape=upper.shape)
     lower.has_canonical_format = True  # but for its order, which the transposes bring about
     upper = sparse.csr_array(sparse.csr_array(lower).T)
-    del lower, row, col
+    del entries, lower, row, col, ends
     before = np.bincount(upper.indices, minlength=count) - 1  # of each row, left of the diagonal
     crow = np.concatenate([[0], np.cumsum(before + np.diff(upper.indptr))])
     free, diagonal = crow[:-1].copy(), crow[:-1] + before
@@ -248,15 +275,4 @@ def stored(upper: Any, rim: Any = None, numbering: Numbering | None = None) -> S
         put(part, diagonal[first : first + ROWS], 0)
         put(mirrored, free, first)
         free += np.diff(mirrored.indptr)
-    del upper
-    values[0, diagonal] -= np.add.reduceat(values[0], crow[:-1])
-    crow, col, values = (torch.from_numpy(part) for part in (crow, col, values))
-    if rim is not None:
-        line: Any = sparse.coo_array((rim + rim.T) / 2)
-        i, j = (ends if given is None else given[ends] for ends in line.coords)
-        extra = torch.zeros_like(values[:1])
-        place = torch.arange(count).repeat_interleave(crow.diff()) * count + col
-        wanted = torch.from_numpy(i.astype(np.int64) * count + j)
-        extra[0, torch.searchsorted(place, wanted)] = torch.from_numpy(line.data)
-        values = torch.cat([values, extra])
-    return SparsePair(crow, col, values)
+    return crow, col, values, diagonal
