@@ -160,7 +160,7 @@ def _meet(one: Float[np.ndarray, "P 4 3"], two: Float[np.ndarray, "P 4 3"]) -> n
     rays = one[:, :3]
     after = inner(np.cross(first, rays), turn) > OVERLAP
     before = inner(np.cross(rays, second), turn) > OVERLAP
-    return (after & before).any(1)
+    return np.any(after & before, axis=1)
 
 
 def closed(

@@ -265,7 +265,7 @@ def facing_out(
     if len(faces) == 0:
         return faces
     vectors, patch = face_vectors(points, faces), patches(faces, len(points))
-    vote = inner(sum(outward.take(corner, 0) for corner in faces.T), vectors)
+    vote = inner(outward.take(faces, 0).sum(1), vectors)
     turned = (np.bincount(patch, vote) < 0)[patch]
     return np.where(turned[:, None], faces[:, ::-1], faces)
 

@@ -175,7 +175,8 @@ class _Relations:
         signed = np.where(self.against, -self.weight, self.weight).astype(np.float32)
         ends = self.i.astype(np.int32), self.j.astype(np.int32)
         one: Any = sparse.coo_array((signed, ends), shape=(count, count))
-        around = sum(np.bincount(end, self.weight, count) for end in ends).astype(np.float32)
+        total = np.bincount(np.concatenate(ends), np.tile(self.weight, 2), count)
+        around = total.astype(np.float32)
         rows = sparse.csr_array(one + one.T)[free]
         matrix = sparse.csr_array(sparse.diags_array(around[free]) - rows[:, free])
         scale = sparse.diags_array(1 / np.maximum(around[free], np.finfo(np.float32).tiny))
