@@ -23,33 +23,45 @@ def mirrored(indptr: np.ndarray, indices: np.ndarray, data: np.ndarray, number: 
     number : the numbers that rows and columns get.
     """
     count = len(number)
-    crow = np.zeros(count + 1, np.int64)
+    crow, column, here = (
+        np.zeros(count + 1, np.int64),
+        np.zeros(count + 1, np.int64),
+        np.empty(count, np.int64),
+    )
     for row in range(count):
+        here[number[row]] = row
         for entry in range(indptr[row], indptr[row + 1]):
-            here, there = number[row], number[indices[entry]]
-            crow[here + 1] += 1
-            if here != there:
-                crow[there + 1] += 1
+            other = indices[entry]
+            crow[number[row] + 1] += 1
+            if other != row:
+                crow[number[other] + 1] += 1
+                column[other + 1] += 1
     for row in range(count):
         crow[row + 1] += crow[row]
-    free, partner, source = (
-        crow.copy(),
-        np.empty(crow[count], np.int32),
-        np.empty(crow[count], np.int32),
+        column[row + 1] += column[row]
+    free, above, source = (
+        column.copy(),
+        np.empty(column[count], np.int32),
+        np.empty(column[count], np.int32),
     )
     for row in range(count):
         for entry in range(indptr[row], indptr[row + 1]):
-            here, there = number[row], number[indices[entry]]
-            partner[free[here]], source[free[here]] = there, entry
-            free[here] += 1
-            if here != there:
-                partner[free[there]], source[free[there]] = here, entry
-                free[there] += 1
-    col, values = np.empty(crow[count], np.int64), np.empty((2, crow[count]))
+            other = indices[entry]
+            if other != row:
+                above[free[other]], source[free[other]] = row, entry
+                free[other] += 1
     free, diagonal = crow.copy(), crow[:-1].copy()
-    for row in range(count):
-        for place in range(crow[row], crow[row + 1]):
-            other, entry = partner[place], source[place]
+    col, values = np.empty(crow[count], np.int64), np.empty((2, crow[count]))
+    for row in range(count):  # into all rows that it has an entry in
+        old = here[row]
+        right = indptr[old + 1] - indptr[old]
+        for step in range(right + column[old + 1] - column[old]):
+            if step < right:
+                entry = indptr[old] + step
+                other = number[indices[entry]]
+            else:
+                place = column[old] + step - right
+                entry, other = source[place], number[above[place]]
             if other == row:
                 diagonal[row] = free[row]
             col[free[other]] = row
