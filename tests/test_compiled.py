@@ -5,6 +5,7 @@ import math
 import os
 import subprocess
 import sys
+import time
 
 import mpmath
 import numpy as np
@@ -146,6 +147,13 @@ def test_admission_is_the_same(both):
         one, other = both(lambda a=points, b=normals, c=pairs: admissible(a, b, *c), "admissible")
         assert torch.equal(one, other)
         assert 0 < one.sum() < 5000
+    grid = torch.cartesian_prod(
+        *[torch.arange(4, dtype=torch.float64)] * 3
+    )  # heights of half the distance, and near it
+    normals = torch.tensor([[0.6, 0.0, 0.8], [0.0, 0.0, 1.0]], dtype=torch.float64).repeat(32, 1)
+    pairs = torch.cartesian_prod(torch.arange(64), torch.arange(64)).T
+    one, other = both(lambda: admissible(grid, normals, *pairs), "admissible")
+    assert torch.equal(one, other)
 
 
 @pytest.mark.parametrize(("dim", "degree"), [(1, 3), (2, 1), (2, 6), (3, 4)])
@@ -171,6 +179,14 @@ def test_operators_are_the_same_to_the_bit(on_mesh, both):
     for name, x in one.items():
         if isinstance(x, torch.Tensor):
             torch.testing.assert_close(x, other[name], rtol=0, atol=0, equal_nan=True, msg=name)
+
+
+def test_time_within_time_counts_once(monkeypatch):
+    monkeypatch.setattr(compiled, "_spent", [0.0])
+    start = time.perf_counter()
+    with compiled.standing_in(), compiled.standing_in():
+        time.sleep(0.02)
+    assert 0.02 <= compiled._spent[0] <= time.perf_counter() - start
 
 
 def test_without_numba_all_works(monkeypatch):

@@ -398,6 +398,20 @@ def test_a_fan_for_each_point():
     assert with_single_fans(faces, 6).tolist() == faces[:3].tolist()
 
 
+def test_fans_that_vanish_leave_the_others():
+    """Round a ring of five points each has two fans of which one goes, until none is left but the face beside them."""
+    one = [[i, (i + 1) % 5, 5 + i] for i in range(5)]
+    two = [[i, 5 + i, (i + 2) % 5] for i in range(5)]
+    faces = np.array([*one, *two, [10, 11, 12]])
+    assert with_single_fans(faces, 13).tolist() == [[10, 11, 12]]
+    generator = np.random.default_rng(0)
+    for count in range(6, 14):  # random ones, beside what leaves all fans in each round
+        soup = np.unique(np.sort(generator.integers(0, count, (3 * count, 3)), axis=1), axis=0)
+        soup = soup[(np.diff(soup, axis=1) > 0).all(1)]
+        left = with_single_fans(soup, count)
+        assert len(with_single_fans(left, count)) == len(left)
+
+
 def grid_of(rows, columns):
     """A lattice of the unit square in a plane of R³."""
     x, y = np.meshgrid(np.linspace(0, 1, columns), np.linspace(0, 1, rows))

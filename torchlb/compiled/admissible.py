@@ -1,4 +1,4 @@
-"""Which points may enter a stencil, compiled for hypersurfaces: six times as fast."""
+"""Which points may enter a stencil, compiled for hypersurfaces."""
 
 from __future__ import annotations
 

@@ -253,7 +253,8 @@ def _mirrored(
     Row pointers, columns, (2, nnz) real and imaginary parts, and where the diagonal is.
     """
     entries = sparse.coo_array(upper)
-    count, (row, col) = upper.shape[0], (given.astype(np.int32)[ends] for ends in entries.coords)
+    count, given = upper.shape[0], given.astype(np.int32)
+    row, col = (given[ends] for ends in entries.coords)
     ends = np.maximum(row, col), np.minimum(row, col)
     lower: Any = sparse.coo_array((entries.data, ends), shape=upper.shape)
     lower.has_canonical_format = True  # but for its order, which the transposes bring about

@@ -8,7 +8,7 @@ leaves their double cone, the *cocone*.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, reduce
 
 import numpy as np
 import torch
@@ -75,7 +75,7 @@ class Cloud:
         sides = b - a, c - b, a - c
         one, two, three = map(lengths, sides)
         normal = np.cross(sides[0], -sides[2])
-        longest = np.maximum(np.maximum(one, two), three)
+        longest = reduce(np.maximum, (one, two, three))
         twice = np.maximum(lengths(normal), FLAT * longest**2)
         return one * two * three / (2 * twice), normal / twice[:, None]
 

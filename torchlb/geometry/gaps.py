@@ -40,7 +40,7 @@ def filled(
     count = len(cloud.points)
     outer = edges_of(faces, count).outer  # only there can anything be added
     near = outer[faces].any(1)
-    inner, around = faces[~near], faces[near]
+    away, around = faces[~near], faces[near]
     while True:
         edges = edges_of(around, count)
         half = edges.rim[outer[edges.ends[0][edges.rim]] & outer[edges.ends[1][edges.rim]]]
@@ -55,7 +55,7 @@ def filled(
         new = new[~overlapping(cloud, new, around)] if strict else new
         if len(new) == 0:
             return (
-                faces if len(inner) + len(around) == len(faces) else np.concatenate([inner, around])
+                faces if len(away) + len(around) == len(faces) else np.concatenate([away, around])
             )
         best = np.full(count, len(new))
         np.minimum.at(best, new.ravel(), np.arange(len(new)).repeat(3))

@@ -128,7 +128,7 @@ def _by_graph(i: np.ndarray, j: np.ndarray, count: int) -> Int[np.ndarray, " cou
 
 def _in_turn(*ends: np.ndarray) -> tuple[Int[np.ndarray, " P"], ...]:
     """As kernels take them."""
-    return tuple(np.ascontiguousarray(end, dtype=np.int64) for end in ends)
+    return tuple(np.require(end, np.int64, ["C", "W"]) for end in ends)
 
 
 def spanning_pairs(i: np.ndarray, j: np.ndarray, count: int) -> Int[np.ndarray, " T"]:
@@ -201,8 +201,7 @@ def with_single_fans(faces: Faces, count: int) -> Faces:
     [[0, 1, 2], [0, 2, 3]]
     """
     looked_at = np.ones(count, dtype=bool)  # points; later those alone that have lost a face
-    while len(faces):
-        around = np.flatnonzero(looked_at.take(faces).any(1))
+    while len(around := np.flatnonzero(looked_at.take(faces).any(1))):
         part = faces[around]
         one, two = edges_of(part, count).twins
         corner = part.ravel()

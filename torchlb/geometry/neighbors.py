@@ -9,6 +9,7 @@ pool, ordered by distance. A path across a crease is cut there, where the tangen
 from __future__ import annotations
 
 from collections.abc import Iterator
+from contextlib import nullcontext
 from functools import cached_property
 from math import ceil
 from typing import Any
@@ -41,7 +42,7 @@ WALKS_AT_ONCE = 2**22
 EDGES = 6
 """The longest edges of a point, in whose middles its fit is judged."""
 BY_MATRICES = 1.5e-6
-"""Seconds a point of a ball where nothing is compiled, and for the larger balls that follow."""
+"""Seconds a point of a ball without a kernel, those of larger balls that follow included."""
 BALL_SURPLUS = 1.5
 """A graph ball holds this many times the points asked for, so that its round core lies inside the ragged edge."""
 
@@ -99,10 +100,10 @@ def admissible(
         arrays = (x.contiguous().numpy() for x in (points, planes, centers, others))
         return torch.from_numpy(kernel(*arrays, MAX_SLOPE, MIN_ALIGNMENT))
     parts = zip(centers.split(PAIRS_AT_ONCE), others.split(PAIRS_AT_ONCE), strict=True)
-    return torch.cat([_admissible_part(points, planes, *part) for part in parts])
+    with compiled.standing_in() if planes.ndim == 2 else nullcontext():
+        return torch.cat([_admissible_part(points, planes, *part) for part in parts])
 
 
-@compiled.standing_in()
 def _admissible_part(points: Tensor, planes: Tensor, centers: Tensor, others: Tensor) -> Tensor:
     offset = at(points, others) - at(points, centers)
     total = dot(offset, offset)
