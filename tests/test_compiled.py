@@ -147,9 +147,8 @@ def test_admission_is_the_same(both):
         one, other = both(lambda a=points, b=normals, c=pairs: admissible(a, b, *c), "admissible")
         assert torch.equal(one, other)
         assert 0 < one.sum() < 5000
-    grid = torch.cartesian_prod(
-        *[torch.arange(4, dtype=torch.float64)] * 3
-    )  # heights of half the distance, and near it
+    # Heights of half the distance, and near it.
+    grid = torch.cartesian_prod(*[torch.arange(4, dtype=torch.float64)] * 3)
     normals = torch.tensor([[0.6, 0.0, 0.8], [0.0, 0.0, 1.0]], dtype=torch.float64).repeat(32, 1)
     pairs = torch.cartesian_prod(torch.arange(64), torch.arange(64)).T
     one, other = both(lambda: admissible(grid, normals, *pairs), "admissible")

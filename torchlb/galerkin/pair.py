@@ -137,7 +137,7 @@ def upper_product(p: Any, matrix: sparse.csr_array) -> sparse.csr_array:
     return sparse.csr_array((data, indices, indptr), shape=(count, count))
 
 
-def _arrays(matrix: Any) -> tuple[np.ndarray, ...]:
+def _arrays(matrix: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Row pointers, columns and values, of the types that are compiled for."""
     indices = matrix.indices.astype(np.int32, copy=False)
     return matrix.indptr.astype(np.int64), indices, matrix.data
@@ -225,11 +225,8 @@ def stored(upper: Any, rim: Any = None, numbering: Numbering | None = None) -> S
     upper = sparse.csr_array(upper)
     count = upper.shape[0]
     given = np.arange(count) if numbering is None else numbering.given.numpy()
-    kernel = compiled.kernel("mirrored")
-    if kernel is None:
-        crow, col, values, diagonal = _mirrored(upper, given)
-    else:
-        crow, col, values, diagonal = kernel(*_arrays(upper), given)
+    whole = compiled.kernel("mirrored") or _mirrored
+    crow, col, values, diagonal = whole(*_arrays(upper), given)
     del upper
     values[0, diagonal] -= np.add.reduceat(values[0], crow[:-1])
     crow, col, values = (torch.from_numpy(part) for part in (crow, col, values))
@@ -246,20 +243,19 @@ def stored(upper: Any, rim: Any = None, numbering: Numbering | None = None) -> S
 
 @compiled.standing_in()
 def _mirrored(
-    upper: Any, given: Int[np.ndarray, " N"]
+    indptr: np.ndarray, indices: np.ndarray, data: np.ndarray, given: Int[np.ndarray, " N"]
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """The whole of a matrix that has one entry for each pair of rows, in other numbers, columns ascending.
 
     Row pointers, columns, (2, nnz) real and imaginary parts, and where the diagonal is.
     """
-    entries = sparse.coo_array(upper)
-    count, given = upper.shape[0], given.astype(np.int32)
-    row, col = (given[ends] for ends in entries.coords)
+    count, given = len(given), given.astype(np.int32)
+    row, col = given.repeat(np.diff(indptr)), given[indices]
     ends = np.maximum(row, col), np.minimum(row, col)
-    lower: Any = sparse.coo_array((entries.data, ends), shape=upper.shape)
+    lower: Any = sparse.coo_array((data, ends), shape=(count, count))
     lower.has_canonical_format = True  # but for its order, which the transposes bring about
     upper = sparse.csr_array(sparse.csr_array(lower).T)
-    del entries, lower, row, col, ends
+    del lower, row, col, ends
     before = np.bincount(upper.indices, minlength=count) - 1  # of each row, left of the diagonal
     crow = np.concatenate([[0], np.cumsum(before + np.diff(upper.indptr))])
     free, diagonal = crow[:-1].copy(), crow[:-1] + before

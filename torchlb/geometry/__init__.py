@@ -6,5 +6,5 @@ plane. `neighbors`: who may enter a stencil, and graph balls. `candidates`: the 
 of thin shapes. `vertex_fits`: one polynomial a vertex, of functions and of the surface. `boundary`: its points and
 conormals. A surface through a cloud of points (section 12), `surface`, is found in steps: `noise`, where the points
 belong; `cocone`, normals and triangles; `poles`, which way is out; `manifold`, which triangles hang together; `gaps`,
-filled and closed; `stars`, where no sheet goes through. `vectors`: inner products of many short vectors.
+filled and closed; `stars`, where no sheet goes through. `vectors`: sums over many short ones.
 """
