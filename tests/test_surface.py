@@ -322,6 +322,16 @@ def test_where_sheets_touch_is_said():
     assert cloud_surface(points).summary.contacts == 0
 
 
+def test_each_place_where_sheets_touch_is_said_once():
+    """A row of five spheres: the four places between them, none in pieces."""
+    points = Sphere().points(1000)
+    gap = 2.0 + 0.33 * (4 * np.pi / 1000) ** 0.5
+    row = torch.cat([points + torch.tensor([k * gap, 0.0, 0.0]) for k in range(5)])
+    places = np.array(cloud_surface(row).summary.places)
+    assert len(places) == 4
+    assert np.sort(places[:, 0]) == pytest.approx(gap * np.array([0.5, 1.5, 2.5, 3.5]), abs=0.1)
+
+
 @pytest.mark.parametrize("name", ["sphere", "torus"])
 def test_noise_is_seen_and_smoothed(name):
     """10 % of the spacing: σ within a factor of 1.5, eigenvalues 1 to 8 within 1 %, the area too; points stay."""

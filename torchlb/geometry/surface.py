@@ -40,8 +40,8 @@ ASKEW = 0.7
 """Cosine with the normal of the faces below which another one is none: those of points in a row are any across it."""
 SPECK = 4
 """Patches of fewer triangles are left out."""
-PLACES = 3
-"""Places that are named where sheets touch."""
+PLACES, PLACE = 8, 0.1
+"""Places that are named where sheets touch; and how large one is, over the width of the cloud."""
 FLAT = 1e-6
 """Thickness over width of a cloud that lies in a plane."""
 
@@ -345,13 +345,18 @@ def _contacts(cloud: Cloud, faces: Faces) -> tuple[int, tuple[tuple[float, float
     met = (beyond * graph).sum(1)  # a way of three edges: two from the nearest, one from here
     touched = np.zeros(count, dtype=bool)
     touched[met == 0] = touched[nearest[met == 0]] = True
-    near = cloud.neighbors[:, 1 : SPACING + 1]
+    near = cloud.neighbors[:, 1:]
     i, j = np.arange(count).repeat(near.shape[1]), near.ravel()
     both = touched[i] & touched[j]
-    place = components(i[both], j[both], count)[touched]
-    largest = np.argsort(-np.bincount(place), kind="stable")[:PLACES]
-    points = cloud.points[touched]
-    means = [points[place == number].mean(0) for number in largest if (place == number).any()]
+    group, points = components(i[both], j[both], count)[touched], cloud.points[touched]
+    number = np.bincount(group)[group]
+    means: list[np.ndarray] = []
+    while number.any() and len(means) < PLACES:
+        heart = points[group == group[number.argmax()]].mean(0)
+        around = np.linalg.norm(points - heart, axis=1) < PLACE * np.ptp(cloud.points, axis=0).max()
+        around |= group == group[number.argmax()]
+        means.append(points[around & (number > 0)].mean(0))
+        number[around] = 0
     return int(touched.sum()), tuple((float(x), float(y), float(z)) for x, y, z in means)
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import torch
 from jaxtyping import Bool, Float
+from scipy import sparse
 from torch import Tensor
 
 from torchlb.errors import first_few, warn
@@ -60,10 +61,11 @@ def warn_of_walls(surface: CloudSurface, boundary: Bool[Tensor, " N"] | None) ->
     sides = points[faces.roll(-1, 1)] - points[faces]
     length = sides.norm(dim=2)
     both, ends = length.flatten().repeat(2), torch.stack([faces, faces.roll(-1, 1)]).flatten()
-    order = torch.from_numpy(np.lexsort((both.numpy(), ends.numpy())))
-    number = torch.bincount(ends, minlength=len(points))
-    middle = (number.cumsum(0) - (number + 1) // 2 - (number == 0).long()).clamp_min(0)
-    usual = both[order][middle] if len(order) else torch.zeros_like(points[:, 0])
+    order = both.numpy().argsort()
+    place = ends.numpy()[order], np.arange(len(order))
+    edges = sparse.csr_array((both.numpy()[order], place), shape=(len(points), len(order)))
+    middle = edges.indptr[:-1] + np.diff(edges.indptr) // 2
+    usual = torch.from_numpy(np.append(edges.data, 0.0)[middle])
     long = (length > LONG * torch.maximum(usual[faces], usual[faces.roll(-1, 1)])).any(1)
     area = torch.linalg.cross(sides[:, 0], sides[:, 1]).norm(dim=1)
     share = float(area[long].sum() / area.sum())
