@@ -21,8 +21,8 @@ def close(actual, expected):
     torch.testing.assert_close(actual, expected, **TOLERANCE[torch.float64])
 
 
-def pairs_of(points):
-    return nearest_pairs(nearest_neighbors(points, 24))
+def nearest(points):
+    return nearest_neighbors(points, 24)
 
 
 def scrambled(normals):
@@ -34,9 +34,9 @@ def scrambled(normals):
 def test_normals_of_a_cloud_are_turned_outward(surface, sampling):
     """Estimated normals with random signs: all end on the outer side, none changes but in sign."""
     points = getattr(surface, sampling)(1000)
-    frames = cloud_frames(points, nearest_neighbors(points, 24), 2)
+    frames = cloud_frames(points, nearest(points), 2)
     normals = scrambled(normals_of_frames(frames))
-    oriented = orient_normals(points, normals, pairs_of(points))
+    oriented = orient_normals(points, normals, nearest(points))
     assert ((oriented * surface.normals(points)).sum(1) > 0).all()
     close(oriented.abs(), normals.abs())
 
@@ -44,7 +44,7 @@ def test_normals_of_a_cloud_are_turned_outward(surface, sampling):
 def test_every_component_is_turned_outward_by_itself():
     points = torch.cat([Sphere().points(300), 2 * Sphere().points(300, seed=1) + 5])
     exact = torch.cat([points[:300], (points[300:] - 5) / 2])
-    close(orient_normals(points, scrambled(exact), pairs_of(points)), exact)
+    close(orient_normals(points, scrambled(exact), nearest(points)), exact)
 
 
 @pytest.mark.parametrize("gap", [1.5, 2.0])
@@ -56,16 +56,15 @@ def test_the_two_sides_of_a_slab_face_away_from_each_other(gap):
     exact = torch.zeros(800, 3, dtype=torch.float64)
     exact[:400, 2], exact[400:, 2] = -1.0, 1.0
     points = torch.cat([lower, upper])
-    pairs = pairs_of(points)
-    oriented = orient_normals(points, scrambled(exact), pairs)
+    oriented = orient_normals(points, scrambled(exact), nearest(points))
     close(oriented, exact)
-    sides = thin_sides(points, oriented, pairs)
+    sides = thin_sides(points, oriented, nearest(points))
     close(sides, exact)
 
 
 def test_nothing_is_thin_on_a_resolved_surface():
     points = Torus().points(1000)
-    assert not thin_sides(points, Torus().normals(points), pairs_of(points)).any()
+    assert not thin_sides(points, Torus().normals(points), nearest(points)).any()
 
 
 def test_a_strip_with_one_side_is_not_thin():
@@ -79,14 +78,14 @@ def test_a_strip_with_one_side_is_not_thin():
     points = torch.stack(
         [reach * turn.cos(), reach * turn.sin(), across * (turn / 2).sin()], -1
     ).view(-1, 3)
-    frames = cloud_frames(points, nearest_neighbors(points, 24), 2)
-    oriented = orient_normals(points, normals_of_frames(frames), pairs_of(points))
-    assert not thin_sides(points, oriented, pairs_of(points)).any()
+    frames = cloud_frames(points, nearest(points), 2)
+    oriented = orient_normals(points, normals_of_frames(frames), nearest(points))
+    assert not thin_sides(points, oriented, nearest(points)).any()
 
 
 def test_pairs_come_once_each():
     points = Sphere().random_points(200)
-    i, j = pairs_of(points)
+    i, j = nearest_pairs(nearest(points))
     assert (i < j).all()
     assert len(torch.unique(torch.stack([i, j], 1), dim=0)) == len(i)
 
@@ -104,4 +103,4 @@ def test_given_normals_of_any_sign_are_oriented():
     points = Ellipsoid().points(500)
     exact = Ellipsoid().normals(points)
     normals = normals_of_frames(complete_frames(scrambled(exact)))
-    close(orient_normals(points, normals, pairs_of(points)), exact)
+    close(orient_normals(points, normals, nearest(points)), exact)

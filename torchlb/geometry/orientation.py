@@ -14,7 +14,7 @@ from scipy import sparse
 from scipy.sparse import csgraph
 from torch import Tensor
 
-from torchlb.geometry.neighbors import MAX_SLOPE, MIN_ALIGNMENT
+from torchlb.geometry.neighbors import MIN_ALIGNMENT, admissible
 from torchlb.geometry.vectors import at, dot
 
 SMOOTH = 0.97
@@ -56,14 +56,14 @@ def _across(
 def orient_normals(
     points: Float[Tensor, "N n"],
     normals: Float[Tensor, "N n"],
-    pairs: tuple[Int[Tensor, " P"], Int[Tensor, " P"]],
+    candidates: Int[Tensor, "N K"],
 ) -> Float[Tensor, "N n"]:
-    """Signs of the normals made consistent along a spanning tree of the pairs, the surest edges first.
+    """Signs of the normals made consistent along a spanning tree of the nearest points, the surest edges first.
 
     Every component is then turned so that the normal at its extreme point (largest last coordinate) points outward.
     On a surface with one side only there is a seam.
     """
-    num_points = len(points)
+    num_points, pairs = len(points), nearest_pairs(candidates)
     cosine, slope = _across(points, normals, *pairs)
     smooth = (cosine.abs() >= SMOOTH) & (slope <= FLAT)
     cost = 1.0001 - cosine.abs() + ~smooth  # positive: zeros would be no edges
@@ -99,20 +99,20 @@ def _parents(tree: sparse.csr_array, roots: Int[Tensor, " R"]) -> Int[Tensor, " 
 
 
 def thin_sides(
-    points: Float[Tensor, "N n"],
-    oriented: Float[Tensor, "N n"],
-    pairs: tuple[Int[Tensor, " P"], Int[Tensor, " P"]],
+    points: Float[Tensor, "N n"], oriented: Float[Tensor, "N n"], candidates: Int[Tensor, "N K"]
 ) -> Float[Tensor, "N n"]:
     """The oriented normals in and next to thin places, zero elsewhere.
 
     Points whose sides have a negative product lie on different sides. It is thin where a near point stands above or
     below the tangent plane and yet has nearly the same one. Elsewhere a shape may have one side only.
     """
-    i, j = pairs
-    opposite = dot(at(oriented, i), at(oriented, j)).abs() >= MIN_ALIGNMENT
-    opposite &= _across(points, oriented, i, j)[1] > MAX_SLOPE
+    i = torch.arange(len(points)).repeat_interleave(candidates.shape[1] - 1)
+    j = candidates[:, 1:].reshape(-1)
+    refused = ~(admissible(points, oriented, i, j) & admissible(points, oriented, j, i))
+    both = torch.stack([i[refused], j[refused]])
+    alike = dot(at(oriented, both[0]), at(oriented, both[1])).abs() >= MIN_ALIGNMENT
     thin = torch.zeros(len(points), dtype=torch.bool)
-    thin[torch.cat([i[opposite], j[opposite]])] = True
+    thin[both[:, alike]] = True
     beside = thin[i] | thin[j]
     thin[torch.cat([i[beside], j[beside]])] = True
     return oriented * thin[:, None]

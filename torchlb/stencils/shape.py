@@ -29,7 +29,6 @@ from torchlb.geometry.neighbors import (
 )
 from torchlb.geometry.orientation import (
     consistently_wound,
-    nearest_pairs,
     orient_normals,
     thin_sides,
 )
@@ -101,10 +100,9 @@ def cloud_shape(
     graph = nearest_graph(points, initial, candidates)
     sides = None
     if dim == points.shape[1] - 1:
-        pairs = nearest_pairs(candidates)
-        oriented = orient_normals(points, normals_of_frames(initial), pairs)
+        oriented = orient_normals(points, normals_of_frames(initial), candidates)
         normals = oriented if normals is None else normals
-        sides = thin_sides(points, oriented, pairs)
+        sides = thin_sides(points, oriented, candidates)
     balls, order, _ = _refined(
         GraphBalls(points, graph, initial, sides), normal_order, num_neighbors, progress
     )
@@ -150,7 +148,7 @@ def mesh_shape(
         reference = vertex_normals(vertices, faces)
         if areas is None and consistently_wound(faces):
             candidates = nearest_neighbors(vertices, min(CANDIDATES[2], len(vertices)))
-            sides = thin_sides(vertices, reference, nearest_pairs(candidates))
+            sides = thin_sides(vertices, reference, candidates)
     start = GraphBalls(vertices, graph, initial, sides)
     balls, order, fits = _refined(start, normal_order, num_neighbors, progress, fit_degrees)
     edge = None
@@ -191,9 +189,7 @@ def surface_shape(
     flat = points.shape[1] == 2
     triangles = torch.cat([surface.faces, surface.stars])
     initial = mesh_frames(points, triangles) if flat else surface.frames
-    sides = None
-    if not flat:
-        sides = thin_sides(points, surface.normals, nearest_pairs(surface.neighbors))
+    sides = None if flat else thin_sides(points, surface.normals, surface.neighbors)
     start = GraphBalls(points, mesh_graph(triangles, len(points)), initial, sides)
     balls, order, fits = _refined(start, normal_order, num_neighbors, progress, fit_degrees)
     edge = None
