@@ -29,6 +29,7 @@ from torchlb.geometry.neighbors import admissible, mesh_graph, nearest_neighbors
 from torchlb.geometry.noise import denoised
 from torchlb.geometry.poles import Poles, corrected_normals
 from torchlb.geometry.stars import gaps_between, pieces_of, stars_in_gaps
+from torchlb.geometry.vectors import lengths
 
 NEAREST = 24
 """Nearest points from which normals, stars and neighbourhoods are made."""
@@ -192,7 +193,7 @@ def _start(
     if noise and given is None:
         normals = refined_normals(points, normals, candidates, rounds=2)
     places = points.numpy()
-    nearest = np.linalg.norm(places[near[:, 1]] - places, axis=1)
+    nearest = lengths(places[near[:, 1]] - places)
     tetrahedra = Tetrahedra.of(places, normals.numpy(), nearest)
     poles = Poles.of(tetrahedra)
     if given is None:
@@ -349,15 +350,16 @@ def _contacts(cloud: Cloud, faces: Faces) -> tuple[int, tuple[tuple[float, float
     i, j = np.arange(count).repeat(near.shape[1]), near.ravel()
     both = touched[i] & touched[j]
     group, points = components(i[both], j[both], count)[touched], cloud.points[touched]
-    number = np.bincount(group)[group]
+    number, width = np.bincount(group)[group], np.ptp(cloud.points, axis=0).max()
     means: list[np.ndarray] = []
     while number.any() and len(means) < PLACES:
-        heart = points[group == group[number.argmax()]].mean(0)
-        around = np.linalg.norm(points - heart, axis=1) < PLACE * np.ptp(cloud.points, axis=0).max()
-        around |= group == group[number.argmax()]
+        first = group == group[number.argmax()]
+        around = first | (lengths(points - points[first].mean(0)) < PLACE * width)
         means.append(points[around & (number > 0)].mean(0))
         number[around] = 0
-    return int(touched.sum()), tuple((float(x), float(y), float(z)) for x, y, z in means)
+    digits = 3 - int(np.floor(np.log10(width)))
+    places = [(np.round(mean, digits) + 0.0).tolist() for mean in means]  # and no −0
+    return int(touched.sum()), tuple((x, y, z) for x, y, z in places)
 
 
 def _kin(cloud: Cloud) -> tuple[np.ndarray, np.ndarray]:
