@@ -32,7 +32,7 @@ METHODS = {
         f"torchlb, p = {order}": lambda *mesh, order=order: LaplaceBeltrami.from_mesh(
             *mesh, order=order, progress=False
         )
-        for order in (1, 3, 5)
+        for order in (1, 2, 3, 5)
     },
 }
 Mesh = tuple[np.ndarray, np.ndarray, np.ndarray]
@@ -92,7 +92,7 @@ def draw(found: dict[str, dict[str, np.ndarray]], path: Path) -> None:
     matplotlib.use("Agg")
     import matplotlib.pyplot as plt
 
-    colors = ["0.55", "#9ecae1", "#4292c6", "#08519c"]
+    colors = ["0.55", "#c6dbef", "#9ecae1", "#4292c6", "#08519c"]
     figure, axes = plt.subplots(1, len(found), figsize=(4 * len(found), 3.4), sharey=True)
     for ax, (shape, methods) in zip(np.atleast_1d(axes), found.items(), strict=True):
         for color, (name, series) in zip(colors, methods.items(), strict=False):
