@@ -62,7 +62,7 @@ class SurfaceSummary:
     noise : distance of the points from the surface, root mean square, ℓ; 0 if there is none to be seen.
     contacts : points the nearest of which is on another sheet, more than three edges away: which of them belong
         together is a guess. Shapes touch or are too thin for their points there.
-    places : where most of these are, up to three points, ℓ.
+    places : where most of these are, up to `PLACES` points, ℓ.
     """
 
     points: int
@@ -95,7 +95,7 @@ class SurfaceSummary:
     @property
     def contact(self) -> str:
         """Where sheets come closer to each other than the points are, in words."""
-        where = ", ".join(f"({x:.3g}, {y:.3g}, {z:.3g})" for x, y, z in self.places)
+        where = ", ".join(f"({x:g}, {y:g}, {z:g})" for x, y, z in self.places)
         return (
             f"{self.contacts} points are nearest to one of another sheet, most of them near {where}"
         )

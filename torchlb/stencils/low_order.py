@@ -18,7 +18,6 @@ from torch import Tensor
 from torch.nn.functional import pad
 
 from torchlb.baseline.robust import LEAST_AREA, robust_rows
-from torchlb.errors import as_given, renumbered
 from torchlb.geometry.boundary import Boundary
 from torchlb.geometry.neighbors import GraphBalls, nearest_neighbors
 from torchlb.geometry.voronoi import (
@@ -27,9 +26,6 @@ from torchlb.geometry.voronoi import (
     rows_at_once,
     unrolled,
 )
-
-RINGS = 3
-"""Of triangles around points whose rows are asked: intrinsic flips farther away change none; of two, one in 1,000."""
 
 
 def simplex_shares(
@@ -95,27 +91,8 @@ class MeshLowOrder:
         return thirds if (thirds > LEAST_AREA * longest).all() else self._robust[1]
 
     def rows(self, centers: Int[Tensor, " B"]) -> sparse.csr_array:
-        """Rows (B, N) of Δ, 1/ℓ²: those of the triangles around alone, unless all are there anyway."""
-        if "_robust" in vars(self):
-            return sparse.csr_array(self._robust[0][centers.numpy()])
-        near, faces = centers.numpy(), self.faces.numpy()
-        part = np.empty(0, dtype=np.int64)
-        for _ in range(RINGS):
-            part = np.unique(self._faces_at[near].indices)
-            near = np.unique(faces[part])
-        triangles = torch.from_numpy(np.searchsorted(near, faces[part]))
-        with renumbered(as_given(near)):
-            found, _ = robust_rows(self.vertices[near], triangles)
-        rows = sparse.csr_array(found[np.searchsorted(near, centers.numpy())])
-        shape = len(centers), len(self.vertices)
-        return sparse.csr_array((rows.data, near[rows.indices], rows.indptr), shape=shape)
-
-    @cached_property
-    def _faces_at(self) -> sparse.csr_array:
-        """(N, F), which triangles are at each vertex."""
-        size, shape = self.faces.numel(), (len(self.faces), len(self.vertices))
-        ends = self.faces.flatten().numpy(), np.arange(0, size + 1, 3)
-        return sparse.csr_array(sparse.csr_array((np.ones(size, bool), *ends), shape=shape).T)
+        """Rows (B, N) of Δ, 1/ℓ²."""
+        return sparse.csr_array(self._robust[0][centers.numpy()])
 
 
 class CloudLowOrder:
