@@ -55,3 +55,13 @@ def test_random_points_of_a_circle_are_one_curve(seed):
     lb = LaplaceBeltrami.from_points(np.c_[np.cos(angle), np.sin(angle)])
     exact = torch.tensor([0, 1, 1, 4, 4]).double()
     torch.testing.assert_close(lb.eigenbasis(5).eigenvalues, exact, rtol=1e-3, atol=1e-9)
+
+
+@pytest.mark.parametrize("points", [50, 200])
+def test_an_open_curve_ends_at_its_last_points(points):
+    """Of a parabola as points alone, whose ends are not declared, masses sum to the length of its polygon."""
+    x = np.linspace(0, 1, points)
+    curve = np.c_[x, x**2]
+    lb = LaplaceBeltrami.from_points(curve, dim=1)
+    length = np.linalg.norm(np.diff(curve, axis=0), axis=1).sum()
+    assert lb.mass.sum().item() == pytest.approx(length, rel=1e-6)

@@ -14,6 +14,9 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+AHEAD = 0.5
+"""Cosine of the directions in which a neighbour lies."""
+
 
 @cache
 def unit_directions(dim: int) -> Float[Tensor, "u d"]:
@@ -83,18 +86,24 @@ def cell_volume(
     """Volume of the cell, ℓ^d: that of the unit ball times the mean of r^d.
 
     At a boundary point, with its conormal `outward` (zero elsewhere), only the inner half counts. Where a cell is open
-    otherwise it ends half-way to the farthest valid neighbour.
+    otherwise it ends half-way to the farthest valid neighbour; where none lies within 60°, at the point itself, as at
+    the end of a curve.
 
     >>> around = torch.tensor([[[1.0, 0.0], [0.0, 1.0], [-1.0, 0.0], [0.0, -1.0], [2.0, 0.0]]])
     >>> cell_volume(around, torch.ones(1, 5, dtype=torch.bool)).round(decimals=2).tolist()
     [1.0]
+    >>> end = torch.tensor([[[1.0], [2.0]]])
+    >>> cell_volume(end, torch.ones(1, 2, dtype=torch.bool)).tolist()
+    [0.5]
     """
     dim = coords.shape[-1]
     distance = coords.norm(dim=-1).masked_fill(~valid, 0).amax(1)
     farthest = distance.clamp_min(torch.finfo(coords.dtype).tiny)
     directions = _directions(coords, valid)
+    ahead = torch.nn.functional.normalize(coords, dim=-1, eps=0) @ directions.mT
+    ahead = ahead.masked_fill(~valid[..., None], -1.0).amax(1) > AHEAD
     inverse = _inverse_radius(coords, valid, directions).amax(1).maximum(2 / farthest[:, None])
-    volume = inverse.pow(-dim)
+    volume = inverse.pow(-dim) * ahead
     if outward is not None:
         volume = volume * ((directions @ outward[..., None])[..., 0] <= 0)
     unit_ball = pi ** (dim / 2) / gamma(dim / 2 + 1)
