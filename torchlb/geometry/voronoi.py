@@ -15,7 +15,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 AHEAD = 0.5
-"""Cosine of the directions in which a neighbour lies."""
+"""Least cosine between a neighbour and a direction in which it lies."""
 
 
 @cache
@@ -98,9 +98,9 @@ def cell_volume(
     """
     dim = coords.shape[-1]
     distance = coords.norm(dim=-1).masked_fill(~valid, 0).amax(1)
-    farthest = distance.clamp_min(torch.finfo(coords.dtype).tiny)
-    directions = _directions(coords, valid)
-    ahead = torch.nn.functional.normalize(coords, dim=-1, eps=0) @ directions.mT
+    tiny = torch.finfo(coords.dtype).tiny
+    farthest, directions = distance.clamp_min(tiny), _directions(coords, valid)
+    ahead = torch.nn.functional.normalize(coords, dim=-1, eps=tiny) @ directions.mT
     ahead = ahead.masked_fill(~valid[..., None], -1.0).amax(1) > AHEAD
     inverse = _inverse_radius(coords, valid, directions).amax(1).maximum(2 / farthest[:, None])
     volume = inverse.pow(-dim) * ahead
