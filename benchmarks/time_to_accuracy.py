@@ -93,14 +93,21 @@ def draw(found: dict[str, dict[str, np.ndarray]], path: Path) -> None:
     import matplotlib.pyplot as plt
 
     colors = ["0.55", "#c6dbef", "#9ecae1", "#4292c6", "#08519c"]
-    figure, axes = plt.subplots(1, len(found), figsize=(4 * len(found), 3.4), sharey=True)
-    for ax, (shape, methods) in zip(np.atleast_1d(axes), found.items(), strict=True):
-        for color, (name, series) in zip(colors, methods.items(), strict=False):
+    columns = min(len(found), 3)
+    rows = -(-len(found) // columns)
+    figure, axes = plt.subplots(
+        rows, columns, figsize=(4 * columns, 3.4 * rows), sharey=True, squeeze=False
+    )
+    for ax in axes.flat[len(found) :]:
+        ax.remove()
+    for ax, (shape, methods) in zip(axes.flat, found.items(), strict=False):
+        for color, (name, series) in zip(colors, methods.items(), strict=True):
             ax.loglog(series[:, 1], series[:, 0], "o-", color=color, label=name, markersize=4)
         ax.set(title=shape, xlabel="seconds, one thread")
         ax.grid(alpha=0.3)
-    np.atleast_1d(axes)[0].set_ylabel("median error of eigenvalues 1–40")
-    np.atleast_1d(axes)[0].legend(frameon=False)
+    for ax in axes[:, 0]:
+        ax.set_ylabel("median error of eigenvalues 1–40")
+    axes[0, 0].legend(frameon=False)
     figure.tight_layout()
     figure.savefig(path, dpi=110)
 
