@@ -97,13 +97,12 @@ def cell_volume(
     [0.5]
     """
     dim = coords.shape[-1]
-    distance = coords.norm(dim=-1).masked_fill(~valid, 0).amax(1)
-    tiny = torch.finfo(coords.dtype).tiny
-    farthest, directions = distance.clamp_min(tiny), _directions(coords, valid)
-    ahead = torch.nn.functional.normalize(coords, dim=-1, eps=tiny) @ directions.mT
-    ahead = ahead.masked_fill(~valid[..., None], -1.0).amax(1) > AHEAD
-    inverse = _inverse_radius(coords, valid, directions).amax(1).maximum(2 / farthest[:, None])
-    volume = inverse.pow(-dim) * ahead
+    distance = coords.norm(dim=-1).masked_fill(~valid, 0)
+    farthest = distance.amax(1, keepdim=True).clamp_min(torch.finfo(coords.dtype).tiny)
+    directions = _directions(coords, valid)
+    inverse = _inverse_radius(coords, valid, directions)
+    ahead = (inverse * distance[..., None] / 2).amax(1) > AHEAD
+    volume = inverse.amax(1).maximum(2 / farthest).pow(-dim) * ahead
     if outward is not None:
         volume = volume * ((directions @ outward[..., None])[..., 0] <= 0)
     unit_ball = pi ** (dim / 2) / gamma(dim / 2 + 1)
