@@ -19,9 +19,9 @@ from torchlb.fits.polynomials import monomial_columns, monomials
 from torchlb.fits.weights import scaled_system
 from torchlb.galerkin import pair
 from torchlb.galerkin.pair import stored, upper_product
+from torchlb.geometry.admission import admissible
 from torchlb.geometry.cocone import best_manifold
 from torchlb.geometry.manifold import components, edges_of, spanning_pairs, tree_sides
-from torchlb.geometry.neighbors import admissible
 from torchlb.geometry.numbering import Numbering
 from torchlb.surfaces import Hemisphere
 

@@ -10,14 +10,9 @@ from scipy.sparse import csgraph
 
 from torchlb import compiled
 from torchlb.geometry import neighbors
+from torchlb.geometry.admission import admissible
 from torchlb.geometry.frames import cloud_frames, mesh_frames
-from torchlb.geometry.neighbors import (
-    GraphBalls,
-    admissible,
-    mesh_graph,
-    nearest_graph,
-    nearest_neighbors,
-)
+from torchlb.geometry.neighbors import GraphBalls, mesh_graph, nearest_graph, nearest_neighbors
 from torchlb.surfaces import Ellipsoid, Sphere, Torus
 
 

@@ -22,7 +22,7 @@ def admissible(
     slope: float,
     alignment: float,
 ) -> np.ndarray:
-    """As `geometry.neighbors.admissible`, with unit normals; `slope` and `alignment` are its bounds."""
+    """As `geometry.admission.admissible`, with unit normals; `slope` and `alignment` are its bounds."""
     found = np.empty(len(centers), np.bool_)
     for pair in range(len(centers)):
         center, other = centers[pair], others[pair]

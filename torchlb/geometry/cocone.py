@@ -20,9 +20,9 @@ from torch.nn.functional import normalize
 from torchlb import compiled
 from torchlb.fits.polynomials import monomial_columns
 from torchlb.fits.weights import window
+from torchlb.geometry.admission import PAIRS_AT_ONCE, admissible_neighbors
 from torchlb.geometry.frames import complete_frames
 from torchlb.geometry.manifold import Faces, edges_of, face_vectors
-from torchlb.geometry.neighbors import PAIRS_AT_ONCE, admissible_neighbors
 from torchlb.geometry.vectors import dot, inner, largest, lengths, smallest
 
 COCONE = np.sin(np.pi / 8)

@@ -14,14 +14,9 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from torchlb.fits.weights import centered_fit, window
+from torchlb.geometry.admission import MIN_ALIGNMENT, admissible_neighbors, planes_of
 from torchlb.geometry.candidates import Candidate, Search
-from torchlb.geometry.neighbors import (
-    AT_ONCE,
-    MIN_ALIGNMENT,
-    GraphBalls,
-    admissible_neighbors,
-    planes_of,
-)
+from torchlb.geometry.neighbors import AT_ONCE, GraphBalls
 from torchlb.geometry.vectors import at, dot
 from torchlb.geometry.vertex_fits import VertexFits, is_regular
 

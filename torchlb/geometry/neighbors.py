@@ -9,7 +9,6 @@ pool, ordered by distance. A path across a crease is cut there, where the tangen
 from __future__ import annotations
 
 from collections.abc import Iterator
-from contextlib import nullcontext
 from functools import cached_property
 from math import ceil
 from typing import Any
@@ -22,21 +21,21 @@ from scipy.spatial import KDTree
 from torch import Tensor
 
 from torchlb import compiled
+from torchlb.geometry.admission import (
+    MAX_SLOPE,
+    MIN_ALIGNMENT,
+    admissible,
+    mutually_admissible,
+    planes_of,
+)
 from torchlb.geometry.vectors import at, dot
 from torchlb.geometry.voronoi import natural_neighbors, rows_at_once
 
-MIN_ALIGNMENT = 0.5
-"""Admission: smallest singular value of E_kᵀE_i, the cosine of the largest angle between two tangent planes."""
-MAX_SLOPE = 0.5
-"""Admission: largest share of the distance |e| that may be height over the centre's tangent plane. On a sphere the
-two bounds meet, at 60°."""
 VOID = 1.5
 """A natural neighbour on a surface or beyond may be this many times farther than the nearest ones; at an open end all
 else would be. A curve has two, and one at its end."""
 AT_ONCE = 2**13
 """Points whose neighbours are looked at together: of small arrays the memory is used again."""
-PAIRS_AT_ONCE = 2**16
-"""Pairs of points that are looked at together, for the same reason."""
 WALKS_AT_ONCE = 2**22
 """Walks of two edges whose ends are looked at together: through the middle of a fan of n triangles there are n²."""
 EDGES = 6
@@ -60,72 +59,6 @@ def nearest_neighbors(points: Float[Tensor, "N n"], size: int) -> Int[Tensor, "N
     others = found != own
     others[:, -1] &= ~others.all(1)  # it was crowded out by points at the same place
     return torch.cat([own, found[others].view(len(points), size - 1)], 1)
-
-
-def _smallest_singular_value(
-    a: Float[Tensor, "P n d"], b: Float[Tensor, "P n d"]
-) -> Float[Tensor, " P"]:
-    """σ_min(AᵀB) of pairs of orthonormal frames."""
-    product = a.mT @ b
-    dim = product.shape[-1]
-    if dim == 1:
-        return product[:, 0, 0].abs()
-    if dim == 2:  # σ² are the roots of s² − |A|²s + det² = 0
-        frobenius = product.square().sum((-1, -2))
-        (a, b), (c, d) = (row.unbind(-1) for row in product.unbind(-2))
-        discriminant = (frobenius.square() - 4 * (a * d - b * c).square()).clamp_min(0)
-        return ((frobenius - discriminant.sqrt()) / 2).clamp_min(0).sqrt()
-    return torch.linalg.svdvals(product)[:, -1]
-
-
-def planes_of(frames: Float[Tensor, "N n d"]) -> Float[Tensor, "N n d"] | Float[Tensor, "N n"]:
-    """What `admissible` takes: the unit normals of a surface in R³, else the frames."""
-    return torch.linalg.cross(*frames.unbind(-1)) if frames.shape[1:] == (3, 2) else frames
-
-
-def admissible(
-    points: Float[Tensor, "N n"],
-    planes: Float[Tensor, "N n d"] | Float[Tensor, "N n"],
-    centers: Int[Tensor, " P"],
-    others: Int[Tensor, " P"],
-) -> Bool[Tensor, " P"]:
-    """Whether `others[j]` may enter the stencil of `centers[j]`.
-
-    It may if their tangent planes are less than 60° apart (σ_min(E_kᵀE_i) ≥ 0.5) and it does not stand above or
-    below the centre's plane (height ≤ 0.5 of the distance). `planes` are frames E, or the unit normals of a
-    hypersurface, which tell the same in less time: σ_min(E_kᵀE_i) = |n_k·n_i|. Orientation is irrelevant.
-    """
-    kernel = compiled.kernel("admissible") if planes.ndim == 2 else None
-    if kernel is not None:
-        arrays = (x.contiguous().numpy() for x in (points, planes, centers, others))
-        return torch.from_numpy(kernel(*arrays, MAX_SLOPE, MIN_ALIGNMENT))
-    parts = zip(centers.split(PAIRS_AT_ONCE), others.split(PAIRS_AT_ONCE), strict=True)
-    with compiled.standing_in() if planes.ndim == 2 else nullcontext():
-        return torch.cat([_admissible_part(points, planes, *part) for part in parts])
-
-
-def _admissible_part(points: Tensor, planes: Tensor, centers: Tensor, others: Tensor) -> Tensor:
-    offset = at(points, others) - at(points, centers)
-    total = dot(offset, offset)
-    mine, theirs = at(planes, centers), at(planes, others)
-    if planes.ndim == 3:
-        flat = torch.einsum("pn,pnd->pd", offset, mine)
-        height = total - dot(flat, flat)
-        cosine = _smallest_singular_value(theirs, mine)
-    else:
-        height = dot(offset, mine).square()
-        cosine = dot(theirs, mine).abs()
-    return (height <= MAX_SLOPE**2 * total) & (cosine >= MIN_ALIGNMENT)
-
-
-def admissible_neighbors(
-    points: Float[Tensor, "N n"],
-    planes: Float[Tensor, "N n d"] | Float[Tensor, "N n"],
-    index: Int[Tensor, "B K"],
-) -> Bool[Tensor, "B K"]:
-    """Which points of each row may enter the stencil of its first, see `admissible`."""
-    centers = index[:, 0].repeat_interleave(index.shape[1])
-    return admissible(points, planes, centers, index.flatten()).view(index.shape)
 
 
 def _graph(i: np.ndarray, j: np.ndarray, num_points: int) -> sparse.csr_array:
@@ -168,11 +101,7 @@ def nearest_graph(
     num_rows, size = others.shape
     if size == 0:  # a single point
         return sparse.csr_array((num_rows, num_rows), dtype=np.float32)
-    centers = torch.arange(num_rows).repeat_interleave(size)
-    flat = others.reshape(-1)
-    planes = planes_of(frames)
-    good = admissible(points, planes, centers, flat) & admissible(points, planes, flat, centers)
-    good = good.view(num_rows, size)
+    centers, flat, good = mutually_admissible(points, planes_of(frames), candidates)
     chosen = good & (good.cumsum(1) <= wanted)
     for rows in torch.arange(num_rows).split(rows_at_once(size, dim)):
         offset = points[others[rows]] - points[rows, None]

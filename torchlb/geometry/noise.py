@@ -7,8 +7,9 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from torchlb.fits.polynomials import monomial_columns, num_monomials
+from torchlb.geometry.admission import admissible_neighbors
 from torchlb.geometry.frames import complete_frames
-from torchlb.geometry.neighbors import AT_ONCE, admissible_neighbors
+from torchlb.geometry.neighbors import AT_ONCE
 from torchlb.geometry.vectors import dot
 
 SMOOTH = 4.0

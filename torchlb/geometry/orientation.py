@@ -14,7 +14,7 @@ from scipy import sparse
 from scipy.sparse import csgraph
 from torch import Tensor
 
-from torchlb.geometry.neighbors import MIN_ALIGNMENT, admissible
+from torchlb.geometry.admission import MIN_ALIGNMENT, mutually_admissible
 from torchlb.geometry.vectors import at, dot
 
 SMOOTH = 0.97
@@ -106,9 +106,8 @@ def thin_sides(
     Points whose sides have a negative product lie on different sides. It is thin where a near point stands above or
     below the tangent plane and yet has nearly the same one. Elsewhere a shape may have one side only.
     """
-    i = torch.arange(len(points)).repeat_interleave(candidates.shape[1] - 1)
-    j = candidates[:, 1:].reshape(-1)
-    refused = ~(admissible(points, oriented, i, j) & admissible(points, oriented, j, i))
+    i, j, good = mutually_admissible(points, oriented, candidates)
+    refused = ~good.view(-1)
     both = torch.stack([i[refused], j[refused]])
     alike = dot(at(oriented, both[0]), at(oriented, both[1])).abs() >= MIN_ALIGNMENT
     thin = torch.zeros(len(points), dtype=torch.bool)

@@ -13,6 +13,7 @@ from scipy.spatial import Delaunay
 from torch import Tensor
 from torch.nn.functional import normalize
 
+from torchlb.geometry.admission import mutually_admissible
 from torchlb.geometry.cocone import REACH, Candidates, Cloud, Tetrahedra, refined_normals
 from torchlb.geometry.frames import cloud_frames, vertex_normals
 from torchlb.geometry.gaps import closed, filled, with_left_points
@@ -25,7 +26,7 @@ from torchlb.geometry.manifold import (
     without_specks,
     wound_alike,
 )
-from torchlb.geometry.neighbors import admissible, mesh_graph, nearest_neighbors
+from torchlb.geometry.neighbors import mesh_graph, nearest_neighbors
 from torchlb.geometry.noise import denoised
 from torchlb.geometry.poles import Poles, corrected_normals
 from torchlb.geometry.stars import gaps_between, pieces_of, stars_in_gaps
@@ -365,13 +366,10 @@ def _contacts(cloud: Cloud, faces: Faces) -> tuple[int, tuple[tuple[float, float
 def _kin(cloud: Cloud) -> tuple[np.ndarray, np.ndarray]:
     """Pairs of points that belong together: each and its nearest admissible ones; all its nearest in a small piece."""
     points, normals = torch.from_numpy(cloud.points), torch.from_numpy(cloud.normals)
-    others = torch.from_numpy(cloud.neighbors[:, 1:])
-    i, j = torch.arange(len(points)).repeat_interleave(others.shape[1]), others.reshape(-1)
-    good = admissible(points, normals, i, j) & admissible(points, normals, j, i)
-    good = good.view(others.shape)
+    i, j, good = mutually_admissible(points, normals, torch.from_numpy(cloud.neighbors))
     near = (good & (good.cumsum(1) <= SPACING)).view(-1).numpy()
     i, j = i.numpy(), j.numpy()
     piece = components(i[near], j[near], len(points))
     lone = (np.bincount(piece) < NEAREST)[piece]
-    near |= (lone[:, None] & (np.arange(others.shape[1]) < SPACING)).ravel()
+    near |= (lone[:, None] & (np.arange(good.shape[1]) < SPACING)).ravel()
     return i[near], j[near]

@@ -27,11 +27,7 @@ from torchlb.geometry.neighbors import (
     nearest_graph,
     nearest_neighbors,
 )
-from torchlb.geometry.orientation import (
-    consistently_wound,
-    orient_normals,
-    thin_sides,
-)
+from torchlb.geometry.orientation import consistently_wound, orient_normals, thin_sides
 from torchlb.geometry.surface import CloudSurface
 from torchlb.geometry.vertex_fits import VertexFits
 from torchlb.stencils.conditions import Condition, Neumann

@@ -1,0 +1,98 @@
+"""Who may enter a point's stencil (`method.md`, section 4)."""
+
+from __future__ import annotations
+
+from contextlib import nullcontext
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from torchlb import compiled
+from torchlb.geometry.vectors import at, dot
+
+MIN_ALIGNMENT = 0.5
+"""Smallest singular value of E_kᵀE_i, the cosine of the largest angle between two tangent planes."""
+MAX_SLOPE = 0.5
+"""Largest share of the distance |e| that may be height over the centre's tangent plane. On a sphere the
+two bounds meet, at 60°."""
+PAIRS_AT_ONCE = 2**16
+"""Pairs of points that are looked at together: of small arrays the memory is used again."""
+
+
+def _smallest_singular_value(
+    a: Float[Tensor, "P n d"], b: Float[Tensor, "P n d"]
+) -> Float[Tensor, " P"]:
+    """σ_min(AᵀB) of pairs of orthonormal frames."""
+    product = a.mT @ b
+    dim = product.shape[-1]
+    if dim == 1:
+        return product[:, 0, 0].abs()
+    if dim == 2:  # σ² are the roots of s² − |A|²s + det² = 0
+        frobenius = product.square().sum((-1, -2))
+        (a, b), (c, d) = (row.unbind(-1) for row in product.unbind(-2))
+        discriminant = (frobenius.square() - 4 * (a * d - b * c).square()).clamp_min(0)
+        return ((frobenius - discriminant.sqrt()) / 2).clamp_min(0).sqrt()
+    return torch.linalg.svdvals(product)[:, -1]
+
+
+def planes_of(frames: Float[Tensor, "N n d"]) -> Float[Tensor, "N n d"] | Float[Tensor, "N n"]:
+    """What `admissible` takes: the unit normals of a surface in R³, else the frames."""
+    return torch.linalg.cross(*frames.unbind(-1)) if frames.shape[1:] == (3, 2) else frames
+
+
+def admissible(
+    points: Float[Tensor, "N n"],
+    planes: Float[Tensor, "N n d"] | Float[Tensor, "N n"],
+    centers: Int[Tensor, " P"],
+    others: Int[Tensor, " P"],
+) -> Bool[Tensor, " P"]:
+    """Whether `others[j]` may enter the stencil of `centers[j]`.
+
+    It may if their tangent planes are less than 60° apart (σ_min(E_kᵀE_i) ≥ 0.5) and it does not stand above or
+    below the centre's plane (height ≤ 0.5 of the distance). `planes` are frames E, or the unit normals of a
+    hypersurface, which tell the same in less time: σ_min(E_kᵀE_i) = |n_k·n_i|. Orientation is irrelevant.
+    """
+    kernel = compiled.kernel("admissible") if planes.ndim == 2 else None
+    if kernel is not None:
+        arrays = (x.contiguous().numpy() for x in (points, planes, centers, others))
+        return torch.from_numpy(kernel(*arrays, MAX_SLOPE, MIN_ALIGNMENT))
+    parts = zip(centers.split(PAIRS_AT_ONCE), others.split(PAIRS_AT_ONCE), strict=True)
+    with compiled.standing_in() if planes.ndim == 2 else nullcontext():
+        return torch.cat([_admissible_part(points, planes, *part) for part in parts])
+
+
+def _admissible_part(points: Tensor, planes: Tensor, centers: Tensor, others: Tensor) -> Tensor:
+    offset = at(points, others) - at(points, centers)
+    total = dot(offset, offset)
+    mine, theirs = at(planes, centers), at(planes, others)
+    if planes.ndim == 3:
+        flat = torch.einsum("pn,pnd->pd", offset, mine)
+        height = total - dot(flat, flat)
+        cosine = _smallest_singular_value(theirs, mine)
+    else:
+        height = dot(offset, mine).square()
+        cosine = dot(theirs, mine).abs()
+    return (height <= MAX_SLOPE**2 * total) & (cosine >= MIN_ALIGNMENT)
+
+
+def admissible_neighbors(
+    points: Float[Tensor, "N n"],
+    planes: Float[Tensor, "N n d"] | Float[Tensor, "N n"],
+    index: Int[Tensor, "B K"],
+) -> Bool[Tensor, "B K"]:
+    """Which points of each row may enter the stencil of its first, see `admissible`."""
+    centers = index[:, 0].repeat_interleave(index.shape[1])
+    return admissible(points, planes, centers, index.flatten()).view(index.shape)
+
+
+def mutually_admissible(
+    points: Float[Tensor, "N n"],
+    planes: Float[Tensor, "N n d"] | Float[Tensor, "N n"],
+    candidates: Int[Tensor, "N K"],
+) -> tuple[Int[Tensor, " P"], Int[Tensor, " P"], Bool[Tensor, "N others"]]:
+    """Each point with all other candidates of its row, (i, j) in turn; and which of them are admissible both ways."""
+    others = candidates[:, 1:]
+    i, j = torch.arange(len(points)).repeat_interleave(others.shape[1]), others.reshape(-1)
+    good = admissible(points, planes, i, j) & admissible(points, planes, j, i)
+    return i, j, good.view(others.shape)
