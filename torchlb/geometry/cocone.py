@@ -13,7 +13,6 @@ from functools import cached_property, reduce
 import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
-from scipy.spatial import Delaunay
 from torch import Tensor
 from torch.nn.functional import normalize
 
@@ -21,6 +20,7 @@ from torchlb import compiled
 from torchlb.fits.polynomials import monomial_columns
 from torchlb.fits.weights import window
 from torchlb.geometry.admission import PAIRS_AT_ONCE, admissible_neighbors
+from torchlb.geometry.delaunay import delaunay_tetrahedra
 from torchlb.geometry.frames import complete_frames
 from torchlb.geometry.manifold import Faces, edges_of, face_vectors
 from torchlb.geometry.vectors import dot, inner, largest, lengths, smallest
@@ -186,8 +186,7 @@ class Tetrahedra:
         random = np.random.default_rng(0).standard_normal(points.shape)
         random -= (1 - RAISED) * inner(random, normals)[:, None] * normals
         moved = points + MOVED * spacing[:, None] * random
-        delaunay = Delaunay(moved)
-        cells, beyond = delaunay.simplices.astype(np.int64), delaunay.neighbors
+        cells, beyond = delaunay_tetrahedra(moved)
         centers = _circumcenters(moved, cells)
         faces, here, there, apex = [], [], [], []
         for k in range(4):
