@@ -123,42 +123,35 @@ def _hole(
     beside: np.ndarray,
     mark: np.ndarray,
     hole: np.ndarray,
+    rim: np.ndarray,
     point: int,
     turn: int,
-) -> int:
-    """All tetrahedra, from the first in `hole` on, that have to go; how many.
+) -> Any:
+    """All tetrahedra, from the first in `hole` on, that have to go, and the faces around them: how many of both.
 
-    `mark` has of each ± the last turn in which it was looked at, − if it could stay.
+    Parameters
+    ----------
+    mark : of each ± the last turn in which it was looked at, − if it could stay.
+    rim : room for the faces, each a tetrahedron that goes, and the place of the corner opposite to the face.
     """
     mark[hole[0]] = turn
-    size, done = 1, 0
-    while done < size:
+    size, faces, done = 1, 0, 0
+    while done < size and faces + 4 <= len(rim):
+        now = hole[done]
         for place in range(4):
-            other = beside[hole[done], place]
-            if abs(mark[other]) != turn:
-                goes = _conflicts(points, cells, other, point)
-                mark[other] = turn if goes else -turn
-                if goes:
+            other = beside[now, place]
+            seen = mark[other]
+            if seen != turn and seen != -turn:
+                seen = turn if _conflicts(points, cells, other, point) else -turn
+                mark[other] = seen
+                if seen == turn:
                     hole[size] = other
                     size += 1
-        done += 1
-    return size
-
-
-@njit
-@no_type_check
-def _rim(
-    beside: np.ndarray, mark: np.ndarray, hole: np.ndarray, turn: int, rim: np.ndarray
-) -> int:
-    """Faces around a hole, each as its tetrahedron and the place opposite, as far as there is room; how many."""
-    faces = 0
-    for now in hole:
-        for place in range(4):
-            if mark[beside[now, place]] != turn:
-                if faces < len(rim):
-                    rim[faces, 0], rim[faces, 1] = now, place
+            if seen != turn:
+                rim[faces, 0], rim[faces, 1] = now, place
                 faces += 1
-    return faces
+        done += 1
+    return size, faces if done == size else len(cells)
 
 
 @njit
@@ -189,27 +182,37 @@ def _filled(
 @njit
 @no_type_check
 def _link(
-    cells: np.ndarray, beside: np.ndarray, new: np.ndarray, point: int, table: np.ndarray
+    cells: np.ndarray,
+    beside: np.ndarray,
+    new: np.ndarray,
+    point: int,
+    keys: np.ndarray,
+    sides: np.ndarray,
 ) -> None:
-    """Those of the new tetrahedra around a point beside each other that share the edge opposite to it."""
-    room = len(table) - 1  # one less than a power of two
-    table[:, 0] = -1
+    """Those of the new tetrahedra around a point beside each other that share the edge opposite to it.
+
+    `keys`, `sides` : a hash table, its size a power of two, of edges by the sums of their ends and of the squares, and
+    of the tetrahedron · 4 + place that has each.
+    """
+    room = len(sides) - 1
+    sides[:] = -1
     for now in new:
+        ends, squares = -point, -point * point
         for place in range(4):
-            if cells[now, place] == point:
+            corner = np.int64(cells[now, place])
+            ends, squares = ends + corner, squares + corner * corner
+        for place in range(4):
+            corner = np.int64(cells[now, place])
+            if corner == point:
                 continue
-            low, high = point, point
-            for other in range(4):
-                if other != place and cells[now, other] != point:
-                    low, high = high, cells[now, other]
-            low, high = min(low, high), max(low, high)
-            slot = (low * 73856093 ^ high * 19349663) & room
-            while table[slot, 0] >= 0 and (table[slot, 2] != low or table[slot, 3] != high):
+            one, two = ends - corner, squares - corner * corner
+            slot = (one * 73856093 ^ two * 19349663) & room
+            while sides[slot] >= 0 and (keys[slot, 0] != one or keys[slot, 1] != two):
                 slot = (slot + 1) & room
-            if table[slot, 0] < 0:
-                table[slot, 0], table[slot, 1], table[slot, 2], table[slot, 3] = now, place, low, high
+            if sides[slot] < 0:
+                sides[slot], keys[slot, 0], keys[slot, 1] = 4 * now + place, one, two
             else:
-                other, back = table[slot, 0], table[slot, 1]
+                other, back = sides[slot] // 4, sides[slot] % 4
                 beside[now, place], beside[other, back] = other, now
 
 
@@ -281,7 +284,7 @@ def delaunay(points: np.ndarray, order: np.ndarray, room: int) -> Any:
     cells, beside = np.empty((room, 4), np.int32), np.empty((room, 4), np.int32)
     mark, hole, free = np.zeros(room, np.int32), np.empty(room, np.int32), np.empty(room, np.int32)
     rim, new = np.empty((room // 4, 2), np.int32), np.empty(room // 4, np.int32)
-    table = np.empty((2 * room, 4), np.int32)
+    keys, sides = np.empty((2 * room, 2), np.int64), np.empty(2 * room, np.int64)
     nothing = np.empty((0, 4), np.int64), np.empty((0, 4), np.int64)
     if _solid(points, order[0], order[1], order[2], order[3]) <= 0:
         return nothing
@@ -292,8 +295,7 @@ def delaunay(points: np.ndarray, order: np.ndarray, room: int) -> Any:
         hole[0] = _located(points, cells, beside, last, point)
         if hole[0] < 0:
             return nothing
-        size = _hole(points, cells, beside, mark, hole, point, turn)
-        faces = _rim(beside, mark, hole[:size], turn, rim)
+        size, faces = _hole(points, cells, beside, mark, hole, rim, point, turn)
         if faces > len(rim) or used + faces - left > room:
             return nothing
         for a in range(faces):
@@ -308,7 +310,7 @@ def delaunay(points: np.ndarray, order: np.ndarray, room: int) -> Any:
         slots = 64
         while slots < 4 * faces:
             slots *= 2
-        _link(cells, beside, new[:faces], point, table[:slots])
+        _link(cells, beside, new[:faces], point, keys[:slots], sides[:slots])
         for a in range(size):
             cells[hole[a], 0] = GONE
             free[left] = hole[a]

@@ -79,11 +79,21 @@ class Poles:
         first = self.farthest(length)
         return self.ray[first], length[first]
 
-    def corrected(self, normals: Float[Tensor, "N 3"]) -> Float[Tensor, "N 3"]:
-        """The normals, but for those along which the Voronoi cell is short: there the direction where it is longest."""
-        along = dot(self.ray, at(normals, self.point)).abs()
+    def corrected(
+        self, normals: Float[Tensor, "N 3"], where: Bool[Tensor, " N"] | None = None
+    ) -> Float[Tensor, "N 3"]:
+        """The normals, but for those along which the Voronoi cell is short: there the direction where it is longest.
+
+        Only those of the points `where` are looked at, if that is given.
+        """
+        seen = slice(None) if where is None else at(where, self.point).nonzero()[:, 0]
+        point = self.point[seen]
+        along = dot(self.ray[seen], at(normals, point)).abs()
+        most = along.new_full((len(normals),), torch.inf).scatter_reduce(
+            0, point, along, "amax", include_self=False
+        )
         longest, length = self._longest
-        short = along[self.farthest(along)] * LONG < length
+        short = most * LONG < length
         return torch.where(short[:, None], longest / length[:, None], normals)
 
     def sides(self, normals: Float[Tensor, "N 3"]) -> tuple[Float[np.ndarray, " S"], bool]:
@@ -206,8 +216,9 @@ def corrected_normals(
     A cell is long across the surface. Where points lie on rings or other curves far apart, the planes through the
     nearest of them are those of the curves, and neither their size nor their fit tells.
     """
+    where = None
     for _ in range(rounds):
-        before, normals = normals, poles.corrected(normals)
-        around = (normals != before).any(1)[candidates].any(1).nonzero()[:, 0]
-        normals = refined_normals(points, normals, candidates, around)
-    return poles.corrected(normals)
+        before, normals = normals, poles.corrected(normals, where)
+        where = (normals != before).any(1)[candidates].any(1)
+        normals = refined_normals(points, normals, candidates, where.nonzero()[:, 0])
+    return poles.corrected(normals, where)
