@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 import torch
 from scipy import sparse
+from scipy.spatial import ConvexHull
 
 from torchlb import LaplaceBeltrami, compiled
 from torchlb.fits.least_squares import left_inverse
@@ -21,6 +22,7 @@ from torchlb.galerkin import pair
 from torchlb.galerkin.pair import stored, upper_product
 from torchlb.geometry.admission import admissible
 from torchlb.geometry.cocone import best_manifold
+from torchlb.geometry.delaunay import delaunay_tetrahedra
 from torchlb.geometry.manifold import components, edges_of, spanning_pairs, tree_sides
 from torchlb.geometry.numbering import Numbering
 from torchlb.surfaces import Hemisphere
@@ -135,6 +137,71 @@ def test_components_and_sides_are_the_same(count, pairs, both):
     assert np.array_equal(one, other)
     chosen = spanning_pairs(i, j, count)
     assert np.array_equal(one[i[chosen]] ^ one[j[chosen]], against[chosen])
+
+
+@pytest.mark.parametrize("faces", [[], [[2, 0, 5]], [[0, 1, 2], [1, 3, 2], [1, 2, 4], [2, 1, 0]]])
+def test_edges_are_the_same(faces, both):
+    """Also of edges with more than two faces, and of faces that are there twice."""
+    some = np.random.default_rng(0).integers(0, 40, (300, 3))
+    for triangles in (np.array(faces, dtype=np.int64).reshape(-1, 3), some):
+        one, other = both(lambda f=triangles: edges_of(f, 41), "edges")
+        for name in ("keys", "of", "uses", "order"):
+            assert np.array_equal(getattr(one, name), getattr(other, name))
+        assert (one.keys[one.of] == one.keys.repeat(one.uses)[np.argsort(one.order)]).all()
+        assert one.uses.sum() == triangles.size
+
+
+CLOUDS = {
+    "cube": lambda random: random.random((700, 3)),
+    "far away": lambda random: random.random((300, 3)) + 1e5,
+    "sphere": lambda random: normalized(random.standard_normal((900, 3))),
+    "flat": lambda random: random.random((400, 3)) * [1.0, 1.0, 1e-6],
+    "sheets": lambda random: (
+        np.round(random.random((500, 3)) * [1, 1, 2]) + 0.1 * random.random((500, 3))
+    ),
+    "few": lambda random: random.random((5, 3)),
+    "four": lambda random: random.random((4, 3)),
+}
+
+
+def normalized(vectors):
+    return vectors / np.linalg.norm(vectors, axis=1)[:, None]
+
+
+@pytest.mark.parametrize("name", CLOUDS)
+def test_tetrahedra_are_the_same_and_delaunay(name, both):
+    """They fill the convex hull, each is beside those with its faces, and no sphere contains a point."""
+    points = CLOUDS[name](np.random.default_rng(0))
+    one, other = both(lambda: delaunay_tetrahedra(points), "delaunay")
+    for x, y in zip(one, other, strict=True):
+        assert np.array_equal(x, y)
+    cells, beside = other
+    corners = points[cells]
+    sides = corners[:, 1:] - corners[:, :1]
+    volume = np.abs(np.linalg.det(sides)) / 6
+    assert volume.sum() == pytest.approx(ConvexHull(points).volume, rel=1e-9)
+    center = np.linalg.solve(sides, (sides**2).sum(2)[..., None] / 2)[..., 0] + corners[:, 0]
+    radius = np.linalg.norm(center - corners[:, 0], axis=1)
+    for part in np.array_split(np.arange(len(cells)), 20):
+        distance = np.linalg.norm(points - center[part, None], axis=2)
+        assert (distance > (1 - 1e-7) * radius[part, None]).all()
+    for cell, near in zip(cells, beside, strict=True):
+        for corner, number in zip(cell, near, strict=True):
+            if number >= 0:
+                assert len(set(cells[number]) & set(cell) - {corner}) == 3
+
+
+def test_where_volumes_are_in_doubt_qhull_finds_tetrahedra(both):
+    """On a grid, where nothing is in general position; and where they are more than there is room for."""
+    grid = np.stack(np.meshgrid(*[np.arange(5.0)] * 3), -1).reshape(-1, 3)
+    line = np.linspace(0, 1, 80)
+    crossing = np.zeros((2, 80, 3))
+    crossing[0, :, 0], crossing[1, :, 1], crossing[1, :, 2] = line, line, 1
+    for points in (grid, crossing.reshape(-1, 3)):
+        one, other = both(lambda p=points: delaunay_tetrahedra(p), "delaunay")
+        for x, y in zip(one, other, strict=True):
+            assert np.array_equal(x, y)
+        assert len(other[0]) > len(points)
 
 
 def test_admission_is_the_same(both):

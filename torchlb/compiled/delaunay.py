@@ -14,20 +14,30 @@ from numba import njit
 
 BEYOND, GONE = -1, -2
 ORIENT, SPHERE = 8e-16, 2e-15
-"""Of the sums of the absolute values of their terms, what determinants may be off by (Shewchuk 1997: 7.8e-16, 1.8e-15)."""
+"""Of the sum of the absolute values of its terms, what a determinant may be off by (Shewchuk 1997: 7.8 and 18e-16)."""
+
+
+@njit
+@no_type_check
+def _offset(points: np.ndarray, start: int, end: int) -> tuple[float, float, float]:
+    return (
+        points[end, 0] - points[start, 0],
+        points[end, 1] - points[start, 1],
+        points[end, 2] - points[start, 2],
+    )
 
 
 @njit
 @no_type_check
 def _solid(points: np.ndarray, a: int, b: int, c: int, d: int) -> float:
     """Six times the volume, less what it may be off by; 0 if that is more, negative on the other side."""
-    ax, ay, az = points[a, 0] - points[d, 0], points[a, 1] - points[d, 1], points[a, 2] - points[d, 2]
-    bx, by, bz = points[b, 0] - points[d, 0], points[b, 1] - points[d, 1], points[b, 2] - points[d, 2]
-    cx, cy, cz = points[c, 0] - points[d, 0], points[c, 1] - points[d, 1], points[c, 2] - points[d, 2]
+    ax, ay, az = _offset(points, d, a)
+    bx, by, bz = _offset(points, d, b)
+    cx, cy, cz = _offset(points, d, c)
     bc, cb, ca, ac, ab, ba = bx * cy, cx * by, cx * ay, ax * cy, ax * by, bx * ay
     volume = az * (bc - cb) + bz * (ca - ac) + cz * (ab - ba)
-    terms = abs(az) * (abs(bc) + abs(cb)) + abs(bz) * (abs(ca) + abs(ac)) + abs(cz) * (abs(ab) + abs(ba))
-    doubt = ORIENT * terms
+    terms = abs(az) * (abs(bc) + abs(cb)) + abs(bz) * (abs(ca) + abs(ac))
+    doubt = ORIENT * (terms + abs(cz) * (abs(ab) + abs(ba)))
     if volume > doubt:
         return volume - doubt
     return volume + doubt if volume < -doubt else 0.0
@@ -37,10 +47,10 @@ def _solid(points: np.ndarray, a: int, b: int, c: int, d: int) -> float:
 @no_type_check
 def _within(points: np.ndarray, a: int, b: int, c: int, d: int, e: int) -> bool:
     """Whether the sphere through the first four contains the last for sure."""
-    ax, ay, az = points[a, 0] - points[e, 0], points[a, 1] - points[e, 1], points[a, 2] - points[e, 2]
-    bx, by, bz = points[b, 0] - points[e, 0], points[b, 1] - points[e, 1], points[b, 2] - points[e, 2]
-    cx, cy, cz = points[c, 0] - points[e, 0], points[c, 1] - points[e, 1], points[c, 2] - points[e, 2]
-    dx, dy, dz = points[d, 0] - points[e, 0], points[d, 1] - points[e, 1], points[d, 2] - points[e, 2]
+    ax, ay, az = _offset(points, e, a)
+    bx, by, bz = _offset(points, e, b)
+    cx, cy, cz = _offset(points, e, c)
+    dx, dy, dz = _offset(points, e, d)
     axby, bxay, bxcy, cxby = ax * by, bx * ay, bx * cy, cx * by
     cxdy, dxcy, dxay, axdy = cx * dy, dx * cy, dx * ay, ax * dy
     axcy, cxay, bxdy, dxby = ax * cy, cx * ay, bx * dy, dx * by
@@ -98,7 +108,7 @@ def _conflicts(points: np.ndarray, cells: np.ndarray, now: int, point: int) -> b
 def _located(
     points: np.ndarray, cells: np.ndarray, beside: np.ndarray, start: int, point: int
 ) -> int:
-    """The tetrahedron with the point, or one beyond the hull from where it is seen, by a walk; −1 if that does not end."""
+    """The tetrahedron with the point, or one beyond the hull that it sees, by a walk; −1 if that does not end."""
     now, before = start, -1
     for _ in range(len(cells)):
         if _beyond(cells, now) < 4:
@@ -189,10 +199,12 @@ def _link(
     keys: np.ndarray,
     sides: np.ndarray,
 ) -> None:
-    """Those of the new tetrahedra around a point beside each other that share the edge opposite to it.
+    """New tetrahedra around a point are beside each other where they share an edge opposite to it.
 
-    `keys`, `sides` : a hash table, its size a power of two, of edges by the sums of their ends and of the squares, and
-    of the tetrahedron · 4 + place that has each.
+    Parameters
+    ----------
+    keys, sides : room for a hash table, a power of two: of edges, by the sums of their ends and of the squares, the
+        tetrahedron · 4 + the place opposite.
     """
     room = len(sides) - 1
     sides[:] = -1
@@ -223,8 +235,7 @@ def _begun(order: np.ndarray, cells: np.ndarray, beside: np.ndarray) -> None:
     for now in range(5):
         for place in range(4):
             cells[now, place], beside[now, place] = order[place], 1 + place
-    for place in range(4):
-        # seen from the other side, two corners change places
+    for place in range(4):  # seen from the other side: two corners change places
         one, two, around = (place + 1) % 4, (place + 2) % 4, 1 + place
         cells[around, place], beside[around, place] = BEYOND, 0
         cells[around, one], beside[around, one] = order[two], 1 + two

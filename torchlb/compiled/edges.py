@@ -8,7 +8,11 @@ import numpy as np
 from numba import njit
 
 
-@njit("Tuple((int64[::1], int64[::1], int64[::1], int64[::1]))(int64[:, ::1], int64)", cache=True, nogil=True)
+@njit(
+    "Tuple((int64[::1], int64[::1], int64[::1], int64[::1]))(int64[:, ::1], int64)",
+    cache=True,
+    nogil=True,
+)
 @no_type_check
 def edges(faces: np.ndarray, count: int) -> Any:
     """The arrays of `geometry.manifold.Edges`: keys, of, uses and order."""

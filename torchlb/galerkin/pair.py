@@ -181,23 +181,22 @@ def positive_mass(
     until none is; that ends, since linear rows take nothing from anybody.
     """
     nodes, count = mesh.nodes, p.shape[1]
-    least = SMALLEST * _row_sums(linear)
-    mass = p.T @ weights
-    if (mass >= least).all():
-        return mass
-    shares = (np.repeat(np.arange(len(nodes.shares)), 3) + count, nodes.corners.numpy().ravel())
-    straight = sparse.csr_array((nodes.shares.numpy().ravel(), shares), shape=p.shape)
-    entries = sparse.coo_array(p)
-    row, col = entries.coords
-    given = weights[row] * entries.data
-    lowered = np.zeros(p.shape[0], dtype=bool)
+    corners, shares = nodes.corners.numpy(), nodes.shares.numpy()
+    least, left = SMALLEST * _row_sums(linear), sparse.csr_array(p.T)
+    mass, lowered = left @ weights, np.zeros(p.shape[0], dtype=bool)
     while True:
-        kept = np.where(lowered, 0.0, weights)
-        mass = p.T @ kept + straight.T @ (weights - kept)
-        taking = (mass < least)[col] & (given < 0) & (row >= count) & ~lowered[row]
-        if not taking.any():
+        low: Any = left[np.flatnonzero(mass < least)]
+        takes = (weights[low.indices] * low.data < 0) & (low.indices >= count)
+        taking = np.unique(low.indices[takes & ~lowered[low.indices]])
+        if len(taking) == 0:
             return mass
-        lowered[row[taking]] = True
+        lowered[taking] = True
+        given, linear_given = (
+            p[taking].T @ weights[taking],
+            shares[taking - count] * weights[taking, None],
+        )
+        mass -= given
+        np.add.at(mass, corners[taking - count], linear_given)
 
 
 def _row_sums(pair: Any) -> Float[np.ndarray, " N"]:

@@ -27,7 +27,8 @@ def delaunay_tetrahedra(points: Float[np.ndarray, "N 3"]) -> Tetrahedra:
     """
     kernel = compiled.kernel("delaunay", BY_QHULL * len(points))
     if kernel is not None:
-        corners, beside = kernel(points, _by_rounds(points), ROOM * len(points) + 256)
+        order = _by_rounds(points)
+        corners, beside = kernel(np.ascontiguousarray(points), order, ROOM * len(points) + 256)
         if len(corners):
             return corners, beside
     return _by_qhull(points)
@@ -35,7 +36,7 @@ def delaunay_tetrahedra(points: Float[np.ndarray, "N 3"]) -> Tetrahedra:
 
 @compiled.standing_in()
 def _by_qhull(points: Float[np.ndarray, "N 3"]) -> Tetrahedra:
-    found = Delaunay(points)
+    found = Delaunay(points - points.mean(0))  # which looks at where the origin is
     by_number = found.simplices.argsort(axis=1)
     both = (found.simplices, found.neighbors)
     corners, beside = (np.take_along_axis(x, by_number, 1).astype(np.int64) for x in both)

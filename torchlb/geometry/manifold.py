@@ -109,7 +109,9 @@ def edges_of(faces: Faces, count: int) -> Edges:
 @compiled.standing_in()
 def _by_keys(
     faces: Faces, count: int
-) -> tuple[Int[np.ndarray, " E"], Int[np.ndarray, " H"], Int[np.ndarray, " E"], Int[np.ndarray, " H"]]:
+) -> tuple[
+    Int[np.ndarray, " E"], Int[np.ndarray, " H"], Int[np.ndarray, " E"], Int[np.ndarray, " H"]
+]:
     tail, head = np.roll(faces, -1, 1).ravel(), np.roll(faces, -2, 1).ravel()
     key = np.minimum(tail, head) * count + np.maximum(tail, head)
     order, ascending = _ascending(key, count**2)

@@ -170,7 +170,7 @@ class _Relations:
         outside: Bool[np.ndarray, " S"],
     ) -> _Relations:
         """Without those of a sphere to itself."""
-        order = np.argsort(-cosine, kind="stable")
+        order = torch.from_numpy(cosine).argsort(descending=True, stable=True).numpy()
         order = order[i[order] != j[order]]
         weight = np.exp(SHARP * (cosine[order] - 1))
         return cls(i[order], j[order], against[order], weight, outside)
