@@ -25,6 +25,7 @@ from torchlb.geometry.cocone import best_manifold
 from torchlb.geometry.delaunay import delaunay_tetrahedra
 from torchlb.geometry.manifold import components, edges_of, spanning_pairs, tree_sides
 from torchlb.geometry.numbering import Numbering
+from torchlb.linalg.sparse import both_products
 from torchlb.surfaces import Hemisphere
 
 
@@ -89,6 +90,19 @@ def test_upper_products_are_the_same_to_the_bit(both, monkeypatch):
     assert np.array_equal(one.indptr, other.indptr)
     assert np.array_equal(one.indices, other.indices)
     assert np.array_equal(one.data, other.data)
+
+
+@pytest.mark.parametrize("columns", [0, 1, 9])
+def test_both_products_are_the_same_to_the_bit(columns, both):
+    generator = np.random.default_rng(columns)
+    k = sparse.csr_array(sparse.random_array((300, 300), density=0.05, rng=generator))
+    m = sparse.csr_array((generator.standard_normal(k.nnz), k.indices, k.indptr), shape=k.shape)
+    x = generator.standard_normal((columns, 300)).T
+    one, other = both(lambda: both_products(k, m, x), "both_products")
+    for a, b, matrix in zip(one, other, (k, m), strict=True):
+        assert np.array_equal(a, b)
+        np.testing.assert_allclose(a, matrix.toarray() @ x, atol=1e-13)
+    assert np.array_equal(both_products(k, sparse.eye_array(300).tocsr(), x)[1], x)
 
 
 @pytest.mark.parametrize("count", [1, 200])

@@ -1,9 +1,10 @@
 """Kernels compiled by numba, each the same to the bit as what stands in for it (`decisions.md`, *Compiled kernels*).
 
-`admissible`: who may enter a stencil. `best_manifold`: triangles for a cloud. `components`: what hangs together, and
-which side is out. `delaunay`: tetrahedra of points. `edges`: those of triangles. `graph_balls`: neighbourhoods of
-surfaces in R³ and of flat domains. `left_inverse`, `monomials`: local fits. `mirrored`, `upper_product`: the weak pair
-from its elements. Numba keeps what it has compiled, which takes some seconds once in an installation.
+`admissible`: who may enter a stencil. `best_manifold`: triangles for a cloud. `both_products`: those of a weak pair.
+`components`: what hangs together, and which side is out. `delaunay`: tetrahedra of points. `edges`: those of triangles.
+`graph_balls`: neighbourhoods of surfaces in R³ and of flat domains. `left_inverse`, `monomials`: local fits.
+`mirrored`, `upper_product`: the weak pair from its elements. Numba keeps what it has compiled, which takes some seconds
+once in an installation.
 """
 
 from __future__ import annotations
@@ -18,6 +19,7 @@ from typing import Any
 KERNELS = (
     "admissible",
     "best_manifold",
+    "both_products",
     "components",
     "delaunay",
     "edges",

@@ -19,7 +19,7 @@ CHECK = 2
 LONGEST = 20
 """Bound on the space, in multiples of what is asked for; it is 2.5 where things are well."""
 LOOSE = 1e-4
-"""Above this tolerance one pass of orthogonalisation is enough."""
+"""Above this tolerance one pass of orthogonalisation is enough, and eigenvectors in float32."""
 
 Inverse = Callable[[Float[np.ndarray, "N C"]], Float[np.ndarray, "N C"]]
 Pairs = tuple[Float[np.ndarray, " k"], Float[np.ndarray, "N k"]]
@@ -60,8 +60,7 @@ def lanczos(
     EigenbasisError : if all N vectors do not suffice, or `LONGEST` times those asked for.
     """
     size, count = len(mass_matrix.diagonal()), k + more
-    generator = np.random.default_rng(0)
-    first = 0 if null is None else 1
+    generator, first = np.random.default_rng(0), int(null is not None)
     basis, dual = (np.empty((min(4 * count + 4 * BLOCK, size), size)) for _ in range(2))  # V, MV
     if null is not None:
         basis[0], dual[0] = null, mass_matrix @ null
@@ -81,7 +80,8 @@ def lanczos(
             theta, y = linalg.eigh(np.triu(h[first:, first:]), lower=False)
             theta, y = theta[: -count - 1 : -1], y[:, : -count - 1 : -1]
             if (np.linalg.norm(r @ y[-BLOCK:, :k], axis=0) <= tolerance * theta[:k]).all():
-                return 1 / theta - shift, basis[first:end].T @ y
+                kind = np.float32 if tolerance > LOOSE else np.float64
+                return 1 / theta - shift, basis[first:end].astype(kind).T @ y.astype(kind)
             look = end + CHECK * BLOCK
         if end + BLOCK > len(basis):
             basis, dual = (np.concatenate([x, np.empty_like(x)]) for x in (basis, dual))
