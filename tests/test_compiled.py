@@ -20,6 +20,7 @@ from torchlb.fits.polynomials import monomial_columns, monomials
 from torchlb.fits.weights import scaled_system
 from torchlb.galerkin import pair
 from torchlb.galerkin.pair import stored, upper_product
+from torchlb.geometry import delaunay
 from torchlb.geometry.admission import admissible
 from torchlb.geometry.cocone import best_manifold
 from torchlb.geometry.delaunay import delaunay_tetrahedra
@@ -165,31 +166,42 @@ def test_edges_are_the_same(faces, both):
         assert one.uses.sum() == triangles.size
 
 
+def normalized(vectors):
+    return vectors / np.linalg.norm(vectors, axis=1)[:, None]
+
+
+def near(points, random):
+    """Moved by a hundred-thousandth, into general position."""
+    return points + 1e-5 * random.standard_normal(points.shape)
+
+
 CLOUDS = {
     "cube": lambda random: random.random((700, 3)),
     "far away": lambda random: random.random((300, 3)) + 1e5,
-    "sphere": lambda random: normalized(random.standard_normal((900, 3))),
-    "flat": lambda random: random.random((400, 3)) * [1.0, 1.0, 1e-6],
-    "sheets": lambda random: (
-        np.round(random.random((500, 3)) * [1, 1, 2]) + 0.1 * random.random((500, 3))
+    "sphere": lambda random: near(normalized(random.standard_normal((900, 3))), random),
+    "grid": lambda random: near(np.stack(np.meshgrid(*[np.arange(6.0)] * 3), -1), random).reshape(
+        -1, 3
     ),
+    "flat": lambda random: random.random((400, 3)) * [1.0, 1.0, 1e-6],
+    "sheets": lambda random: random.random((500, 3)) * [1, 1, 0.1] + np.arange(500)[:, None] % 2,
     "few": lambda random: random.random((5, 3)),
     "four": lambda random: random.random((4, 3)),
 }
 
 
-def normalized(vectors):
-    return vectors / np.linalg.norm(vectors, axis=1)[:, None]
+def compiled_tetrahedra(points, room=None):
+    """Corners and neighbours; both without rows where there is no result."""
+    kernel = pytest.importorskip("torchlb.compiled.delaunay").delaunay
+    return kernel(points, delaunay._by_rounds(points), room or delaunay.ROOM * len(points) + 256)
 
 
 @pytest.mark.parametrize("name", CLOUDS)
-def test_tetrahedra_are_the_same_and_delaunay(name, both):
+def test_tetrahedra_are_the_same_and_delaunay(name):
     """They fill the convex hull, each is beside those with its faces, and no sphere contains a point."""
     points = CLOUDS[name](np.random.default_rng(0))
-    one, other = both(lambda: delaunay_tetrahedra(points), "delaunay")
-    for x, y in zip(one, other, strict=True):
+    cells, beside = compiled_tetrahedra(points)
+    for x, y in zip((cells, beside), delaunay._by_qhull(points), strict=True):
         assert np.array_equal(x, y)
-    cells, beside = other
     corners = points[cells]
     sides = corners[:, 1:] - corners[:, :1]
     volume = np.abs(np.linalg.det(sides)) / 6
@@ -199,19 +211,42 @@ def test_tetrahedra_are_the_same_and_delaunay(name, both):
     for part in np.array_split(np.arange(len(cells)), 20):
         distance = np.linalg.norm(points - center[part, None], axis=2)
         assert (distance > (1 - 1e-7) * radius[part, None]).all()
-    for cell, near in zip(cells, beside, strict=True):
-        for corner, number in zip(cell, near, strict=True):
+    assert_beside(cells, beside)
+
+
+def assert_beside(cells, beside):
+    for cell, numbers in zip(cells, beside, strict=True):
+        for corner, number in zip(cell, numbers, strict=True):
             if number >= 0:
                 assert len(set(cells[number]) & set(cell) - {corner}) == 3
 
 
-def test_where_volumes_are_in_doubt_qhull_finds_tetrahedra(both):
+def test_where_signs_are_in_doubt_there_are_no_tetrahedra_or_they_are_whole():
+    """Of points from near to 10 to the power 10 away, where faces of the hull can be in doubt."""
+    found = 0
+    for seed in range(300):
+        random = np.random.default_rng(seed)
+        far = random.standard_normal((8, 3)) * 10.0 ** random.integers(1, 11, (8, 1))
+        points = near(np.concatenate([normalized(random.standard_normal((30, 3))), far]), random)
+        cells, beside = compiled_tetrahedra(points)
+        found += len(cells) > 0
+        if len(cells):
+            assert_beside(cells, beside)
+            assert set(cells.ravel()) == set(range(38))
+    assert 30 < found < 300
+
+
+def test_where_there_are_no_tetrahedra_qhull_finds_them(both):
     """On a grid, where nothing is in general position; and where they are more than there is room for."""
     grid = np.stack(np.meshgrid(*[np.arange(5.0)] * 3), -1).reshape(-1, 3)
-    line = np.linspace(0, 1, 80)
-    crossing = np.zeros((2, 80, 3))
-    crossing[0, :, 0], crossing[1, :, 1], crossing[1, :, 2] = line, line, 1
-    for points in (grid, crossing.reshape(-1, 3)):
+    crossing = np.zeros((2, 150, 3))
+    crossing[0, :, 0] = crossing[1, :, 1] = np.linspace(0, 1, 150)
+    crossing[1, :, 2] = 1
+    crossing += 1e-7 * np.random.default_rng(0).standard_normal(crossing.shape)
+    crossing = crossing.reshape(-1, 3)
+    assert len(compiled_tetrahedra(crossing, room=2**16)[0]) > delaunay.ROOM * 300 + 256
+    for points in (grid, crossing):
+        assert len(compiled_tetrahedra(points)[0]) == 0
         one, other = both(lambda p=points: delaunay_tetrahedra(p), "delaunay")
         for x, y in zip(one, other, strict=True):
             assert np.array_equal(x, y)

@@ -13,6 +13,9 @@ import numpy as np
 from numba import njit
 
 BEYOND, GONE = -1, -2
+FREE, MET = -1, -2
+ODD = (0x1E3779B97F4A7C15, 0x3F58476D1CE4E5B9)
+"""Factors that spread edges over a table."""
 ORIENT, SPHERE = 8e-16, 2e-15
 """Of the sum of the absolute values of its terms, what a determinant may be off by (Shewchuk 1997: 7.8 and 18e-16)."""
 
@@ -191,23 +194,26 @@ def _filled(
 
 @njit
 @no_type_check
-def _link(
+def _linked(
     cells: np.ndarray,
     beside: np.ndarray,
     new: np.ndarray,
     point: int,
     keys: np.ndarray,
     sides: np.ndarray,
-) -> None:
-    """New tetrahedra around a point are beside each other where they share an edge opposite to it.
+    bits: int,
+) -> bool:
+    """Whether each edge around a hole has two of the new tetrahedra, which are beside each other then.
+
+    An edge has four where a hole is pinched, which only faces of the hull that are in doubt bring about.
 
     Parameters
     ----------
-    keys, sides : room for a hash table, a power of two: of edges, by the sums of their ends and of the squares, the
+    keys, sides : a hash table with so many bits: of edges, by the sums of their ends and of the squares, the
         tetrahedron · 4 + the place opposite.
     """
-    room = len(sides) - 1
-    sides[:] = -1
+    left = 0
+    sides[:] = FREE
     for now in new:
         ends, squares = -point, -point * point
         for place in range(4):
@@ -218,14 +224,20 @@ def _link(
             if corner == point:
                 continue
             one, two = ends - corner, squares - corner * corner
-            slot = (one * 73856093 ^ two * 19349663) & room
-            while sides[slot] >= 0 and (keys[slot, 0] != one or keys[slot, 1] != two):
-                slot = (slot + 1) & room
-            if sides[slot] < 0:
+            slot = np.int64(np.uint64(one * ODD[0] + two * ODD[1]) >> np.uint64(64 - bits))
+            while sides[slot] != FREE and (keys[slot, 0] != one or keys[slot, 1] != two):
+                slot = (slot + 1) % len(sides)
+            if sides[slot] == FREE:
                 sides[slot], keys[slot, 0], keys[slot, 1] = 4 * now + place, one, two
+                left += 1
+            elif sides[slot] == MET:
+                return False
             else:
                 other, back = sides[slot] // 4, sides[slot] % 4
                 beside[now, place], beside[other, back] = other, now
+                sides[slot] = MET
+                left -= 1
+    return left == 0
 
 
 @njit
@@ -290,7 +302,7 @@ def delaunay(points: np.ndarray, order: np.ndarray, room: int) -> Any:
     """Corners of the tetrahedra of points in R³, and which is beside each, opposite to that corner; −1 for none.
 
     Points come in the given order, the first four being the corners of a tetrahedron. Corners are in ascending order,
-    and so are the tetrahedra. Without rows if there is no result, or no `room` for as many tetrahedra.
+    and so are the tetrahedra. Without rows if there is no result, or no `room`, 256 or more, for as many tetrahedra.
     """
     cells, beside = np.empty((room, 4), np.int32), np.empty((room, 4), np.int32)
     mark, hole, free = np.zeros(room, np.int32), np.empty(room, np.int32), np.empty(room, np.int32)
@@ -318,10 +330,12 @@ def delaunay(points: np.ndarray, order: np.ndarray, room: int) -> Any:
                 used += 1
         if not _filled(points, cells, beside, rim[:faces], new[:faces], point):
             return nothing
-        slots = 64
-        while slots < 4 * faces:
-            slots *= 2
-        _link(cells, beside, new[:faces], point, keys[:slots], sides[:slots])
+        bits = 6
+        while 2**bits < 4 * faces:
+            bits += 1
+        edges = keys[: 2**bits], sides[: 2**bits]
+        if not _linked(cells, beside, new[:faces], point, *edges, bits):
+            return nothing
         for a in range(size):
             cells[hole[a], 0] = GONE
             free[left] = hole[a]

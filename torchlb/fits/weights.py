@@ -128,9 +128,8 @@ def _left_by_fit(
     coefficients: Float[Tensor, "B M neighbors"],
     heights: Float[Tensor, "B neighbors n"],
 ) -> Float[Tensor, "B neighbors n"]:
-    rows = (
-        heights.mT @ coefficients.mT @ values.mT
-    )  # a few long rows, in half of the time of a few long columns
+    # a few long rows, in half of the time of a few long columns
+    rows = heights.mT @ coefficients.mT @ values.mT
     return heights - rows.mT
 
 

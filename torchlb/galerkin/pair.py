@@ -180,10 +180,11 @@ def positive_mass(
     Where one is below a tenth of that of linear elements, the rows of P that take from it are replaced by linear ones,
     until none is; that ends, since linear rows take nothing from anybody.
     """
-    nodes, count = mesh.nodes, p.shape[1]
-    corners, shares = nodes.corners.numpy(), nodes.shares.numpy()
-    least, left = SMALLEST * _row_sums(linear), sparse.csr_array(p.T)
-    mass, lowered = left @ weights, np.zeros(p.shape[0], dtype=bool)
+    nodes, count, least = mesh.nodes, p.shape[1], SMALLEST * _row_sums(linear)
+    mass = p.T @ weights
+    if (mass >= least).all():
+        return mass
+    left, lowered = sparse.csr_array(p.T), np.zeros(p.shape[0], dtype=bool)
     while True:
         low: Any = left[np.flatnonzero(mass < least)]
         takes = (weights[low.indices] * low.data < 0) & (low.indices >= count)
@@ -191,12 +192,9 @@ def positive_mass(
         if len(taking) == 0:
             return mass
         lowered[taking] = True
-        given, linear_given = (
-            p[taking].T @ weights[taking],
-            shares[taking - count] * weights[taking, None],
-        )
-        mass -= given
-        np.add.at(mass, corners[taking - count], linear_given)
+        shares = nodes.shares.numpy()[taking - count] * weights[taking, None]
+        mass -= p[taking].T @ weights[taking]
+        np.add.at(mass, nodes.corners.numpy()[taking - count], shares)
 
 
 def _row_sums(pair: Any) -> Float[np.ndarray, " N"]:

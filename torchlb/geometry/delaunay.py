@@ -11,9 +11,9 @@ from torchlb import compiled
 BY_QHULL = 2e-5
 """Seconds a point that Qhull takes."""
 THIN = 8
-"""Every so manieth of the points in their order comes first, and of these again."""
+"""One of so many points in their order comes first, and of these again."""
 ROOM = 16
-"""Tetrahedra for a point while they are made; 7 to 8 on surfaces and in solids."""
+"""Tetrahedra for a point while they are made; most often 7 to 9, of random points on a cylinder 14."""
 BEYOND = -1
 
 Tetrahedra = tuple[Int[np.ndarray, "T 4"], Int[np.ndarray, "T 4"]]
@@ -26,7 +26,7 @@ def delaunay_tetrahedra(points: Float[np.ndarray, "N 3"]) -> Tetrahedra:
     QhullError if they are in a plane.
     """
     kernel = compiled.kernel("delaunay", BY_QHULL * len(points))
-    if kernel is not None:
+    if kernel is not None and len(points) > 3:
         order = _by_rounds(points)
         corners, beside = kernel(np.ascontiguousarray(points), order, ROOM * len(points) + 256)
         if len(corners):
@@ -36,7 +36,7 @@ def delaunay_tetrahedra(points: Float[np.ndarray, "N 3"]) -> Tetrahedra:
 
 @compiled.standing_in()
 def _by_qhull(points: Float[np.ndarray, "N 3"]) -> Tetrahedra:
-    found = Delaunay(points - points.mean(0))  # which looks at where the origin is
+    found = Delaunay(points - points.mean(0))  # far from the origin it merges what is apart
     by_number = found.simplices.argsort(axis=1)
     both = (found.simplices, found.neighbors)
     corners, beside = (np.take_along_axis(x, by_number, 1).astype(np.int64) for x in both)

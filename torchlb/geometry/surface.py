@@ -30,7 +30,7 @@ from torchlb.geometry.neighbors import mesh_graph, nearest_neighbors
 from torchlb.geometry.noise import denoised
 from torchlb.geometry.poles import Poles, corrected_normals
 from torchlb.geometry.stars import gaps_between, pieces_of, stars_in_gaps
-from torchlb.geometry.vectors import inner, lengths
+from torchlb.geometry.vectors import lengths
 
 NEAREST = 24
 """Nearest points from which normals, stars and neighbourhoods are made."""
@@ -213,9 +213,8 @@ def _reaches(
     """
     few = near[:, : SPACING + 1]
     offset = points[few] - points[few].mean(1, keepdims=True)
-    spread = offset.transpose(0, 2, 1) @ offset
-    trace, square = np.trace(spread, axis1=1, axis2=2), inner(spread, spread).sum(1)
-    in_row = trace**2 - square < 2 * (IN_ROW * trace) ** 2  # λ_1 λ_2 of the two largest eigenvalues
+    length = np.linalg.eigvalsh(offset.transpose(0, 2, 1) @ offset)
+    in_row = length[:, 1] < IN_ROW**2 * length[:, 2]
     far = np.where(in_row, near[:, -1], few[:, -1])
     return REACH * np.linalg.norm(points[far] - points, axis=1)
 
@@ -346,9 +345,8 @@ def _contacts(cloud: Cloud, faces: Faces) -> tuple[int, tuple[tuple[float, float
     nearest = cloud.neighbors[:, 1]
     apart = np.flatnonzero(graph[np.arange(count), nearest] == 0)
     beyond = sparse.csr_array(graph[nearest[apart]] @ graph)
-    met = (beyond * graph[apart]).sum(
-        1
-    )  # a way of three edges: two from the nearest, one from here
+    # a way of three edges: two from the nearest, one from here
+    met = (beyond * graph[apart]).sum(1)
     far, touched = apart[met == 0], np.zeros(count, dtype=bool)
     touched[far] = touched[nearest[far]] = True
     near = cloud.neighbors[:, 1:]
