@@ -80,8 +80,7 @@ def lanczos(
             theta, y = linalg.eigh(np.triu(h[first:, first:]), lower=False)
             theta, y = theta[: -count - 1 : -1], y[:, : -count - 1 : -1]
             if (np.linalg.norm(r @ y[-BLOCK:, :k], axis=0) <= tolerance * theta[:k]).all():
-                kind = np.float32 if tolerance > LOOSE else np.float64
-                return 1 / theta - shift, basis[first:end].astype(kind).T @ y.astype(kind)
+                return 1 / theta - shift, _combined(basis[first:end], y, tolerance)
             look = end + CHECK * BLOCK
         if end + BLOCK > len(basis):
             basis, dual = (np.concatenate([x, np.empty_like(x)]) for x in (basis, dual))
@@ -101,6 +100,12 @@ def _orthogonalise(z: np.ndarray, basis: np.ndarray, dual: np.ndarray, passes: i
         z -= coefficients @ basis
         total += coefficients
     return total
+
+
+def _combined(basis: np.ndarray, y: np.ndarray, tolerance: float) -> np.ndarray:
+    """Eigenvectors, from their coefficients."""
+    kind = np.float32 if tolerance > LOOSE else np.float64
+    return basis.astype(kind, copy=False).T @ y.astype(kind, copy=False)
 
 
 def _orthonormal(
