@@ -126,7 +126,8 @@ def both_products(
     kernel = compiled.kernel("both_products") if on_one_pattern(one, other) else None
     if kernel is None:
         return _one_by_one(one, other, x)
-    return kernel(one.indptr, one.indices, one.data, other.data, np.ascontiguousarray(x))
+    pattern = (part.astype(np.int32, copy=False) for part in (one.indptr, one.indices))
+    return kernel(*pattern, one.data, other.data, np.ascontiguousarray(x))
 
 
 @compiled.standing_in()
