@@ -33,7 +33,7 @@ def _offset(points: np.ndarray, start: int, end: int) -> tuple[float, float, flo
 @njit
 @no_type_check
 def _solid(points: np.ndarray, a: int, b: int, c: int, d: int) -> float:
-    """Six times the volume, less what it may be off by; 0 if that is more, negative on the other side."""
+    """Six times the volume, negative on the other side; 0 if rounding may have turned its sign."""
     ax, ay, az = _offset(points, d, a)
     bx, by, bz = _offset(points, d, b)
     cx, cy, cz = _offset(points, d, c)
@@ -41,9 +41,7 @@ def _solid(points: np.ndarray, a: int, b: int, c: int, d: int) -> float:
     volume = az * (bc - cb) + bz * (ca - ac) + cz * (ab - ba)
     terms = abs(az) * (abs(bc) + abs(cb)) + abs(bz) * (abs(ca) + abs(ac))
     doubt = ORIENT * (terms + abs(cz) * (abs(ab) + abs(ba)))
-    if volume > doubt:
-        return volume - doubt
-    return volume + doubt if volume < -doubt else 0.0
+    return volume if abs(volume) > doubt else 0.0
 
 
 @njit
@@ -260,9 +258,10 @@ def _sorted(cells: np.ndarray, beside: np.ndarray, count: int) -> Any:
     """The tetrahedra within the convex hull, corners and rows in ascending order."""
     total, kept, other = 0, np.empty(len(cells), np.int32), np.empty(len(cells), np.int32)
     for now in range(len(cells)):
-        if cells[now, 0] != GONE and _beyond(cells, now) == 4:
-            kept[total] = now
-            total += 1
+        if cells[now, 0] == GONE or _beyond(cells, now) < 4:
+            continue
+        kept[total] = now
+        total += 1
         for last in range(1, 4):
             for place in range(last, 0, -1):
                 one, two = cells[now, place - 1], cells[now, place]

@@ -22,18 +22,17 @@ def edges(faces: np.ndarray, count: int) -> Any:
         for k in range(3):
             one, two = faces[face, (k + 1) % 3], faces[face, (k + 2) % 3]
             ends[0, 3 * face + k], ends[1, 3 * face + k] = min(one, two), max(one, two)
-    order, before = np.empty(size, np.int64), np.arange(size)
+    order = np.arange(size)
     for end in (1, 0):
         place = np.zeros(count + 1, np.int64)
         for half in range(size):
             place[ends[end, half] + 1] += 1
         for point in range(count):
             place[point + 1] += place[point]
+        before, order = order, np.empty(size, np.int64)
         for half in before:
             order[place[ends[end, half]]] = half
             place[ends[end, half]] += 1
-        order, before = before, order
-    order = before
     keys, of, uses = np.empty(size, np.int64), np.empty(size, np.int64), np.zeros(size, np.int64)
     found, last = 0, np.int64(-1)
     for half in order:

@@ -16,11 +16,11 @@ ROOM = 16
 """Tetrahedra for a point while they are made; most often 7 to 9, of random points on a cylinder 14."""
 BEYOND = -1
 
-Tetrahedra = tuple[Int[np.ndarray, "T 4"], Int[np.ndarray, "T 4"]]
+Cells = tuple[Int[np.ndarray, "T 4"], Int[np.ndarray, "T 4"]]
 """Corners, and which tetrahedron is beside each, opposite to that corner: `BEYOND` for none."""
 
 
-def delaunay_tetrahedra(points: Float[np.ndarray, "N 3"]) -> Tetrahedra:
+def delaunay_tetrahedra(points: Float[np.ndarray, "N 3"]) -> Cells:
     """The tetrahedra of points in general position, corners and rows in ascending order.
 
     QhullError if they are in a plane.
@@ -35,7 +35,7 @@ def delaunay_tetrahedra(points: Float[np.ndarray, "N 3"]) -> Tetrahedra:
 
 
 @compiled.standing_in()
-def _by_qhull(points: Float[np.ndarray, "N 3"]) -> Tetrahedra:
+def _by_qhull(points: Float[np.ndarray, "N 3"]) -> Cells:
     found = Delaunay(points - points.mean(0))  # far from the origin it merges what is apart
     by_number = found.simplices.argsort(axis=1)
     both = (found.simplices, found.neighbors)
@@ -54,7 +54,7 @@ def _by_rounds(points: Float[np.ndarray, "N 3"]) -> Int[np.ndarray, " N"]:
     volume = offset @ np.cross(offset[second], offset[third])
     fourth = np.abs(volume).argmax()
     first = [0, second, third, fourth] if volume[fourth] < 0 else [second, 0, third, fourth]
-    last_round = np.full(len(points), 0)
+    last_round = np.zeros(len(points), dtype=int)
     step = THIN
     while step < len(points):
         last_round[::step] -= 1
