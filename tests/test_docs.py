@@ -77,6 +77,7 @@ TRIGGERS = {
     ),
     "… points share": lambda: LaplaceBeltrami.from_points(torch.cat([VERTICES, VERTICES[:2]])),
     "… are NaN": lambda: LaplaceBeltrami.from_points(NAN),
+    "…: they require": lambda: LaplaceBeltrami.from_points(VERTICES.clone().requires_grad_()),
     "… have indices": lambda: LaplaceBeltrami.from_mesh(VERTICES, FACES + 1),
     "… these look like quads": lambda: LaplaceBeltrami.from_mesh(
         torch.rand(100, 3), GRID[:-1, :-1].reshape(-1, 1) + torch.tensor([0, 1, 11, 10])
@@ -184,7 +185,7 @@ def test_a_quoted_message_is_one_that_comes(message, tmp_path, monkeypatch):
     pattern = ".*".join(re.escape(part) for part in message.split("…"))
     with warnings.catch_warnings():
         warnings.simplefilter("error", torchlb.StabilityWarning)
-        warnings.filterwarnings("error", "(faces|points|batch): ")
+        warnings.filterwarnings("error", "(faces|points|vertices|batch): ")
         with pytest.raises((ValueError, TypeError, RuntimeError, UserWarning)) as caught:
             triggers[0]()
     assert re.search(pattern, str(caught.value), re.DOTALL), str(caught.value)

@@ -226,6 +226,41 @@ def test_an_operator_of_other_points_is_refused(change):
         to_operator(shapes[1])
 
 
+@pytest.mark.parametrize("float_type", [torch.float32, torch.float64])
+@pytest.mark.parametrize("faces", [True, False])
+def test_nodes_in_another_order_are_refused(faces, float_type):
+    """Transforms permute nodes, not matrices: all points by PyG's own, two of them by hand, two shapes of a batch."""
+    vertices, corners = MESHES[1]
+    plain = data_of(vertices.to(float_type), corners if faces else None)
+    data = LaplaceBeltramiTransform(order=1)(plain)
+    count = data.num_nodes
+    swap = torch.arange(count)
+    swap[[17, 18]] = swap[[18, 17]]
+    turned = [T.FixedPoints(count, replace=False)(copy.copy(data))]
+    turned += [data.subgraph(swap), data.subgraph(torch.arange(count).roll(1))]
+    for changed in turned:
+        with pytest.raises(
+            ValueError, match=r"pos: .* points .* in another order .* apply it last"
+        ):
+            to_operator(changed)
+        with pytest.raises(ValueError, match="in another order"):
+            to_operator(Batch.from_data_list([data, changed]))
+    other = LaplaceBeltramiTransform(order=1)(data_of(2 * plain.pos, corners if faces else None))
+    batch = Batch.from_data_list([data, other])
+    order = torch.arange(2 * count).roll(count)
+    for key in ("pos", "lb_pos", "lb_nodes", "lb_mass"):
+        batch[key] = batch[key][order]
+    with pytest.raises(ValueError, match="in another order"):
+        to_operator(batch)
+    for key in ("pos", "lb_pos", "lb_nodes", "lb_mass"):
+        batch[key] = batch[key][order]
+    to_operator(batch)  # as it was
+    shapes = [copy.copy(data) for _ in range(2)]
+    shapes[0].pos = shapes[0].pos.to(torch.float64)
+    shapes[1].pos = shapes[1].pos.to(torch.float32) + 3
+    assert [to_operator(shape).num_points for shape in shapes] == [count, count]
+
+
 def test_edges_without_faces_are_named():
     data = T.FaceToEdge()(copy.copy(DATA[0]))
     with pytest.warns(UserWarning, match="edges but no face.*remove_faces=False"):

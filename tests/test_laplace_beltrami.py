@@ -4,6 +4,7 @@ import copy
 import functools
 import io
 import pickle
+import warnings
 from collections import namedtuple
 from functools import cache
 
@@ -15,7 +16,7 @@ import torch
 from torch.autograd import gradcheck, gradgradcheck
 
 from builders import stencil_of_cloud
-from torchlb import InputError, LaplaceBeltrami, collate
+from torchlb import InputError, LaplaceBeltrami, collate, load_or_build
 from torchlb.operator.storage import BASIS
 from torchlb.surfaces import (
     Circle,
@@ -456,6 +457,42 @@ def test_collate_knows_rows_of_faces_and_edges_and_names_the_key_that_it_cannot_
 
 
 # Input
+
+
+def test_positions_that_require_gradients_are_told_once_a_build(tmp_path):
+    """∂/∂v Σ Δ_ij v_j is Δᵀ1 alone: the operator is a constant, and the warning says so; f may require gradients."""
+    vertices, faces = Sphere().mesh(60)
+    vertices.requires_grad_()
+    builds = {
+        "points": [lambda v: LaplaceBeltrami.from_points(v, order=1)],
+        "vertices": [
+            lambda v: LaplaceBeltrami.from_mesh(v, faces, order=1),
+            lambda v: LaplaceBeltrami.from_cotangent(v, faces),
+            lambda v: load_or_build(v, faces, cache=tmp_path, order=1),
+            lambda v: load_or_build(v, faces, cache=tmp_path, order=1),  # out of the cache
+        ],
+    }
+    for name, calls in builds.items():
+        for build in calls:
+            with pytest.warns(
+                UserWarning, match=rf"{name}: they require .* pass {name}\.detach"
+            ) as told:
+                lb = build(vertices)
+            assert sum("require gradients" in str(warning.message) for warning in told) == 1
+            with warnings.catch_warnings():
+                warnings.simplefilter("error")
+                warnings.filterwarnings("ignore", "Sparse")
+                build(vertices.detach())
+                with torch.no_grad():
+                    build(vertices)
+            (gradient,) = torch.autograd.grad(lb(vertices).sum(), vertices)
+            ones = torch.ones(60, 3, dtype=torch.float64)
+            torch.testing.assert_close(gradient, torch.from_numpy(lb.to_scipy().T @ ones.numpy()))
+
+
+def test_a_constructor_with_arguments_names_the_builders():
+    with pytest.raises(TypeError, match=r"from_mesh\(vertices, faces\)"):
+        LaplaceBeltrami(*Sphere().mesh(60))
 
 
 def test_arrays_lists_and_integers_are_points():

@@ -495,3 +495,10 @@ def test_complex_functions_are_refused():
     lb = BUILDERS["pair"]()
     with pytest.raises(InputError, match="real f"):
         poisson_solve(lb, torch.complex(lb.mass, lb.mass))
+
+
+def test_swapped_arguments_are_named(unchecked):
+    lb = LaplaceBeltrami.from_mesh(*Sphere().mesh(60), order=1)
+    for function in (heat_flow, implicit_step):
+        with pytest.raises(TypeError, match=r"expected an operator, got a Tensor .* \(lb, f\)"):
+            function(lb.mass, lb, 0.1)

@@ -72,7 +72,7 @@ def get_operators(
 
     Parameters
     ----------
-    verts : (V, 3) tensor, ℓ; detached if it requires a gradient.
+    verts : (V, 3) tensor, ℓ; the results are constants, as a warning says if it requires a gradient.
     faces : (F, 3) tensor; None or empty for a point cloud.
     k_eig : number of eigenpairs, 0 for none.
     op_cache_dir : folder of a cache (`load_or_build`), or None.
@@ -96,7 +96,7 @@ def get_operators(
         arguments.setdefault("certify", True)
     if cloud and normals is not None:
         arguments["normals"] = normals
-    double = verts.detach().double()
+    double = verts.double()
     if op_cache_dir is None:
         lb = build_operator(double, None if cloud else faces, **arguments)
     else:

@@ -10,6 +10,7 @@ Shapes get theirs once, then loaders batch them::
 from __future__ import annotations
 
 import json
+import zlib
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Literal
@@ -18,11 +19,18 @@ import torch
 from jaxtyping import Int
 from torch import Tensor
 from torch.nn.functional import pad
-from torch_geometric.data import Batch, Data
-from torch_geometric.data.datapipes import functional_transform
-from torch_geometric.transforms import BaseTransform
 
-from torchlb.errors import InputError, TorchlbError, warn
+try:
+    from torch_geometric.data import Batch, Data
+    from torch_geometric.data.datapipes import functional_transform
+    from torch_geometric.transforms import BaseTransform
+except ModuleNotFoundError as error:
+    raise ModuleNotFoundError(
+        f"torchlb.interop.pyg needs PyTorch Geometric, pip install torch_geometric ({error})",
+        name=error.name,
+    ) from error
+
+from torchlb.errors import InputError, TorchlbError, first_few, warn
 from torchlb.io.cache import load_or_build
 from torchlb.operator.batching import join_states
 from torchlb.operator.dispatch import Operator, build_operator
@@ -57,6 +65,8 @@ class LaplaceBeltramiTransform(BaseTransform):
     lb_weak_values     (nnz, 3)     stiffness, mass matrix, mass matrix of the boundary
     lb_linear_…                     the same of the linear pair
     lb_basis           (…,)         with k > 0: all parts of the eigenbasis in one vector, for `to_operator`
+    lb_nodes           (N,)         lb_first and the numbers after it: nodes that are permuted take theirs along
+    lb_first           (1,)         checksum of the positions
     lb_basis_size      (1, 2)       number of eigenpairs, and their `KINDS`
     lb_info            str          source, options, certificate, bounds as JSON
     =================  ===========  ============================================================================
@@ -139,6 +149,7 @@ def _keys(lb: LaplaceBeltrami, k: int) -> dict[str, Any]:
     """What is stored in the data of one shape."""
     row = torch.arange(lb.num_points).repeat_interleave(lb.crow.diff())
     closed = torch.zeros(lb.num_points, dtype=torch.bool)
+    first = zlib.crc32(lb.points.cpu().numpy().tobytes())
     keys: dict[str, Any] = {
         "lb_edge_index": torch.stack([lb.col, row]),
         "lb_values": lb.values,
@@ -147,6 +158,8 @@ def _keys(lb: LaplaceBeltrami, k: int) -> dict[str, Any]:
         "lb_mass": lb.mass,
         "lb_frames": lb.frames,
         "lb_pos": lb.points,
+        "lb_nodes": torch.arange(first, first + lb.num_points),
+        "lb_first": torch.tensor([first]),
         "lb_face_index": lb.faces.T.contiguous(),
         "lb_boundary": closed if lb.boundary is None else lb.boundary,
         "lb_info": json.dumps(lb.get_extra_state()),
@@ -176,7 +189,8 @@ def to_operator(data: Any) -> LaplaceBeltrami:
 
     Raises
     ------
-    ValueError : for data without the keys, or whose `pos` was changed since by more than a translation.
+    ValueError : for data without the keys, whose `pos` was changed since by more than a translation, or whose nodes
+        were put into another order, since transforms permute nodes, not matrices.
     """
     if "lb_edge_index" not in data:
         raise InputError(f"expected data that went through LaplaceBeltramiTransform, got {data}")
@@ -231,7 +245,7 @@ def _buffers(data: Any, sizes: Int[Tensor, " S"]) -> dict[str, Tensor]:
 
 
 def _check_unchanged(data: Any, sizes: Int[Tensor, " S"]) -> None:
-    """ValueError unless `pos` is what the operator was built from, but for a translation of each shape."""
+    """ValueError unless `pos` is what the operator was built from, in its order, but for a translation of a shape."""
     built, pos = data.lb_pos, data.pos
     count = max(len(built), int(data.lb_edge_index.max()) + 1)  # some transforms sample every key
     if not len(pos) == int(sizes.sum()) == count:
@@ -239,6 +253,16 @@ def _check_unchanged(data: Any, sizes: Int[Tensor, " S"]) -> None:
             f"{len(pos)} points, but an operator of {count}: nodes were added or taken away after "
             "LaplaceBeltramiTransform; apply it last"
         )
+    if "lb_nodes" in data:  # data of torchlb 0.2 have none
+        before = sizes.cumsum(0) - sizes
+        number = torch.arange(len(pos), device=before.device) - before.repeat_interleave(sizes)
+        expected = data.lb_first.repeat_interleave(sizes) + number
+        astray = (data.lb_nodes != expected).nonzero()[:, 0]
+        if len(astray):
+            raise InputError(
+                f"pos: {len(astray)} of {len(pos)} points ({first_few(astray)}) are in another order since "
+                "LaplaceBeltramiTransform, and its matrices are not; permute or sample first, and apply it last"
+            )
     moved = (pos - built).split(sizes.tolist())
     by = max((float((d - d[:1]).abs().max()) for d in moved if len(d)), default=0.0)
     scale = max(float(pos.abs().max()), float(built.abs().max())) if len(pos) else 0.0

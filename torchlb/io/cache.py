@@ -21,7 +21,7 @@ from torch import Tensor
 
 from torchlb.errors import CacheWarning, InputError, OperatorFileError, warn
 from torchlb.operator.dispatch import Operator, build_operator, builder_of, complete_options
-from torchlb.operator.inputs import ArrayLike, as_tensor, float_type
+from torchlb.operator.inputs import ArrayLike, as_tensor, float_type, warn_of_gradients
 from torchlb.operator.laplace_beltrami import LaplaceBeltrami
 from torchlb.version import __version__
 
@@ -72,6 +72,7 @@ def load_or_build(
     >>> torch.equal(first.values, again.values)
     True
     """
+    warn_of_gradients(vertices, "vertices")
     builder, points, corners = builder_of(vertices, faces, operator)
     options = complete_options(builder, options)
     key = _key(operator, points, corners, options)

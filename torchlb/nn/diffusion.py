@@ -72,8 +72,8 @@ def heat_flow(
     >>> bool(torch.allclose(heat_flow(lb, theta.cos(), 0.5), math.exp(-0.5) * theta.cos(), atol=1e-2))
     True
     """
-    method = checked_method(method or ("contour" if lb.has_weak_form else "deflated"))
     x = as_columns(f, lb)
+    method = checked_method(method or ("contour" if lb.has_weak_form else "deflated"))
     dtype = compute_dtype(x, lb.values)
     time = as_times(t, x, dtype)
     with torch.autocast(x.device.type, enabled=False):

@@ -11,7 +11,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from torchlb.errors import InputError, first_few
+from torchlb.errors import InputError, first_few, warn
 
 ArrayLike = Tensor | np.ndarray | Sequence[Any]
 """What becomes a tensor."""
@@ -28,6 +28,15 @@ def float_type(values: ArrayLike) -> torch.dtype:
     """Floating type of the input, and of what is computed from it; torch's default for integers."""
     dtype = as_tensor(values).dtype
     return dtype if dtype.is_floating_point else torch.get_default_dtype()
+
+
+def warn_of_gradients(points: ArrayLike, what: str) -> None:
+    """UserWarning for positions that require a gradient, which an operator, a constant, does not hand on to them."""
+    if isinstance(points, Tensor) and points.requires_grad and torch.is_grad_enabled():
+        warn(
+            f"{what}: they require gradients, but an operator is a constant of what is computed with it, so that the "
+            f"gradients of results lack all that comes by the geometry; pass {what}.detach() if that is meant"
+        )
 
 
 def check_points(points: ArrayLike, what: str = "points") -> Float[Tensor, "N n"]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Literal
+from typing import Any, Literal
 
 import torch
 
@@ -18,7 +18,7 @@ from torchlb.operator.batching import (
     remember_shapes,
     split_buffers,
 )
-from torchlb.operator.inputs import ArrayLike, float_type
+from torchlb.operator.inputs import ArrayLike, float_type, warn_of_gradients
 from torchlb.operator.stencil_face import StencilFace
 from torchlb.operator.storage import FIT_FIELDS, REPORT_FIELDS
 from torchlb.operator.weak_face import WeakFace
@@ -58,6 +58,14 @@ class LaplaceBeltrami(StencilFace, WeakFace):
     True
     """
 
+    def __init__(self, *given: Any) -> None:
+        if given:
+            raise TypeError(
+                "LaplaceBeltrami() takes no arguments; an operator is built by LaplaceBeltrami.from_mesh(vertices, "
+                "faces), from_points(points) or from_cotangent(vertices, faces)"
+            )
+        super().__init__()
+
     @classmethod
     def from_points(
         cls,
@@ -81,7 +89,7 @@ class LaplaceBeltrami(StencilFace, WeakFace):
         Parameters
         ----------
         points : (N, n) tensor or array, length ℓ, without duplicates. Computed in float64 on the CPU, without
-            gradients; the result has the floating type of the points.
+            gradients, as a warning says where they are required; the result has the floating type of the points.
         dim : d of the manifold; n − 1 by default. Curves, surfaces in R⁴, S³ in R⁴ take the same path.
         order : p ≥ 1 of the Laplacian: the error falls like h^p.
         normal_order : q of the tangent frames, p + 1 by default; 0 keeps the initial ones (or those of `normals`).
@@ -110,6 +118,7 @@ class LaplaceBeltrami(StencilFace, WeakFace):
         options = build.Options(
             order, normal_order, projection, weights, num_neighbors, condition, weak_form, certify
         )
+        warn_of_gradients(points, "points")
         with torch.inference_mode(False):  # what is kept serves a training, too
             built = build.build_cloud(
                 points, dim, options, normals=normals, boundary=boundary, progress=progress
@@ -153,6 +162,7 @@ class LaplaceBeltrami(StencilFace, WeakFace):
         options = build.Options(
             order, normal_order, projection, weights, num_neighbors, condition, weak_form, certify
         )
+        warn_of_gradients(vertices, "vertices")
         with torch.inference_mode(False):
             built = build.build_mesh(vertices, faces, options, boundary=boundary, progress=progress)
             return cls._from_assembled(built, vertices)
@@ -168,6 +178,7 @@ class LaplaceBeltrami(StencilFace, WeakFace):
         Its gradient is the first-order fit to the vertices around each point, and ∂_ν f = 0 at a boundary.
         Raises InputError for bad input and for vertices without area.
         """
+        warn_of_gradients(vertices, "vertices")
         with torch.inference_mode(False):
             return cls._from_assembled(build.build_cotangent(vertices, faces), vertices)
 
