@@ -12,12 +12,9 @@ from pathlib import Path
 
 import matplotlib.pyplot as plt
 import mesh_independent_modes
-import numpy as np
-import torch
-import trimesh
 from _common import cortex
 
-from torchlb import LaplaceBeltrami, clean_mesh
+from torchlb import LaplaceBeltrami, clean_mesh, read_shape
 from torchlb.plot import plot_orders, plot_points, plot_surface
 from torchlb.surfaces import smooth_function
 
@@ -28,29 +25,16 @@ def read(path):
     """Vertices, faces (None for a cloud), name and unit of a file; ValueError if it is not a surface or cloud."""
     if not path.is_file():
         raise ValueError(f"{path}: no such file")
-    try:
-        shape = trimesh.load(path, process=False)
-        if isinstance(shape, trimesh.Scene):
-            shape = trimesh.util.concatenate(shape.dump())
-        vertices = torch.tensor(np.array(shape.vertices, dtype=np.float64))
-        if len(vertices) == 0:
-            raise ValueError("it has no vertices")
-        faces = torch.tensor(np.array(getattr(shape, "faces", [])), dtype=torch.int64)
-    except Exception as error:  # each reader of trimesh has its own
-        raise ValueError(
-            f"{path}: not a file that trimesh reads as a mesh or cloud, such as .ply, .obj, .off, .stl ({error})"
-        ) from error
-    places, merged = torch.unique(vertices, dim=0, return_inverse=True)
-    if len(places) < len(vertices):
-        print(f"{len(vertices) - len(places)} vertices share a place with another and are merged")
-        vertices, faces = places, merged[faces]
-    if len(faces) == 0:
+    vertices, faces = read_shape(path)
+    if faces is None:
         print(f"{path.name} has no faces: it is taken for a cloud")
         return vertices, None, path.name, ""
     count = len(vertices)
-    vertices, faces, kept = clean_mesh(vertices, faces)
+    vertices, faces, kept = clean_mesh(vertices, faces, merge=True)
     if len(kept) < count:
-        print(f"{count - len(kept)} vertices belong to no face and are left out (clean_mesh)")
+        print(
+            f"{count - len(kept)} vertices share a place or belong to no face: left out (clean_mesh)"
+        )
     return vertices, faces, path.name, ""
 
 
@@ -91,7 +75,9 @@ def draw_reached(vertices, faces, lb, ax, view):
 
 def main(arguments=None):
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--mesh", type=Path, help="a mesh or cloud, any file that trimesh reads")
+    parser.add_argument(
+        "--mesh", type=Path, help="a mesh or cloud, any file that torchlb.read_shape reads"
+    )
     parser.add_argument("--order", type=int, default=3, help="order of accuracy (default: 3)")
     parser.add_argument("--output", type=Path, default=Path("demo_output"), help="for the pictures")
     options = parser.parse_args(arguments)

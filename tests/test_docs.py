@@ -10,9 +10,9 @@ from pathlib import Path
 
 import pytest
 import torch
+import trimesh
 
 import torchlb
-import torchlb.interop.trimesh
 from torchlb import DiffusionNet, LaplaceBeltrami
 from torchlb.surfaces import Circle, Sphere, UnitDisk
 
@@ -27,10 +27,23 @@ def test_the_code_of_a_page_runs_from_top_to_bottom(page, tmp_path, monkeypatch)
     monkeypatch.chdir(tmp_path)
     names = {"__name__": "__main__"}
     text = page.read_text("utf-8")
+    trimesh.Trimesh(VERTICES.numpy(), FACES.numpy(), process=False).export("my.ply")
     for found in CODE.finditer(text):
         line = text.count("\n", 0, found.start()) + 1
-        code = compile("\n" * line + found.group(1), str(page), "exec")
+        shown = found.group(1).replace(
+            "\n# yours: ", "\n"
+        )  # what a user may write instead runs, too
+        code = compile("\n" * line + shown, str(page), "exec")
         exec(code, names)
+
+
+def test_what_a_user_may_write_instead_is_shown():
+    """README's first lines of code, after its own imports alone; `torchlb.interop` needs no import of its own."""
+    first = CODE.search(PAGES[0].read_text("utf-8")).group(1)
+    assert '\n# yours: vertices, faces = read_shape("my.ply")' in first
+    program = "import torchlb; print(torchlb.interop.trimesh.to_trimesh, torchlb.plot.plot_surface)"
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
+    assert done.stdout.count("function") == 2, done.stderr
 
 
 def test_pages_with_code_are_found():

@@ -73,7 +73,35 @@ def test_a_folder_of_meshes_and_clouds(tmp_path):
     found = load_or_build(VERTICES, FACES, cache=out, order=1)
     assert operators_in(out) == before
     assert torch.equal(found.values, load_operator(report.files["mesh.npz"]).values)
-    assert str(report) == "4 shapes, 4 built, 0 cached, 0 failed"
+    counts, skipped = str(report).splitlines()
+    assert counts == "4 shapes, 4 built, 0 cached, 0 failed"
+    assert skipped == "skipped, as no meshes or tables of points: 1 .txt"
+    assert report.skipped == ("notes.txt",)
+
+
+def test_clouds_are_cleaned_whatever_their_file(tmp_path):
+    """A point twice in each; labels and pictures beside them are counted, not read."""
+    folder, out = tmp_path / "shapes", tmp_path / "out"
+    folder.mkdir()
+    points = np.r_[VERTICES.numpy(), VERTICES.numpy()[:3]]
+    names = ["a.txt", "b.csv", "c.pts", "d.xyz", "e.asc"]
+    for i, name in enumerate(names):
+        delimiter = "," if name == "b.csv" else " "
+        np.savetxt(folder / name, (1 + i) * points, delimiter=delimiter)
+    head = "FIELDS x y z\nSIZE 8 8 8\nTYPE F F F\nCOUNT 1 1 1\nPOINTS 103\nDATA binary\n"
+    (folder / "f.pcd").write_bytes(head.encode() + (9 * points).tobytes())
+    np.save(folder / "g.npy", 10 * points)
+    np.savetxt(folder / "labels.txt", np.arange(103), fmt="%d")
+    (folder / "names.csv").write_text("name,label\nsphere,1\n")
+    (folder / "picture.png").write_bytes(b"\x89PNG")
+    report = precompute_operators(folder, out, workers=1, clean=True, **OPTIONS)
+    assert [result.name for result in report.results] == [*names, "f.pcd", "g.npy"]
+    assert {(result.status, result.points) for result in report.results} == {("built", 100)}
+    assert report.skipped == ("labels.txt", "names.csv", "picture.png")
+    assert str(report).endswith("no meshes or tables of points: 1 .csv, 1 .png, 1 .txt")
+    raw = precompute_operators(folder, out, workers=1, **OPTIONS)
+    assert all("torchlb.clean_points(points)" in result.message for result in raw.failed)
+    assert len(raw.failed) == 7
 
 
 def test_a_bad_shape_is_named_and_stops_no_other(tmp_path):

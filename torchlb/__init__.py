@@ -7,6 +7,9 @@ all; `nn`, solves and layers that take it as an argument; `io` and `interop`, fi
 shapes with exact answers.
 """
 
+from importlib import import_module
+from typing import Any
+
 from torchlb import surfaces
 from torchlb.errors import (
     CacheWarning,
@@ -20,6 +23,7 @@ from torchlb.errors import (
     TorchlbError,
 )
 from torchlb.io.cache import load_operator, load_or_build, operator_key, save_operator
+from torchlb.io.files import read_shape
 from torchlb.io.precompute import PrecomputeReport, ShapeResult, precompute_operators
 from torchlb.nn.diffusion import Diffusion, heat_flow
 from torchlb.nn.diffusion_net import DiffusionNet, DiffusionNetBlock
@@ -83,8 +87,16 @@ __all__ = [
     "operator_key",
     "poisson_solve",
     "precompute_operators",
+    "read_shape",
     "save_operator",
     "spectral_wavelets",
     "surfaces",
     "wave_kernel_signature",
 ]
+
+
+def __getattr__(name: str) -> Any:
+    """`torchlb.interop` and `torchlb.plot`, loaded when they are asked for."""
+    if name in ("interop", "plot"):
+        return import_module(f"torchlb.{name}")
+    raise AttributeError(f"module 'torchlb' has no attribute {name!r}")

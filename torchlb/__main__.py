@@ -22,7 +22,7 @@ from torchlb.geometry.frames import Projection
 from torchlb.io.cache import describe_file
 from torchlb.io.files import read_shape
 from torchlb.io.precompute import concerns_the_shape, precompute_operators
-from torchlb.operator.cleaning import clean_mesh
+from torchlb.operator.cleaning import clean_mesh, cleaned
 from torchlb.operator.dispatch import Operator, build_operator
 from torchlb.operator.laplace_beltrami import LaplaceBeltrami
 from torchlb.plot.comparison import draw_comparison, spectra, spectrum_table
@@ -77,7 +77,9 @@ def _stencil_options(command: Callable[..., Any]) -> Callable[..., Any]:
             default=None,
             help="Prove the stencil stable; by default where there is no weak pair.",
         ),
-        click.option("--clean", is_flag=True, help="Leave out vertices that belong to no face."),
+        click.option(
+            "--clean", is_flag=True, help="Leave out vertices of no face, and points twice."
+        ),
     ):
         command = option(command)
     return command
@@ -113,7 +115,8 @@ def main() -> None:
 def compare(mesh: Path, k: int, out: Path | None, clean: bool, **options: Any) -> None:
     """Report, stability and spectrum of MESH beside the cotangent operator's, and a picture.
 
-    MESH is a mesh or point cloud (.ply .obj .off .stl .glb .xyz .npy .npz). A cloud has no cotangent operator.
+    MESH is a mesh (.ply .obj .off .stl .glb .npz) or a point cloud (.ply .pcd .xyz .txt .csv .npy .npz). A cloud has no
+    cotangent operator.
 
     \b
     Examples:
@@ -121,8 +124,8 @@ def compare(mesh: Path, k: int, out: Path | None, clean: bool, **options: Any) -
       python -m torchlb compare scan.xyz --order 2 -k 50 --out scan.png
     """
     vertices, faces = read_shape(mesh)
-    if clean and faces is not None:
-        vertices, faces, _ = clean_mesh(vertices, faces)
+    if clean:
+        vertices, faces = cleaned(vertices, faces)
     start = time.perf_counter()
     lb = build_operator(vertices, faces, **options)
     click.echo(f"{mesh.name}: {_size(vertices, faces)}\n{lb}")

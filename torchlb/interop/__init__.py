@@ -2,5 +2,16 @@
 
 `trimesh`: shapes from files and back. `conventions`: signs, factors and masses of igl, potpourri3d, LaPy and PyG.
 `pyg`: PyTorch Geometric's data, batches and loaders. `diffusion_net`: the operators that DiffusionNet code expects.
-Import the one you need; each needs its own library.
+Each needs its own library, and is loaded when it is asked for.
 """
+
+from importlib import import_module
+from typing import Any
+
+MODULES = ("conventions", "diffusion_net", "pyg", "trimesh")
+
+
+def __getattr__(name: str) -> Any:
+    if name in MODULES:
+        return import_module(f"torchlb.interop.{name}")
+    raise AttributeError(f"module 'torchlb.interop' has no attribute {name!r}")

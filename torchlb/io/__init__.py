@@ -1,5 +1,5 @@
 """Shapes and operators on disk.
 
-`files`: meshes and clouds from files. `cache`: operators, found by what they were computed from. `precompute`: a data
-set at once, in parallel.
+`files`: meshes and clouds from files. `formats`: those that are read here. `cache`: operators, found by what they were
+computed from. `precompute`: a data set at once, in parallel.
 """

@@ -1,4 +1,4 @@
-"""Shapes from files: meshes through trimesh, arrays through NumPy."""
+"""Shapes from files: polygons and points by `formats`, .stl and .glb through trimesh, arrays through NumPy."""
 
 from __future__ import annotations
 
@@ -11,10 +11,14 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from torchlb.errors import InputError
+from torchlb.io.formats import READERS, begins_with_points
+from torchlb.operator.cleaning import merged, proper_faces, triangles_of
 from torchlb.operator.inputs import as_tensor
 
-SUFFIXES = (".glb", ".gltf", ".npy", ".npz", ".obj", ".off", ".ply", ".stl", ".xyz")
+SUFFIXES = tuple(sorted([".glb", ".gltf", ".npy", ".npz", ".stl", *READERS]))
 """Of files that `read_shape` takes."""
+STEPS = 4
+"""Of single precision at the largest coordinate, by which corners of an .stl that are one vertex may differ."""
 Shape = tuple[Float[Tensor, "N n"], Int[Tensor, "F v"] | None]
 
 
@@ -36,9 +40,11 @@ def read_shape(path: str | Path) -> Shape:
 
     Parameters
     ----------
-    path : a mesh or cloud that trimesh reads (.ply, .obj, .off, .stl, .glb, .gltf, .xyz); an array (N, n) of points in
-        .npy; or a .npz with `vertices` (or `points`, or `pos`) and, for a mesh, `faces`. The corners of an .stl, which
-        has no vertices, are merged where they coincide; nothing else is changed.
+    path : a mesh (.ply, .obj, .off, .stl, .glb, .gltf), whose polygons are split into triangles, along the shorter
+        diagonal of a quad; without faces it is a cloud. A cloud in .pcd, or a table of numbers (.xyz, .txt, .csv, .pts,
+        .asc) with the coordinates in the columns x, y, z, or in the first three. An array (N, n) of points in .npy; or
+        a .npz with `vertices` (or `points`, or `pos`) and, for a mesh, `faces`. The corners of an .stl, which has no
+        vertices, are merged where they coincide, and along open edges where they differ by rounding.
 
     Raises
     ------
@@ -54,6 +60,8 @@ def read_shape(path: str | Path) -> Shape:
             vertices, faces = as_tensor(np.load(path, allow_pickle=False)), None
         elif suffix == ".npz":
             vertices, faces = _npz(path)
+        elif suffix in READERS:
+            vertices, faces = _triangulated(*READERS[suffix](path))
         else:
             import trimesh
 
@@ -66,9 +74,57 @@ def read_shape(path: str | Path) -> Shape:
             f"{path}: not a mesh or cloud that can be read; {', '.join(SUFFIXES)} can ({error})"
         ) from error
     if suffix == ".stl" and faces is not None:
-        vertices, merged = torch.unique(vertices, dim=0, return_inverse=True)
-        faces = merged[faces]
+        vertices, faces = _sewn(vertices, faces)
     return vertices.double(), faces
+
+
+def may_be_shape(path: Path) -> bool:
+    """Whether a file is taken for a shape, by its ending; .txt and .csv by the numbers in their first row."""
+    suffix = path.suffix.lower()
+    return begins_with_points(path) if suffix in (".csv", ".txt") else suffix in SUFFIXES
+
+
+def _triangulated(
+    vertices: Float[np.ndarray, "N n"], corners: Int[np.ndarray, " C"], sizes: Int[np.ndarray, " P"]
+) -> Shape:
+    """With polygons as triangles, in their order; what has less than three corners is left out."""
+    places, every = torch.from_numpy(vertices), torch.from_numpy(corners)
+    bad = corners[(corners < 0) | (corners >= len(vertices))]
+    if len(bad):
+        raise InputError(f"faces have a corner {bad[0]}, and there are {len(vertices)} vertices")
+    starts, parts, owners = np.cumsum(sizes) - sizes, [], []
+    for size in np.unique(sizes[sizes > 2]).tolist():
+        chosen = np.flatnonzero(sizes == size)
+        polygons = every[torch.from_numpy(starts[chosen][:, None] + np.arange(size))]
+        parts.append(polygons[:, None] if size == 3 else triangles_of(places, polygons))
+        owners.append(torch.from_numpy(chosen).repeat_interleave(size - 2))
+    if not parts:
+        return places, None
+    order = torch.cat(owners).argsort(stable=True)
+    return places, torch.cat([part.flatten(0, 1) for part in parts])[order]
+
+
+def _sewn(vertices: Float[Tensor, "N 3"], faces: Int[Tensor, "F 3"]) -> tuple[Tensor, Tensor]:
+    """The corners of triangles as vertices: equal ones are one, and at open edges those that differ by rounding.
+
+    An open edge is that of one triangle, and the ends of an edge stay two. So no vertices of a closed mesh are merged,
+    however fine it is.
+    """
+    vertices, number = torch.unique(vertices, dim=0, return_inverse=True)
+    faces = number[faces]
+    proper = proper_faces(faces)
+    edges = torch.cat([proper[:, [a, a - 1]] for a in range(3)]).sort(1).values
+    edges, count = torch.unique(edges, dim=0, return_counts=True)
+    rim = torch.unique(edges[count == 1])
+    if len(rim) == 0:
+        return vertices, faces
+    place = torch.full((len(vertices),), -1).index_put((rim,), torch.arange(len(rim)))
+    between = place[edges]
+    reach = STEPS * torch.finfo(torch.float32).eps * float(vertices.abs().max())
+    one = torch.arange(len(vertices))
+    one[rim] = rim[merged(vertices[rim], reach, between[(between >= 0).all(1)])]
+    kept, number = torch.unique(one, return_inverse=True)
+    return vertices[kept], number[faces]
 
 
 def _npz(path: Path) -> Shape:

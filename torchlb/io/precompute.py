@@ -13,6 +13,7 @@ import os
 import time
 import uuid
 import warnings
+from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
@@ -23,8 +24,8 @@ from tqdm import tqdm
 
 from torchlb.errors import InputError
 from torchlb.io.cache import load_or_build, operator_key
-from torchlb.io.files import SUFFIXES, read_shape
-from torchlb.operator.cleaning import clean_mesh
+from torchlb.io.files import SUFFIXES, may_be_shape, read_shape
+from torchlb.operator.cleaning import cleaned
 from torchlb.operator.dispatch import Operator, check_options_of
 
 TABLE = "precompute.csv"
@@ -57,9 +58,16 @@ class ShapeResult:
 
 @dataclass(frozen=True)
 class PrecomputeReport:
-    """What became of every shape, in the order given. `print` it for the counts and a table of failures."""
+    """What became of every shape, in the order given. `print` it for the counts and a table of failures.
+
+    Attributes
+    ----------
+    results : one for each shape.
+    skipped : files of the folder that are no shapes, by their endings or, of .txt and .csv, by their first lines.
+    """
 
     results: tuple[ShapeResult, ...]
+    skipped: tuple[str, ...] = ()
 
     @property
     def failed(self) -> tuple[ShapeResult, ...]:
@@ -86,6 +94,10 @@ class PrecomputeReport:
             width = max((len(result.name) for result in chosen), default=0)
             lines += [title] if chosen else []
             lines += [f"  {r.name:<{width}}  {' '.join(r.message.split())}" for r in chosen]
+        if self.skipped:
+            endings = Counter(Path(name).suffix or name for name in self.skipped)
+            kinds = ", ".join(f"{number} {ending}" for ending, number in sorted(endings.items()))
+            lines.append(f"skipped, as no meshes or tables of points: {kinds}")
         return "\n".join(lines)
 
 
@@ -117,13 +129,14 @@ def precompute_operators(
 
     Parameters
     ----------
-    shapes : a folder, searched in depth for files that `torchlb.interop.trimesh.read_shape` takes; or a list of files
-        or of (vertices, faces) pairs, faces None for a cloud.
+    shapes : a folder, searched in depth for files that `torchlb.read_shape` takes, of .txt and .csv those whose rows
+        have three numbers or more; or a list of files or of (vertices, faces) pairs, faces None for a cloud.
     out : folder of the cache. ``load_or_build(vertices, faces, cache=out, …)`` with the same options finds the entries.
     operator, k : as for `load_or_build`.
     workers : processes, each with one thread; −1 for one per core. Within ``joblib.parallel_config(backend="dask")``
         the workers are those of the Dask client.
-    clean : whether meshes go through `clean_mesh` first; the data set then has to do the same.
+    clean : whether meshes go through `clean_mesh` first, and clouds through `clean_points`; the data set then has to do
+        the same.
     progress : whether to show a bar, on a terminal.
     **options : of `LaplaceBeltrami.from_mesh` or `from_points`.
 
@@ -137,9 +150,10 @@ def precompute_operators(
     """
     check_options_of(operator, options)
     cache = Path(out).expanduser()
+    sources, skipped = _sources(shapes, cache)
     tasks = [
         _Task(name, source, str(cache.resolve()), operator, k, clean, options)
-        for name, source in _sources(shapes, cache)
+        for name, source in sources
     ]
     cache.mkdir(parents=True, exist_ok=True)
     _remove_stale(cache)
@@ -151,30 +165,32 @@ def precompute_operators(
                 bar.set_postfix(failed=sum(r.status == "failed" for r in results.values()))
                 bar.update()
     finally:
-        report = PrecomputeReport(tuple(results[i] for i in sorted(results)))
+        report = PrecomputeReport(tuple(results[i] for i in sorted(results)), skipped)
         _write_table(report, cache / TABLE)
     return report
 
 
-def _sources(shapes: str | Path | Iterable[Any], cache: Path) -> list[tuple[str, Any]]:
-    """Name and file, or arrays, of every shape."""
+def _sources(
+    shapes: str | Path | Iterable[Any], cache: Path
+) -> tuple[list[tuple[str, Any]], tuple[str, ...]]:
+    """Name and file, or arrays, of every shape; and the names of files in the folder that are none."""
     if isinstance(shapes, str | Path):
         folder = Path(shapes).expanduser()
         if not folder.is_dir():
             raise InputError(
                 f"{folder}: no such folder; give a folder, or a list of files or of arrays"
             )
-        found = [
-            path
+        files = [
+            (str(path.relative_to(folder)), path.resolve())
             for path in sorted(folder.rglob("*"))
-            if path.suffix.lower() in SUFFIXES
-            and path.is_file()
+            if path.is_file()
             and not path.name.startswith(".")
             and cache.resolve() not in path.resolve().parents
         ]
+        found = [file for file in files if may_be_shape(file[1])]
         if not found:
             raise InputError(f"{folder}: no shapes in it; they end in {', '.join(SUFFIXES)}")
-        return [(str(path.relative_to(folder)), path.resolve()) for path in found]
+        return found, tuple(name for name, path in files if (name, path) not in found)
     named = []
     for i, shape in enumerate(shapes):
         if isinstance(shape, str | Path):
@@ -185,7 +201,7 @@ def _sources(shapes: str | Path | Iterable[Any], cache: Path) -> list[tuple[str,
             raise InputError(f"shape {i}: expected a file or (vertices, faces), got {type(shape)}")
     if not named:
         raise InputError("shapes: got none")
-    return named
+    return named, ()
 
 
 def _run(tasks: Sequence[_Task], workers: int) -> Iterator[tuple[int, ShapeResult]]:
@@ -256,8 +272,8 @@ def concerns_the_shape(warning: Warning | str) -> bool:
 
 def _stored(task: _Task, vertices: Any, faces: Any) -> tuple[str, int, str]:
     """Status, number of points and file of one shape, whose operator is in the cache then."""
-    if task.clean and faces is not None:
-        vertices, faces, _ = clean_mesh(vertices, faces)
+    if task.clean:
+        vertices, faces = cleaned(vertices, faces)
     key = operator_key(vertices, faces, operator=task.operator, **task.options)
     path = Path(task.cache) / f"{key}.npz"
     before = _identity(path)

@@ -132,7 +132,7 @@ def mended_faces(vertices: Float[Tensor, "N n"], faces: Int[Tensor, "F v"]) -> I
         if len(none):
             raise InputError(
                 f"faces: {len(none)} segments ({first_few(none)}) have no length, their ends share a place; make one "
-                "vertex of the two"
+                "vertex of the two with vertices, faces, kept = torchlb.clean_mesh(vertices, faces, merge=True)"
             )
     first = first_of_each(faces)
     if not first.all():
@@ -155,7 +155,7 @@ def mended_faces(vertices: Float[Tensor, "N n"], faces: Int[Tensor, "F v"]) -> I
     if len(bad):
         warn(
             f"vertices: {len(bad)} share a place with another ({first_few(bad)}), so the mesh is cut open along them; "
-            "if it should not be, merge them first, for example with trimesh.Trimesh(vertices, faces).merge_vertices()"
+            "if it should not be, merge them: vertices, faces, kept = torchlb.clean_mesh(vertices, faces, merge=True)"
         )
     return faces
 

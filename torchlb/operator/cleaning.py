@@ -5,8 +5,11 @@ from __future__ import annotations
 import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
+from scipy import sparse
+from scipy.sparse import csgraph
 from scipy.spatial import KDTree
 from torch import Tensor
+from torch.nn.functional import pad
 
 from torchlb.geometry.manifold import edges_of, two_orientations
 from torchlb.operator.inputs import ArrayLike, as_tensor, check_corners, check_points
@@ -60,17 +63,21 @@ def clean_points(points: ArrayLike) -> tuple[Tensor, Tensor]:
     return points[kept], kept
 
 
-def clean_mesh(vertices: ArrayLike, faces: ArrayLike) -> tuple[Tensor, Tensor, Tensor]:
+def clean_mesh(
+    vertices: ArrayLike, faces: ArrayLike, *, merge: bool = False
+) -> tuple[Tensor, Tensor, Tensor]:
     """Mesh without unreferenced vertices and repeated faces, quads split into triangles, all wound alike.
 
     Faces that repeat a corner go, and all but the first of those with the same corners. Quads are split along the
-    shorter diagonal. Triangles are turned so that they agree with their neighbours, the fewer of each component; a
-    component with one side only, such as a Möbius band, stays as it is.
+    shorter diagonal that lies inside. Triangles are turned so that they agree with their neighbours, the fewer of each
+    component; a component with one side only, such as a Möbius band, stays as it is.
 
     Parameters
     ----------
     vertices : (N, n).
     faces : (F, 3) indices; (F, 4) for quads (or tetrahedra, which stay).
+    merge : whether of vertices in the same place, to rounding, the first stays and has the faces of the others: what
+        was cut open along them is closed.
 
     Returns
     -------
@@ -88,13 +95,22 @@ def clean_mesh(vertices: ArrayLike, faces: ArrayLike) -> tuple[Tensor, Tensor, T
     corners, faces = check_corners(faces, len(vertices)), as_tensor(faces)
     places = vertices.detach().cpu().double()
     if corners.shape[1] == 4 and are_quads(corners):
-        corners = _triangles(places, corners)
+        corners = triangles_of(places, corners).flatten(0, 1)
+    if merge:
+        corners = merged(places, COINCIDENT * float(places.abs().max()))[corners]
     corners = proper_faces(corners)
     corners = corners[first_of_each(corners)]
     corners = torch.where(turned_faces(corners)[:, None], corners.flip(1), corners)
     kept, renumbered = torch.unique(corners, return_inverse=True)
     kept = kept.to(vertices.device)
     return vertices[kept], renumbered.to(faces), kept
+
+
+def cleaned(vertices: ArrayLike, faces: ArrayLike | None) -> tuple[Tensor, Tensor | None]:
+    """Vertices and faces by `clean_mesh`, or by `clean_points` without faces."""
+    if faces is None or len(faces) == 0:
+        return clean_points(vertices)[0], None
+    return clean_mesh(vertices, faces)[:2]
 
 
 def proper_faces(faces: Int[Tensor, "F v"]) -> Int[Tensor, "G v"]:
@@ -125,11 +141,93 @@ def are_quads(faces: Int[Tensor, "F 4"]) -> bool:
     return 2 * int((count[number].view(4, -1) > 1).any(0).sum()) < max(len(faces), 1)
 
 
-def _triangles(vertices: Float[Tensor, "N n"], quads: Int[Tensor, "F 4"]) -> Int[Tensor, "G 3"]:
-    """Two triangles for every quad, along its shorter diagonal."""
-    a, b = ((vertices[quads[:, i]] - vertices[quads[:, i + 2]]).norm(dim=1) for i in (0, 1))
-    turned = torch.where((a <= b)[:, None], quads, quads.roll(-1, 1))
-    return torch.stack([turned[:, :3], turned[:, [0, 2, 3]]], 1).flatten(0, 1)
+def merged(
+    places: Float[Tensor, "N n"], reach: float, apart: Int[Tensor, "E 2"] | None = None
+) -> Int[Tensor, " N"]:
+    """Of each point the first of those that it is one with: chains of points with at most `reach` from one to the next.
+
+    Pairs of points `apart` are never made one, nor what a chain would join besides.
+
+    >>> merged(torch.tensor([[0.0], [2.0], [0.1]]), 0.2).tolist()
+    [0, 1, 0]
+    """
+    unique, number = np.unique(places.numpy(), axis=0, return_inverse=True)
+    number = number.reshape(-1)
+    near = KDTree(unique).query_pairs(reach, output_type="ndarray")
+    ones, shape = np.ones(len(near), dtype=bool), (len(unique), len(unique))
+    group = csgraph.connected_components(sparse.coo_array((ones, near.T), shape), directed=False)[1]
+    if apart is not None:
+        ends = number[apart.numpy()].T
+        torn = group[ends[0]][(group[ends[0]] == group[ends[1]]) & (ends[0] != ends[1])]
+        loose = np.isin(group, torn)
+        group[loose] = len(unique) + np.flatnonzero(loose)
+    _, first, back = np.unique(group[number], return_index=True, return_inverse=True)
+    return torch.from_numpy(first[back.reshape(-1)])
+
+
+def triangles_of(vertices: Float[Tensor, "N n"], polygons: Int[Tensor, "F c"]) -> Tensor:
+    """Triangles (F, c − 2, 3) of polygons with c corners each, in space or in the plane.
+
+    A fan from the corner whose longest diagonal is shortest among those from which all triangles face as the polygon
+    does; where there is none, as it is not star-shaped from a corner, ears are cut off.
+
+    >>> dart = torch.tensor([[0.0, 0.0], [1.0, 0.2], [0.0, 1.0], [0.4, 0.3]])
+    >>> triangles_of(dart, torch.tensor([[0, 1, 2, 3]])).tolist()
+    [[[1, 2, 3], [1, 3, 0]]]
+    """
+    count, size = polygons.shape
+    places = pad(vertices, (0, max(3 - vertices.shape[1], 0)))[:, :3][polygons]
+    offset = places - places[:, :1]
+    normal = torch.linalg.cross(offset, offset.roll(-1, 1)).sum(1, keepdim=True)
+    costs, diagonals = [], []
+    for start in range(size):
+        ray = (places.roll(-start, 1) - places[:, start, None])[:, 1:]
+        up = (torch.linalg.cross(ray[:, :-1], ray[:, 1:]) * normal).sum(-1)
+        length = ray[:, 1:-1].norm(dim=-1)
+        diagonals.append(length.amax(1) if size > 3 else length.sum(1))
+        costs.append(torch.where((up > 0).all(1), diagonals[-1], torch.inf))
+    cost = torch.stack(costs, 1)
+    none = cost.isinf().all(1)
+    if size == 4:  # without an area: by the shorter diagonal
+        cost, none = torch.where(none[:, None], torch.stack(diagonals, 1), cost), none & False
+    order = (cost.argmin(1, keepdim=True) + torch.arange(size)) % size
+    turned = polygons.gather(1, order)
+    first = turned[:, :1].expand(count, size - 2)
+    result = torch.stack([first, turned[:, 1:-1], turned[:, 2:]], -1)
+    for i in none.nonzero()[:, 0].tolist():
+        result[i] = polygons[i][_ears(places[i].numpy(), normal[i, 0].numpy())]
+    return result
+
+
+def _ears(corners: Float[np.ndarray, "c 3"], normal: Float[np.ndarray, " 3"]) -> Tensor:
+    """Triangles of a polygon: in turn a corner is cut off whose ear has no other corner in it, by the shortest cut.
+
+    G. H. Meisters, Polygons have ears, 1975.
+    """
+    axes = np.delete(np.arange(3), np.abs(normal).argmax())
+    flat = corners[:, axes]
+    if _left_of(flat[0], flat, np.roll(flat, -1, 0)).sum() < 0:
+        flat = flat[:, ::-1]
+    left, triangles = list(range(len(flat))), []
+    while len(left) > 3:
+        best, cut = torch.inf, 0
+        for k in range(len(left)):
+            a, b, c = (flat[left[(k + s) % len(left)]] for s in (-1, 0, 1))
+            others = flat[[i for i in left if not (flat[i] == (a, b, c)).all(1).any()]]
+            sides = np.stack([_left_of(p, q, others) for p, q in ((a, b), (b, c), (c, a))])
+            ear = _left_of(a, b, c[None])[0] > 0 and not (sides >= 0).all(0).any()
+            length = np.linalg.norm(c - a) * (1.0 if ear else 1e30)  # there is one but for rounding
+            if length < best:
+                best, cut = length, k
+        triangles.append([left[cut - 1], left[cut], left[(cut + 1) % len(left)]])
+        del left[cut]
+    return torch.tensor([*triangles, left])
+
+
+def _left_of(start: np.ndarray, end: np.ndarray, points: np.ndarray) -> np.ndarray:
+    """Twice the area of the triangles over an edge in the plane, positive on its left."""
+    (x, y), (u, v) = (end - start).T, (points - start).T
+    return x * v - y * u
 
 
 def turned_faces(faces: Int[Tensor, "F v"]) -> Bool[Tensor, " F"]:

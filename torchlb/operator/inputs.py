@@ -46,7 +46,7 @@ def check_points(points: ArrayLike, what: str = "points") -> Float[Tensor, "N n"
     except (TypeError, ValueError, RuntimeError) as error:
         hint = "; a mesh goes to from_trimesh" if hasattr(points, "faces") else ""
         if isinstance(points, str | Path):
-            hint = "; trimesh.load_mesh reads a file, and from_trimesh takes what it gives"
+            hint = "; vertices, faces = torchlb.read_shape(path) reads a file"
         raise InputError(
             f"{what}: expected an (N, n) tensor or array, got {type(points)}{hint}"
         ) from error

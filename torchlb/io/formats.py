@@ -1,0 +1,265 @@
+"""What is read here, and not by trimesh: polygons of .obj, .off and .ply, points of .pcd, tables of numbers.
+
+Each reader gives the vertices, (N, 3) or (N, n), and the corners of all polygons, one after the other, with the number
+of corners of each; without polygons the shape is a cloud.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Iterator
+from itertools import chain
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from torchlb.errors import InputError
+
+Polygons = tuple[Float[np.ndarray, "N n"], Int[np.ndarray, " C"], Int[np.ndarray, " P"]]
+TYPES = {
+    **{"char": "i1", "uchar": "u1", "short": "i2", "ushort": "u2", "int": "i4", "uint": "u4"},
+    **{"float": "f4", "double": "f8", "int8": "i1", "uint8": "u1", "int16": "i2", "uint16": "u2"},
+    **{"int32": "i4", "uint32": "u4", "float32": "f4", "float64": "f8"},
+}
+"""Those of .ply, in NumPy's words."""
+
+
+def _polygons(vertices: Any, faces: Any) -> Polygons:
+    """Of faces as rows of an array, or as lists of corners."""
+    if isinstance(faces, np.ndarray):
+        sizes, corners = np.full(len(faces), faces.shape[1]), faces.ravel()
+    else:
+        sizes, corners = np.fromiter(map(len, faces), int), np.fromiter(chain(*faces), int)
+    return np.asarray(vertices, dtype=float), corners.astype(np.int64), sizes
+
+
+def read_obj(path: Path) -> Polygons:
+    """Vertices and faces of all groups and materials of an .obj; texture and normals split no vertex.
+
+    An index below zero counts back from the last vertex before its face.
+    """
+    vertices, faces = [], []
+    for line in path.read_text("utf-8", "replace").replace("\\\n", " ").splitlines():
+        key, *words = line.split("#")[0].split() or [""]
+        if key == "v":
+            vertices.append([float(word) for word in words[:3]])
+        elif key == "f":
+            numbers = [int(word.partition("/")[0]) for word in words]
+            if 0 in numbers:
+                raise InputError(f"a corner 0 in {line!r}; they count from 1")
+            faces.append([i - 1 if i > 0 else len(vertices) + i for i in numbers])
+    return _polygons(vertices, faces)
+
+
+def read_off(path: Path) -> Polygons:
+    """Vertices and faces of an .off, also of COFF, NOFF and their like, whose further columns are left out."""
+    lines = (line.partition("#")[0] for line in path.read_text("utf-8", "replace").splitlines())
+    head, *rest = (line.strip() for line in lines if line.strip())
+    found = re.match(r"(ST)?C?N?(OFF)?", head)
+    counts, *rows = ([head[found.end() :]] if found and head[found.end() :] else []) + rest
+    count, number = (int(word) for word in counts.split()[:2])
+    if len(rows) < count + number:
+        raise InputError(f"{count} vertices and {number} faces announced, {len(rows)} lines")
+    vertices = [[float(word) for word in row.split()[:3]] for row in rows[:count]]
+    faces = []
+    for row in rows[count : count + number]:
+        size, *corners = row.split()
+        faces.append([int(corner) for corner in corners[: int(size)]])
+    return _polygons(vertices, faces)
+
+
+def read_ply(path: Path) -> Polygons:
+    """Vertices, faces and strips of triangles of a .ply, ascii or binary."""
+    data = path.read_bytes()
+    end = re.search(rb"end_header[ \t]*\r?\n", data)
+    if end is None or not data.startswith(b"ply"):
+        raise InputError("no header of a .ply")
+    order, at = "", end.end()
+    elements: list[tuple[str, int, list[tuple[str, str, str | None]]]] = []
+    for line in data[: end.start()].decode("ascii", "replace").splitlines():
+        match line.split():
+            case ["format", kind, *_]:
+                order = {"binary_little_endian": "<", "binary_big_endian": ">"}.get(kind, "")
+            case ["element", name, count]:
+                elements.append((name, int(count), []))
+            case ["property", "list", size, kind, name]:
+                elements[-1][2].append((name, _type(kind, order), _type(size, order)))
+            case ["property", kind, name]:
+                elements[-1][2].append((name, _type(kind, order), None))
+    if not order:
+        data, at = np.array(data[at:].split()).astype("<f8").tobytes(), 0
+    vertices, faces = np.zeros((0, 3)), None
+    for name, count, properties in elements:
+        columns, at = _element(data, at, count, properties)
+        if name == "vertex":
+            vertices = np.stack([np.ravel(columns[axis]) for axis in "xyz"], 1)
+        elif name in ("face", "tristrips") and count:
+            lists = [title for title, _, size in properties if size]
+            corners = columns[next((n for n in lists if n.startswith("vertex_ind")), lists[0])]
+            if name == "tristrips":
+                corners = [
+                    triangle for strip in corners for triangle in _strip(strip.astype(np.int32))
+                ]
+            faces = corners if faces is None else [*faces, *corners]
+    return _polygons(vertices, [] if faces is None else faces)
+
+
+def _type(name: str, order: str) -> str:
+    """A type in NumPy's words; an ascii file is taken as a binary one of doubles alone."""
+    return order + TYPES[name] if order else "<f8"
+
+
+def _element(
+    data: bytes, at: int, count: int, properties: list[tuple[str, str, str | None]]
+) -> tuple[dict[str, Any], int]:
+    """Of each property its values in every row, lists of them for a list; and where the next element starts.
+
+    Where all rows are as long as the first, at once.
+    """
+    if count == 0:
+        return {name: [] for name, *_ in properties}, at
+    first, _ = _row(data, at, properties)
+    fields: list[Any] = []
+    for (name, kind, size), values in zip(properties, first, strict=True):
+        fields += [(f"size of {name}", size)] if size else []
+        fields.append((name, kind, (len(values),)) if size else (name, kind))
+    row = np.dtype(fields)
+    if at + count * row.itemsize <= len(data):
+        table = np.frombuffer(data, row, count, at)
+        sizes = [(table[f"size of {name}"], table[name].shape[1]) for name, _, s in properties if s]
+        if all((size == width).all() for size, width in sizes):
+            return {name: table[name] for name, *_ in properties}, at + table.nbytes
+    rows = []
+    for _ in range(count):
+        values, at = _row(data, at, properties)
+        rows.append(values)
+    columns = zip(*rows, strict=True)
+    return {name: list(c) for (name, *_), c in zip(properties, columns, strict=True)}, at
+
+
+def _row(
+    data: bytes, at: int, properties: list[tuple[str, str, str | None]]
+) -> tuple[list[np.ndarray], int]:
+    values = []
+    for _, kind, size in properties:
+        count = 1
+        if size:
+            count = int(np.frombuffer(data, size, 1, at)[0])
+            at += np.dtype(size).itemsize
+        values.append(np.frombuffer(data, kind, count, at))
+        at += values[-1].nbytes
+    return values, at
+
+
+def _strip(corners: Int[np.ndarray, " C"]) -> Iterator[np.ndarray]:
+    """Triangles of strips, one after the other with −1 between them; every second one is wound the other way.
+
+    >>> [triangle.tolist() for triangle in _strip(np.array([0, 1, 2, 3, -1, 4, 5, 6]))]
+    [[0, 1, 2], [2, 1, 3], [4, 5, 6]]
+    """
+    for strip in np.split(corners, np.flatnonzero(corners == -1)):
+        strip = strip[strip != -1]
+        for i in range(len(strip) - 2):
+            triangle = strip[i : i + 3]
+            if len(set(triangle)) == 3:  # others only lead on
+                yield triangle[::-1] if i % 2 else triangle
+
+
+def read_pcd(path: Path) -> Polygons:
+    """The points of a .pcd, ascii or binary, of which NaN stands for none."""
+    data, header = path.read_bytes(), {}
+    at = 0
+    while "DATA" not in header and at < len(data):
+        line, _, _ = data[at:].partition(b"\n")
+        at += len(line) + 1
+        key, *words = line.decode("ascii", "replace").split() or ["#"]
+        header[key] = words
+    kind = header["DATA"][0]
+    sizes, types = header["SIZE"], header["TYPE"]
+    repeats = [int(word) for word in header.get("COUNT", ["1"] * len(sizes))]
+    fields = [
+        (f"{i} {name}", f"<{t.lower()}{size}", (repeat,))
+        for i, (name, t, size, repeat) in enumerate(
+            zip(header["FIELDS"], types, sizes, repeats, strict=True)
+        )
+    ]
+    titles = {name: title for name, (title, *_) in zip(header["FIELDS"], fields, strict=True)}
+    count = int(header["POINTS"][0])
+    if kind == "binary":
+        table: Any = np.frombuffer(data, np.dtype(fields), count, at)
+        points = np.stack([table[titles[axis]][:, 0].astype(float) for axis in "xyz"], 1)
+    elif kind == "ascii":
+        starts = dict(zip(header["FIELDS"], np.cumsum([0, *repeats]), strict=False))
+        table = np.array(data[at:].split()).astype(float).reshape(count, sum(repeats))
+        points = table[:, [starts[axis] for axis in "xyz"]]
+    else:
+        raise InputError(
+            f"its data are {kind}; write them as binary or ascii, as pcl_convert_pcd_ascii_binary does"
+        )
+    return _polygons(points[~np.isnan(points).any(1)], [])
+
+
+def read_table(path: Path) -> Polygons:
+    """Points from the columns x, y and z of a table of numbers, or its first three (two, if it has no more).
+
+    Columns are parted by commas, semicolons or blanks. Lines before the numbers, such as names of the columns or
+    the number of points, and comments by # or // are left out.
+    """
+    lines = _numbers(path)
+    names, first = next(lines, ([], []))
+    width = len(first)
+    if width < 2:
+        raise InputError("no rows of two or more numbers")
+    chosen = [names.index(axis) for axis in "xyz" if axis in names]
+    chosen = chosen if len(names) == width and len(chosen) > 1 else list(range(min(3, width)))
+    rows = [first, *(row for _, row in lines)]
+    if any(len(row) != width for row in rows):
+        raise InputError(f"rows of {width} numbers and of others")
+    return _polygons(np.array(rows)[:, chosen], [])
+
+
+def begins_with_points(path: Path) -> bool:
+    """Whether the first row of a table has three numbers or more."""
+    try:
+        return len(next(_numbers(path), ([], []))[1]) > 2
+    except InputError:
+        return False
+
+
+def _numbers(path: Path) -> Iterator[tuple[list[str], list[float]]]:
+    """Rows of a table, with the words of the line before the first, in small letters."""
+    names: list[str] = []
+    begun = False
+    with open(path, encoding="utf-8-sig", errors="replace") as file:
+        for number, line in enumerate(file, 1):
+            text, _, comment = line.replace("//", "#").partition("#")
+            text = comment if not (begun or text.strip()) else text
+            text = (
+                text.replace(",", ".").replace(";", " ") if ";" in text else text.replace(",", " ")
+            )
+            words = text.split()
+            try:
+                row = [float(word) for word in words]
+            except ValueError:
+                if begun:
+                    raise InputError(
+                        f"line {number}: {line.strip()[:60]!r} has no numbers"
+                    ) from None
+                row = []
+            if len(row) > 1 and not line.lstrip().startswith(("#", "//")):
+                begun = True
+                yield names, row
+            elif words and not begun:
+                names = [word.strip("\"'").lower() for word in words]
+
+
+READERS: dict[str, Callable[[Path], Polygons]] = {
+    ".obj": read_obj,
+    ".off": read_off,
+    ".pcd": read_pcd,
+    ".ply": read_ply,
+    **dict.fromkeys((".asc", ".csv", ".pts", ".txt", ".xyz"), read_table),
+}
+"""By the ending of the file."""
