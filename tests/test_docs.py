@@ -91,6 +91,12 @@ TRIGGERS = {
     "… points share": lambda: LaplaceBeltrami.from_points(torch.cat([VERTICES, VERTICES[:2]])),
     "… are NaN": lambda: LaplaceBeltrami.from_points(NAN),
     "…: they require": lambda: LaplaceBeltrami.from_points(VERTICES.clone().requires_grad_()),
+    "normals: the signs": lambda: LaplaceBeltrami.from_points(
+        VERTICES, normals=VERTICES * torch.tensor([1.0, -1.0]).repeat(30)[:, None], order=1
+    ),
+    "normals: … face": lambda: LaplaceBeltrami.from_points(
+        VERTICES, normals=torch.cat([-VERTICES[:1], VERTICES[1:]]), order=1
+    ),
     "… have indices": lambda: LaplaceBeltrami.from_mesh(VERTICES, FACES + 1),
     "… these look like quads": lambda: LaplaceBeltrami.from_mesh(
         torch.rand(100, 3), GRID[:-1, :-1].reshape(-1, 1) + torch.tensor([0, 1, 11, 10])
@@ -198,7 +204,7 @@ def test_a_quoted_message_is_one_that_comes(message, tmp_path, monkeypatch):
     pattern = ".*".join(re.escape(part) for part in message.split("…"))
     with warnings.catch_warnings():
         warnings.simplefilter("error", torchlb.StabilityWarning)
-        warnings.filterwarnings("error", "(faces|points|vertices|batch): ")
+        warnings.filterwarnings("error", "(faces|points|vertices|normals|batch): ")
         with pytest.raises((ValueError, TypeError, RuntimeError, UserWarning)) as caught:
             triggers[0]()
     assert re.search(pattern, str(caught.value), re.DOTALL), str(caught.value)

@@ -508,6 +508,23 @@ def test_arrays_lists_and_integers_are_points():
     assert single.values.dtype == torch.float32
 
 
+@pytest.mark.parametrize("surface", [Torus(), Ellipsoid(), Circle()])
+def test_given_normals_with_random_signs_are_those_without(surface):
+    """Neighbours agree, all face out as they do without, and the operator is that of the exact normals."""
+    points = points_of(surface, 300)
+    exact = surface.normals(points)
+    sign = torch.where(torch.rand(300, generator=torch.manual_seed(1)) < 0.5, -1.0, 1.0)[:, None]
+    with pytest.warns(UserWarning, match="signs at 300 points contradict"):
+        lb = LaplaceBeltrami.from_points(points, normals=exact * sign, order=2)
+    assert ((lb.normals * exact).sum(1) > 0.9).all()
+    with pytest.warns(UserWarning, match=r"3 face the other way .* \(7, 8, 100\) and are turned"):
+        inward = exact.clone()
+        inward[[7, 8, 100]] *= -1
+        inward = LaplaceBeltrami.from_points(points, normals=-inward, order=2)
+    assert ((inward.normals * exact).sum(1) < -0.9).all()
+    same(lb.mass, inward.mass)
+
+
 def test_given_normals_decide_the_orientation():
     points = points_of(Sphere(), 200)
     lb = LaplaceBeltrami.from_points(points, order=1, normals=-3 * points)

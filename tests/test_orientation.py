@@ -10,6 +10,7 @@ from torchlb.geometry.frames import cloud_frames, complete_frames, face_normals,
 from torchlb.geometry.neighbors import nearest_neighbors
 from torchlb.geometry.orientation import (
     consistently_wound,
+    mended_normals,
     nearest_pairs,
     orient_normals,
     thin_sides,
@@ -60,6 +61,56 @@ def test_the_two_sides_of_a_slab_face_away_from_each_other(gap):
     close(oriented, exact)
     sides = thin_sides(points, oriented, nearest(points))
     close(sides, exact)
+
+
+@pytest.mark.parametrize("side", [1, -1])
+@pytest.mark.parametrize(
+    ("surface", "count"), [(Torus(), 60), (Torus(), 1000), (Ellipsoid(), 500), (StarShaped(), 800)]
+)
+def test_a_consistent_field_keeps_its_side_and_a_minority_is_turned(surface, count, side):
+    """None of the signs is wrong, single ones, three in ten, or all of a quarter of the surface."""
+    points = surface.random_points(count)
+    exact = side * surface.normals(points)
+    generator = torch.manual_seed(0)
+    share = torch.rand(count, generator=generator)
+    above = points[:, 2] > points[:, 2].quantile(0.75)
+    for wrong in (share < 0, share < 0.02, share < 0.1, above) + (
+        (share < 0.3,) if count > 99 else ()
+    ):
+        given = torch.where(wrong[:, None], -exact, exact)
+        mended, random = mended_normals(points, given, nearest(points))
+        close(mended, exact)
+        assert not random.any()
+
+
+@pytest.mark.parametrize("gap", [0.05, 0.5, 1.5])
+@pytest.mark.parametrize("sides", [(-1, 1), (1, 1)])
+def test_sides_that_a_user_gives_to_two_sheets_stay(gap, sides):
+    """A thin slab, also where it is thinner than the spacing, or two sheets that both face up."""
+    axis = torch.arange(20, dtype=torch.float64)
+    lower = torch.cartesian_prod(axis, axis, torch.zeros(1, dtype=torch.float64))
+    points = torch.cat([lower, lower + torch.tensor([0.4, 0.3, gap], dtype=torch.float64)])
+    exact = torch.zeros(800, 3, dtype=torch.float64)
+    exact[:400, 2], exact[400:, 2] = sides
+    close(mended_normals(points, exact, nearest(points))[0], exact)
+
+
+def test_normals_towards_a_camera_face_out():
+    """It sees half of a sphere from outside; with the other half they have no side."""
+    points = Sphere().points(1000)
+    seen = torch.where(points[:, :1] > 0, points, -points)
+    mended, even = mended_normals(points, seen, nearest(points))
+    assert even.all()
+    close(mended, points)
+
+
+def test_random_signs_are_told_and_face_out():
+    """Of one of two spheres; the other faces in, as it is given."""
+    sphere = Sphere().points(300)
+    points, normals = torch.cat([sphere, sphere + 5]), torch.cat([scrambled(sphere), -sphere])
+    mended, random = mended_normals(points, normals, nearest(points))
+    assert random.tolist() == [True] * 300 + [False] * 300
+    close(mended, torch.cat([sphere, -sphere]))
 
 
 def test_nothing_is_thin_on_a_resolved_surface():

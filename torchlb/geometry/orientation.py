@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import numpy as np
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from scipy import sparse
 from scipy.sparse import csgraph
 from torch import Tensor
@@ -21,6 +21,12 @@ SMOOTH = 0.97
 """An edge whose ends' normals mirror each other better than this (within 14°) and that lies flat is trusted first."""
 FLAT = 0.35
 """Largest share of an edge's length that may be height over the tangent plane at either end of such an edge."""
+
+AROUND = 8
+"""Nearest points that judge the sign of a given normal."""
+CONTRADICTED, ASTRAY = 1 / 8, 3 / 4
+"""Shares of them that contradict: on the whole, up to which a field is consistent (2 % on thin or coarse shapes, 50 %
+of random signs); and at one point, from which on that is turned, if the field is; a half, if not."""
 
 
 def nearest_pairs(candidates: Int[Tensor, "N K"]) -> tuple[Int[Tensor, " P"], Int[Tensor, " P"]]:
@@ -44,13 +50,46 @@ def _across(
     normals: Float[Tensor, "N n"],
     i: Int[Tensor, " P"],
     j: Int[Tensor, " P"],
-) -> tuple[Float[Tensor, " P"], Float[Tensor, " P"]]:
-    """(cosine between n_j and the mirror image of n_i, larger slope of the edge over the planes at its two ends)."""
+) -> tuple[Float[Tensor, " P"], Float[Tensor, " P"], Bool[Tensor, " P"]]:
+    """(cosine of n_j to the mirror image of n_i; larger slope of the edge over the planes at its ends; if on an arc).
+
+    Along an arc that the edge spans it falls under one plane and rises to the other, if the normals agree. Where it
+    does not, the ends may lie on the two sides of a thin sheet.
+    """
     edge, ends = at(points, j) - at(points, i), [at(normals, end) for end in (i, j)]
     edge = edge / edge.norm(dim=1, keepdim=True)
     rise_i, rise_j = (dot(edge, end) for end in ends)
     cosine = dot(*ends) - 2 * rise_i * rise_j
-    return cosine, torch.maximum(rise_i.abs(), rise_j.abs())
+    return cosine, torch.maximum(rise_i.abs(), rise_j.abs()), cosine * rise_i * rise_j <= 0
+
+
+def _carried(
+    points: Float[Tensor, "N n"],
+    normals: Float[Tensor, "N n"],
+    candidates: Int[Tensor, "N K"],
+) -> tuple[Float[Tensor, " N"], Int[Tensor, " N"]]:
+    """(signs that make normals consistent with that of the root of their component, by a spanning tree; these roots).
+
+    The root is the extreme point of a component (largest last coordinate); the surest edges of the tree come first.
+    """
+    num_points, pairs = len(points), nearest_pairs(candidates)
+    cosine, slope, _ = _across(points, normals, *pairs)
+    smooth = (cosine.abs() >= SMOOTH) & (slope <= FLAT)
+    cost = 1.0001 - cosine.abs() + ~smooth  # positive: zeros would be no edges
+    ends = tuple(end.numpy() for end in pairs)
+    weighted = sparse.csr_array((cost.numpy(), ends), shape=(num_points, num_points))
+    tree = csgraph.minimum_spanning_tree(weighted)
+    _, component = csgraph.connected_components(tree, directed=False)
+    # The extreme point of each component, which a lexicographic order puts last.
+    order = np.lexsort((points[:, -1].numpy(), component))
+    roots = torch.from_numpy(order[np.append(np.diff(component[order]) > 0, True)])
+    parent = _parents(tree, roots)
+    away = _across(points, normals, parent, torch.arange(num_points))[0] < 0
+    sign = torch.where(away, -1.0, 1.0).to(points)
+    sign[roots] = 1.0
+    while not torch.equal(parent, parent[parent]):  # products along the paths, by doubling
+        sign, parent = sign * sign[parent], parent[parent]
+    return sign, parent
 
 
 def orient_normals(
@@ -63,25 +102,52 @@ def orient_normals(
     Every component is then turned so that the normal at its extreme point (largest last coordinate) points outward.
     On a surface with one side only there is a seam.
     """
-    num_points, pairs = len(points), nearest_pairs(candidates)
-    cosine, slope = _across(points, normals, *pairs)
-    smooth = (cosine.abs() >= SMOOTH) & (slope <= FLAT)
-    cost = 1.0001 - cosine.abs() + ~smooth  # positive: zeros would be no edges
-    ends = tuple(end.numpy() for end in pairs)
-    weighted = sparse.csr_array((cost.numpy(), ends), shape=(num_points, num_points))
-    tree = csgraph.minimum_spanning_tree(weighted)
-    _, component = csgraph.connected_components(tree, directed=False)
-    # The extreme point of each component, which a lexicographic order puts last.
-    order = np.lexsort((points[:, -1].numpy(), component))
-    roots = torch.from_numpy(order[np.append(np.diff(component[order]) > 0, True)])
-    parent = _parents(tree, roots)
-    away = _across(points, normals, parent, torch.arange(num_points))[0] < 0
-    sign = torch.where(away, -1.0, 1.0)
-    sign[roots] = 1.0
-    while not torch.equal(parent, parent[parent]):  # products along the paths, by doubling
-        sign, parent = sign * sign[parent], parent[parent]
-    sign = torch.where(normals[parent, -1] < 0, -sign, sign)
-    return normals * sign[:, None]
+    sign, root = _carried(points, normals, candidates)
+    return normals * torch.where(normals[root, -1] < 0, -sign, sign)[:, None]
+
+
+def mended_normals(
+    points: Float[Tensor, "N n"],
+    normals: Float[Tensor, "N n"],
+    candidates: Int[Tensor, "N K"],
+) -> tuple[Float[Tensor, "N n"], Bool[Tensor, " N"]]:
+    """Normals of a user with the signs that those around them have, and where these have no side.
+
+    Points are turned that most around them contradict, again and again; or signs are carried as by `orient_normals`, to
+    the side that most of a component have, if fewer neighbours contradict each other then, also on smooth edges alone.
+    Where many do, and the two sides are as even as chance makes them (three deviations), the component faces out.
+    """
+    sign, root = _carried(points, normals, candidates)
+    i, j = nearest_pairs(candidates[:, : AROUND + 1])
+    cosine, slope, arc = _across(points, normals, i, j)
+    told = (arc & (cosine.abs() >= MIN_ALIGNMENT)).to(points)
+    sure = told * (cosine.abs() >= SMOOTH) * (slope <= FLAT)
+
+    def contradicted(
+        told: Float[Tensor, " P"], side: Float[Tensor, " N"], group: Int[Tensor, " N"]
+    ) -> Float[Tensor, " N"]:
+        """Share of the pairs at the points of each group that contradict."""
+        wrong = told * (cosine * side[i] * side[j] < 0)
+        total = torch.zeros(2, len(points), dtype=points.dtype)
+        for end in (i, j):
+            total.index_add_(1, group[end], torch.stack([wrong, told]))
+        return (total[0] / total[1].clamp_min(1))[group]
+
+    side, own = torch.ones_like(sign), torch.arange(len(points))
+    many = contradicted(told, side, root) > CONTRADICTED
+    for _ in range(AROUND):
+        astray = contradicted(told, side, own) > torch.where(many, 0.5, ASTRAY)
+        side = torch.where(astray, -side, side)
+    better = torch.ones_like(many)
+    for pairs in (told, sure):
+        better &= contradicted(pairs, sign, root) < contradicted(pairs, side, root)
+    votes, number = torch.zeros(2, len(points), dtype=points.dtype).index_add(
+        1, root, torch.stack([sign, torch.ones_like(sign)])
+    )
+    even = (many | better) & (votes.abs() <= 3 * number.sqrt())[root]
+    most = torch.where(even, normals[root, -1], votes[root])
+    carried = torch.where(most < 0, -sign, sign)
+    return normals * torch.where(better | even, carried, side)[:, None], even
 
 
 def _parents(tree: sparse.csr_array, roots: Int[Tensor, " R"]) -> Int[Tensor, " N"]:

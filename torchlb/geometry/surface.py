@@ -130,13 +130,17 @@ def cloud_surface(
     points: Float[Tensor, "N 3"],
     *,
     normals: Float[Tensor, "N 3"] | None = None,
+    oriented: bool = True,
     boundary: Bool[Tensor, " N"] | None = None,
 ) -> CloudSurface:
-    """The surface through all points, as far as they resolve one; `boundary` marks points of a real boundary."""
+    """The surface through all points, as far as they resolve one; `boundary` marks points of a real boundary.
+
+    Given normals say which side is out where they are `oriented`.
+    """
     start = _start(points, normals, boundary)
     cloud, found, given, count = start.cloud, start.found, normals, len(points)
     places = cloud.points
-    outward = found.outward if given is None else given.numpy()
+    outward = given.numpy() if given is not None and oriented else found.outward
     pairs = _kin(cloud)
     every, seam = wound_alike(places, _chosen(cloud, found, start.two_sided, pairs))
     faces = _clean(every[~seam], count) if seam.any() else every

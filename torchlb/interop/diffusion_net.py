@@ -43,6 +43,7 @@ from torch import Tensor
 
 from torchlb.errors import InputError
 from torchlb.io.cache import load_or_build
+from torchlb.operator.build import settled_normals
 from torchlb.operator.dispatch import Operator, build_operator
 from torchlb.operator.laplace_beltrami import LaplaceBeltrami
 
@@ -76,7 +77,7 @@ def get_operators(
     faces : (F, 3) tensor; None or empty for a point cloud.
     k_eig : number of eigenpairs, 0 for none.
     op_cache_dir : folder of a cache (`load_or_build`), or None.
-    normals : (V, 3). They orient the frames, and on a cloud are the first guess of the tangent planes.
+    normals : (V, 3). They orient the frames, made consistent, and on a cloud are the first guess of the tangent planes.
     overwrite_cache : whether to compute anew.
     truncate_cache : of the original; without effect, since a file with more pairs serves already.
     operator : "stencil" or "cotangent".
@@ -102,6 +103,8 @@ def get_operators(
     else:
         arguments |= {"cache": op_cache_dir, "k": k_eig, "overwrite": overwrite_cache}
         lb = load_or_build(double, None if cloud else faces, **arguments)
+    if cloud:
+        normals = None  # which the operator has
     return _tuple(lb, k_eig, normals, symmetric, verts)
 
 
@@ -139,7 +142,7 @@ def _tuple(
     lb: LaplaceBeltrami, k_eig: int, normals: Tensor | None, symmetric: bool, like: Tensor
 ) -> Operators:
     """The seven results of an operator in float64, in the type and on the device of `like`."""
-    frames = _frames(lb, None if normals is None else normals.detach().cpu().double())
+    frames = _frames(lb, normals)
     turn = torch.einsum("vxn,vnd->vxd", frames[:, :2], lb.frames)  # of the frame's components
     row = torch.arange(lb.num_points).repeat_interleave(lb.crow.diff())
     index = torch.stack([row, lb.col])
@@ -169,7 +172,12 @@ def _tuple(
 def _frames(lb: LaplaceBeltrami, side: Tensor | None) -> Float[Tensor, "V 3 3"]:
     """Rows X, Y, normal: X is e₁ in the tangent plane, or e₂ where e₁ is steep, and Y = normal × X."""
     normal = lb.normals
-    if side is not None:
+    side, known = (
+        (normal, False)
+        if side is None
+        else settled_normals(lb.points, side.detach().cpu().double())
+    )
+    if known:
         flip = (normal * side).sum(1, keepdim=True) < 0
         normal = torch.where(flip, -normal, normal)
     axes = torch.eye(3, dtype=normal.dtype)

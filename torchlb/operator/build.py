@@ -12,14 +12,16 @@ from torch import Tensor
 from torch.nn.functional import pad
 
 from torchlb.baseline.cotangent import cotangent_laplacian
-from torchlb.errors import InputError, renumbered, warn
+from torchlb.errors import InputError, first_few, renumbered, warn
 from torchlb.fits.rules import WeightsName
 from torchlb.galerkin.flips import flipped
 from torchlb.galerkin.pair import ELEMENTS, SparsePair, WeakPair, mesh_pair
 from torchlb.geometry.boundary import boundary_faces
 from torchlb.geometry.frames import Projection
+from torchlb.geometry.neighbors import nearest_neighbors
 from torchlb.geometry.numbering import Numbering
-from torchlb.geometry.surface import SurfaceSummary, cloud_surface
+from torchlb.geometry.orientation import mended_normals
+from torchlb.geometry.surface import NEAREST, SurfaceSummary, cloud_surface
 from torchlb.operator.checks import (
     check_boundary,
     check_dimension,
@@ -184,13 +186,14 @@ def build_cloud(
     here = numbering.sorted(points)
     if isinstance(where, Tensor):
         where = numbering.sorted(where)
-    if normals is not None:
-        normals = numbering.sorted(normals)
     settings = {"num_neighbors": options.num_neighbors, "condition": options.held}
-    settings |= {"normals": normals, "progress": progress}
     with renumbered(numbering.given):
+        oriented = True
+        if normals is not None:
+            normals, oriented = settled_normals(here, numbering.sorted(normals))
+        settings |= {"normals": normals, "progress": progress}
         if on_surface:
-            built = _build_on_surface(here, options, where, settings, numbering)
+            built = _build_on_surface(here, options, where, settings, numbering, oriented)
         else:
             options = options.settled(triangles=False)
             shape = cloud_shape(here, d, options.q, boundary=where, **settings)
@@ -200,17 +203,39 @@ def build_cloud(
     return replace(built.restored(numbering), points=points)
 
 
+def settled_normals(
+    points: Float[Tensor, "N n"], normals: Float[Tensor, "N n"]
+) -> tuple[Float[Tensor, "N n"], bool]:
+    """Given normals so that neighbours agree, and whether their side is the user's; warnings say what was changed."""
+    candidates = nearest_neighbors(points, min(NEAREST, len(points)))
+    mended, even = mended_normals(points, normals, candidates)
+    turned = (((mended * normals).sum(1) < 0) & ~even).nonzero()[:, 0]
+    if even.any():
+        warn(
+            f"normals: the signs at {int(even.sum())} points contradict those of their neighbours, and neither side "
+            "has a majority; they are turned outward, as without `normals`: orient them first if the side matters"
+        )
+    if len(turned):
+        warn(
+            f"normals: {len(turned)} face the other way than those around them ({first_few(turned)}) and are turned "
+            "round, so that neighbours agree"
+        )
+    return mended, not even.all()
+
+
 def _build_on_surface(
     points: Float[Tensor, "N n"],
     options: Options,
     boundary: Bool[Tensor, " N"] | str | None,
     settings: dict[str, Any],
     numbering: Numbering,
+    oriented: bool,
 ) -> AssembledOperator:
-    """Operator on a cloud in R² or R³, by the surface through it."""
+    """Operator on a cloud in R² or R³, by the surface through it, which turns normals that are not `oriented`."""
     ambient, where = points.shape[1], None if isinstance(boundary, str) else boundary
     space = pad(points, (0, 3 - ambient))
-    surface = cloud_surface(space, normals=settings["normals"], boundary=where)
+    surface = cloud_surface(space, normals=settings["normals"], oriented=oriented, boundary=where)
+    settings["normals"] = settings["normals"] if oriented else None
     surface = replace(surface, faces=flipped(surface.points, surface.faces))
     options = options.settled(triangles=len(surface.faces) > 0)
     degree, degrees = options.elements

@@ -96,7 +96,8 @@ class LaplaceBeltrami(StencilFace, WeakFace):
         projection : "tangent" (more accurate) or "normal" (the note's), see `method.md`, section 3.
         weights : "least_squares" (robust) or "polyharmonic" (far more accurate on evenly spread points).
         num_neighbors : size K of every stencil, itself included, instead of the sizes of the candidates.
-        normals : (N, n), if known (d = n − 1): the first guess of the tangent frames, and their orientation.
+        normals : (N, n), if known (d = n − 1): the first guess of the tangent frames, and their orientation, in which
+            neighbours are made to agree; a warning says where they did not.
         boundary : (N,) mask of the points on the boundary. By default, or for "detect", that of the surface through a
             cloud in R² or R³; elsewhere None is a closed shape, and surfaces alone can "detect" one.
         condition : there: "neumann", ∂_ν f = 0, or "dirichlet", f = 0. With the latter the values of f at boundary
