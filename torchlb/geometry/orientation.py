@@ -117,11 +117,13 @@ def mended_normals(
     the side that most of a component have, if fewer neighbours contradict each other then, also on smooth edges alone.
     Where many do, and the two sides are as even as chance makes them (three deviations), the component faces out.
     """
-    sign, root = _carried(points, normals, candidates)
     i, j = nearest_pairs(candidates[:, : AROUND + 1])
     cosine, slope, arc = _across(points, normals, i, j)
     told = (arc & (cosine.abs() >= MIN_ALIGNMENT)).to(points)
     sure = told * (cosine.abs() >= SMOOTH) * (slope <= FLAT)
+    if not (told * (cosine < 0)).any():
+        return normals, torch.zeros(len(points), dtype=torch.bool)
+    sign, root = _carried(points, normals, candidates)
 
     def contradicted(
         told: Float[Tensor, " P"], side: Float[Tensor, " N"], group: Int[Tensor, " N"]
