@@ -114,7 +114,8 @@ def _sewn(vertices: Float[Tensor, "N 3"], faces: Int[Tensor, "F 3"]) -> tuple[Te
     faces = number[faces]
     proper = proper_faces(faces)
     edges = torch.cat([proper[:, [a, a - 1]] for a in range(3)]).sort(1).values
-    edges, count = torch.unique(edges, dim=0, return_counts=True)
+    code, count = torch.unique(edges[:, 0] * len(vertices) + edges[:, 1], return_counts=True)
+    edges = torch.stack([code // len(vertices), code % len(vertices)], 1)
     rim = torch.unique(edges[count == 1])
     if len(rim) == 0:
         return vertices, faces

@@ -157,7 +157,7 @@ def _strip(corners: Int[np.ndarray, " C"]) -> Iterator[np.ndarray]:
     """Triangles of strips, one after the other with −1 between them; every second one is wound the other way.
 
     >>> [triangle.tolist() for triangle in _strip(np.array([0, 1, 2, 3, -1, 4, 5, 6]))]
-    [[0, 1, 2], [2, 1, 3], [4, 5, 6]]
+    [[0, 1, 2], [3, 2, 1], [4, 5, 6]]
     """
     for strip in np.split(corners, np.flatnonzero(corners == -1)):
         strip = strip[strip != -1]
