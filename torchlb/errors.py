@@ -36,7 +36,7 @@ class InputError(TorchlbError):
     """Input that cannot work: shapes, types, values or options."""
 
 
-class StencilError(TorchlbError):
+class StencilError(InputError):
     """No acceptable stencil exists for some points; the message names them and the remedy."""
 
 

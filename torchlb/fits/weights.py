@@ -261,9 +261,9 @@ def least_squares_weights(
     residual = (rows @ values - functionals.mT).abs().amax((1, 2)) / functionals.abs().max()
     solution = rows.mT
     if flux is not None:
-        # What the data add would hide that points on a line say nothing of what is across.
-        spread = torch.linalg.svdvals(scaled)
-        residual = torch.where(spread[:, -1] < ON_LINE * spread[:, 0], torch.inf, residual)
+        # What the data add would hide that points on a line, or in one place, say nothing of what is across.
+        spread = torch.linalg.svdvals(scaled.nan_to_num())
+        residual = torch.where(spread[:, -1] <= ON_LINE * spread[:, 0], torch.inf, residual)
     center = -(constant[..., None] * solution).sum(1, keepdim=True)
     weights = torch.cat([center, solution[:, : coords.shape[1]]], dim=1)
     left = torch.zeros_like(radius)

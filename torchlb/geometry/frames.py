@@ -177,7 +177,9 @@ def _tangent_offsets(points: Tensor, frames: Tensor, centers: Tensor, neighbors:
 def _normal_offsets(points: Tensor, frames: Tensor, centers: Tensor, neighbors: Tensor) -> Tensor:
     offset = at(points, neighbors) - at(points, centers)[:, None]
     theirs = at(frames, neighbors).mT  # (B, K, d, n)
-    return torch.linalg.solve(theirs @ frames[centers, None], theirs @ offset[..., None])[..., 0]
+    product, right = theirs @ frames[centers, None], theirs @ offset[..., None]
+    solution, _ = torch.linalg.solve_ex(product, right)  # not finite where planes are orthogonal
+    return solution[..., 0]
 
 
 Projection = Literal["tangent", "normal"]

@@ -27,9 +27,10 @@ from torchlb.geometry.candidates import (
 )
 from torchlb.geometry.frames import local_heights, local_offsets
 from torchlb.geometry.neighbors import AT_ONCE
+from torchlb.geometry.vectors import at
 from torchlb.stencils.acceptance import WIDEST_AT_BOUNDARY, Acceptance
 from torchlb.stencils.low_order import MeshLowOrder
-from torchlb.stencils.rows import Reason, Rows, matrix_rows, stencil_rows
+from torchlb.stencils.rows import Reason, Rows, matrix_rows, stencil_rows, to_tangent_vectors
 from torchlb.stencils.shape import Shape
 
 RULES = list(WEIGHT_RULES)
@@ -90,7 +91,10 @@ class Stencils:
             rule = torch.full_like(tried, RULES.index(candidate.rule))
             rule[with_data & splines] = RULES.index("least_squares")
             order = candidate.degree - 1
-            blocks.append(stencil_rows(index[passed], weights[passed], number, order, rule[passed]))
+            index, weights = index[passed], weights[passed]
+            gradient = self._tangent_vectors(centers[tried[passed]], index, weights.gradient)
+            weights = replace(weights, gradient=gradient)
+            blocks.append(stencil_rows(index, weights, number, order, rule[passed]))
             taken.append(tried[passed])
         left = torch.ones(len(centers), dtype=torch.bool)
         left[torch.cat([*taken, torch.empty(0, dtype=torch.int64)])] = False
@@ -164,6 +168,17 @@ class Stencils:
             coords = local_offsets(points, frames, centers, neighbors, "tangent")
         return local_heights(points, frames, centers, neighbors, coords)
 
+    def _tangent_vectors(
+        self,
+        centers: Int[Tensor, " B"],
+        index: Int[Tensor, "B K"],
+        gradient: Float[Tensor, "B K d"],
+    ) -> Float[Tensor, "B K d"]:
+        """Weights of ∇ in the frames, from those of derivatives along the coordinates."""
+        points, frames = self.shape.points, at(self.shape.frames, centers)
+        jacobian = gradient.mT @ (at(points, index) - at(points, centers)[:, None])
+        return gradient @ to_tangent_vectors(jacobian, frames).mT
+
     def _low_order_rows(self, centers: Int[Tensor, " B"], reason: Int[Tensor, " B"]) -> Rows:
         assert self.shape.low_order is not None
         matrix = self.shape.low_order.rows(centers)
@@ -204,7 +219,8 @@ class Stencils:
             passed = _good_slope(weights) & self.acceptance.follows(weights, candidates[number])
             search.settle(tried[passed])
             if passed.any():
-                yield tried[passed], index[passed], weights.gradient[passed]
+                tried, index, gradient = tried[passed], index[passed], weights.gradient[passed]
+                yield tried, index, self._tangent_vectors(centers[tried], index, gradient)
 
 
 def _good_slope(weights: Weights) -> Bool[Tensor, " B"]:

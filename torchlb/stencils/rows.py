@@ -14,7 +14,7 @@ from scipy import sparse
 from torch import Tensor
 
 from torchlb.fits.rules import WEIGHT_RULES
-from torchlb.fits.weights import Weights
+from torchlb.fits.weights import MAX_RESIDUAL, Weights
 from torchlb.geometry.numbering import Numbering
 from torchlb.linalg.sparse import from_scipy
 
@@ -128,6 +128,27 @@ ENTRIES = {"col", "laplacian", "gradient"}
 """The fields of `Rows` that have one value an entry; the others have one a row."""
 
 
+def to_tangent_vectors(
+    jacobian: Float[Tensor, "B d n"], frames: Float[Tensor, "B n d"]
+) -> Float[Tensor, "B d d"]:
+    """EᵀJ⁺, which makes components in the frame E of the gradient from derivatives along the coordinates of a fit.
+
+    With weights G of these derivatives J = Gx are tangent vectors of the surface that the fit makes of the points x,
+    and over it ∇f = Jᵀ(JJᵀ)⁻¹Gf = J⁺Gf. Where the frame is tangent to it J = Eᵀ, and the result is 1. Of coordinates
+    ∇ is Eᵀ times a projector, so no longer than 1, however steep the fit is over the frame.
+
+    >>> steep = torch.tensor([[[1.0, 2.0]]])
+    >>> to_tangent_vectors(steep, torch.tensor([[[1.0], [0.0]]])).round(decimals=4).tolist()
+    [[[0.2]]]
+    """
+    turn = torch.eye(jacobian.shape[1], dtype=jacobian.dtype).repeat(len(jacobian), 1, 1)
+    askew = (jacobian @ jacobian.mT - turn).abs().amax((1, 2)) > MAX_RESIDUAL
+    # Singular values are those of [1, slope], 1 and more, and 0 across a line on which all points lie.
+    inverse = torch.linalg.pinv(jacobian[askew], atol=MAX_RESIDUAL, rtol=0.0)
+    turn[askew] = frames[askew].mT @ inverse
+    return turn
+
+
 def stencil_rows(
     index: Int[Tensor, "B K"], weights: Weights, candidate: int, order: int, rule: Int[Tensor, " B"]
 ) -> Rows:
@@ -163,7 +184,7 @@ def matrix_rows(
 ) -> Rows:
     """Rows of a given strong-form matrix (B, N), with the least-squares gradient over the points of each row.
 
-    Where those all lie on a line the derivative across it is zero.
+    Where those all lie on a line the derivative across it is zero. See `to_tangent_vectors` for where they are steep.
     """
     crow, col, laplacian = from_scipy(matrix)
     length = crow.diff()
@@ -174,10 +195,13 @@ def matrix_rows(
     def summed(values: Tensor) -> Tensor:
         return values.new_zeros(len(centers), *values.shape[1:]).index_add_(0, local, values)
 
-    square = summed(coords.square().sum(-1))
-    scale = square.clamp_min(torch.finfo(square.dtype).tiny)[:, None, None]
-    moment = summed(coords[:, :, None] * coords[:, None, :]) / scale
-    inverse = torch.linalg.pinv(moment, rtol=1e-9, hermitian=True) / scale
+    size = summed(coords.square().sum(-1)).sqrt()
+    size = size.clamp_min(torch.finfo(size.dtype).tiny ** 0.5)[:, None]
+    coords = coords / size[local]
+    moment = summed(coords[:, :, None] * coords[:, None, :])
+    inverse = torch.linalg.pinv(moment, rtol=1e-9, hermitian=True) / size[..., None]
+    jacobian = inverse @ summed(coords[:, :, None] * offset[:, None, :])
+    inverse = to_tangent_vectors(jacobian, frames[centers]) @ inverse
     gradient = torch.einsum("ecd,ed->ec", inverse[local], coords)
     on_diagonal = col == centers[local]
     gradient[on_diagonal] -= summed(gradient)[local[on_diagonal]]
