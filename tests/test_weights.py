@@ -76,7 +76,7 @@ def test_derivatives_of_polynomials_are_exact(dim, degree, rule):
     close(applied(weights.gradient, f, coords), slope.expand(3, dim), scale)
     assert (weights.condition < 1e10).all()
     # On clustered random nodes splines have weights of 1e4 and more, and their rounding; those are never accepted.
-    assert weights.residual.max() < (1e-9 if rule == "polyharmonic" else 1e-11)
+    assert weights.residual.max() < (1e-8 if rule == "polyharmonic" else 1e-11)
 
 
 @pytest.mark.parametrize("dim", [1, 2, 3, 4])
