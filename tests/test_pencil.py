@@ -16,7 +16,7 @@ from torchlb.linalg.lanczos import inverse, lanczos
 from torchlb.spectral import pencil
 from torchlb.spectral.eigenbasis import stack_eigenbases, unstack_eigenbases
 from torchlb.spectral.pencil import pencil_eigenbasis
-from torchlb.surfaces import Ellipsoid, UnitDisk
+from torchlb.surfaces import Ellipsoid, Sphere, UnitDisk
 
 
 def path_matrix(size, shift):
@@ -296,3 +296,51 @@ def test_eigenpairs_are_those_in_any_unit(unit):
         )
         identity = torch.eye(other.eigenvectors.shape[1], dtype=torch.float64)
         torch.testing.assert_close(other.to_basis(other.eigenvectors), identity, rtol=0, atol=1e-8)
+
+
+@pytest.mark.parametrize(
+    ("build", "dtype"),
+    [("from_mesh", "float64"), ("from_mesh", "float32"), ("from_cotangent", "float64")],
+)
+def test_a_stiffness_matrix_has_no_factor(build, dtype):
+    """K1 = 0, which rounding hides: the last pivot is 1e-14, K⁻¹ would be 1e14. K + cM and K without a point have one."""
+    vertices, faces = Sphere().mesh(300)
+    lb = getattr(LaplaceBeltrami, build)(vertices.numpy().astype(dtype), faces)
+    stiffness, mass = lb.to_scipy("stiffness"), lb.to_scipy("mass")
+    least = {"float32": 0.1, "float64": 1e-6}[dtype]
+    for singular in (
+        stiffness,
+        sparse.block_diag([stiffness, stiffness + mass]),
+        stiffness + 1e-15 * mass,
+        stiffness.astype(float) * 1e20 if dtype == "float64" else stiffness,
+    ):
+        with pytest.raises(InputError, match=r"singular.*K1 = 0.*K \+ cM"):
+            cholesky(singular)
+    right = torch.from_numpy(mass.sum(axis=1)).double()
+    x = cholesky(stiffness + least * mass).solve(least * right)  # (K + cM)1 = cM1
+    torch.testing.assert_close(x, torch.ones_like(x), rtol=1e-2, atol=0)
+    assert cholesky(stiffness[1:, 1:]).solve(right[1:]).isfinite().all()
+
+
+@pytest.mark.parametrize(
+    "matrix",
+    [
+        sparse.diags_array([1.0, 0.0, 2.0]),
+        sparse.csr_array((4, 4)),
+        sparse.csr_array(np.ones((2, 2))),
+        sparse.csr_array(np.array([[1.0, 2.0], [3.0, 6.0]])),
+        sparse.csr_array(1 / (1 + np.add.outer(np.arange(14.0), np.arange(14.0)))),  # Hilbert's
+    ],
+)
+def test_other_singular_matrices_have_no_factor(matrix):
+    with pytest.raises(InputError, match="singular"):
+        cholesky(matrix)
+
+
+def test_badly_scaled_matrices_have_a_factor():
+    """A small pivot alone is no reason: each row has its own unit."""
+    x = cholesky(sparse.diags_array([1.0, 1e-20, 1e20])).solve(torch.ones(3).double())
+    torch.testing.assert_close(x, torch.tensor([1.0, 1e20, 1e-20]).double())
+    for wrong in (sparse.csr_array((4, 5)), sparse.csr_array(np.array([[np.nan]]))):
+        with pytest.raises(InputError, match="square one of finite entries"):
+            cholesky(wrong)

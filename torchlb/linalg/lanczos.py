@@ -10,7 +10,7 @@ from jaxtyping import Float
 from scipy import linalg, sparse
 
 from torchlb.errors import EigenbasisError
-from torchlb.linalg.factor import cholesky
+from torchlb.linalg.factor import Factor
 
 BLOCK = 16
 """Vectors at a time, the largest multiplicity that is surely found; 8 to 32 take about the same time."""
@@ -27,7 +27,7 @@ Pairs = tuple[Float[np.ndarray, " k"], Float[np.ndarray, "N k"]]
 
 def inverse(matrix: sparse.csr_array) -> Inverse:
     """The product with A⁻¹, by a Cholesky factor."""
-    factor = cholesky(matrix)
+    factor = Factor(sparse.csr_array(matrix))
     return lambda b: factor.solve(torch.from_numpy(b)).numpy()
 
 
