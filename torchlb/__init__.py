@@ -13,9 +13,11 @@ from typing import Any
 from torchlb import surfaces
 from torchlb.errors import (
     CacheWarning,
+    DerivativeError,
     DiffusionError,
     EigenbasisError,
     InputError,
+    InputTypeError,
     OperatorFileError,
     StabilityError,
     StabilityWarning,
@@ -51,6 +53,7 @@ from torchlb.version import __version__
 __all__ = [
     "CacheWarning",
     "Certificate",
+    "DerivativeError",
     "Diffusion",
     "DiffusionError",
     "DiffusionNet",
@@ -60,6 +63,7 @@ __all__ = [
     "GradientFeatures",
     "ImplicitDiffusion",
     "InputError",
+    "InputTypeError",
     "LaplaceBeltrami",
     "OperatorFileError",
     "PoissonBlock",

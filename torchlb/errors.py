@@ -12,9 +12,11 @@ from typing import Any
 
 __all__ = [
     "CacheWarning",
+    "DerivativeError",
     "DiffusionError",
     "EigenbasisError",
     "InputError",
+    "InputTypeError",
     "OperatorFileError",
     "StabilityError",
     "StabilityWarning",
@@ -36,6 +38,10 @@ class InputError(TorchlbError):
     """Input that cannot work: shapes, types, values or options."""
 
 
+class InputTypeError(InputError, TypeError):
+    """An argument of another type than asked for, also a `TypeError`; the message says what makes the right one."""
+
+
 class StencilError(InputError):
     """No acceptable stencil exists for some points; the message names them and the remedy."""
 
@@ -50,6 +56,10 @@ class EigenbasisError(TorchlbError):
 
 class DiffusionError(TorchlbError):
     """A flow cannot be computed by the method asked for; the message names one that can."""
+
+
+class DerivativeError(TorchlbError, RuntimeError):
+    """A second derivative of what is differentiable once, also a `RuntimeError`; the message says what to take."""
 
 
 class OperatorFileError(TorchlbError):

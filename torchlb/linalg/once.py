@@ -9,6 +9,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from torchlb.errors import DerivativeError
+
 
 def once_differentiable(backward: Callable[..., Any]) -> Callable[..., Any]:
     """As torch's decorator of that name, but whoever asks for second derivatives gets the error whichever way he asks.
@@ -38,7 +40,7 @@ class _Last(torch.autograd.Function):
 
     @staticmethod
     def backward(ctx: Any, *grads: Any) -> Any:
-        raise RuntimeError(
+        raise DerivativeError(
             "second derivatives of a solve, of heat flow or of a conductivity: they are differentiable once, by "
             "backward(); torch.autograd.functional.jvp goes back twice, too. In f they are linear: the derivative in a "
             "direction is what they make of that direction; in other data take vjp, or a difference quotient"

@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Float, Int, Shaped
 from scipy import sparse
 from torch import Tensor
 from torch.nn.functional import embedding_bag
@@ -42,7 +42,7 @@ def transpose_pattern(
 def csr_product(
     pattern: Sequence[Tensor],
     values: Float[Tensor, " nnz"],
-    x: Float[Tensor, "M C"],
+    x: Shaped[Tensor, "M C"],
     transposed: bool = False,
 ) -> Float[Tensor, "K C"]:
     """Product A x of a CSR matrix, or Aᵀ x, differentiable any number of times in `values` and in `x`.
@@ -277,7 +277,8 @@ def to_scipy(
     values: Float[Tensor, " nnz"],
     shape: tuple[int, int],
 ) -> sparse.csr_array:
-    """As a scipy CSR matrix on the CPU, without a copy where there is none needed."""
+    """As a scipy CSR matrix on the CPU, without a copy where there is none needed; half precision becomes float32."""
+    values = values.float() if values.dtype.itemsize < 4 else values
     data, indices, indptr = (t.detach().cpu().numpy() for t in (values, col, crow))
     return sparse.csr_array((data, indices, indptr), shape=shape)
 

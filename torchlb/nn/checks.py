@@ -10,7 +10,8 @@ from typing import Any, ParamSpec, TypeVar, get_args
 import torch
 from torch import Tensor
 
-from torchlb.errors import InputError
+from torchlb.errors import InputError, InputTypeError
+from torchlb.linalg.checks import check_finite, check_tensor
 from torchlb.operator.laplace_beltrami import LaplaceBeltrami
 
 P = ParamSpec("P")
@@ -18,14 +19,13 @@ T = TypeVar("T")
 
 
 def check_shape(x: Tensor, lb: LaplaceBeltrami) -> None:
-    """InputError unless x is (N, C) or (B, N, C) with the N of the operator, TypeError unless it is a tensor."""
+    """InputError unless x is (N, C) or (B, N, C) with the N of the operator, InputTypeError unless a tensor."""
     if not hasattr(lb, "num_points"):
-        raise TypeError(
+        raise InputTypeError(
             f"expected an operator, got a {type(lb).__name__} in its place: functions take (lb, f), layers (x, lb); "
             "several shapes are one operator, LaplaceBeltrami.batch(…), with features below each other, torch.cat(…)"
         )
-    if not isinstance(x, Tensor):
-        raise TypeError(f"expected f as a tensor, got {type(x)}; torch.as_tensor(f) makes one")
+    check_tensor(x)
     if x.ndim not in (2, 3) or x.shape[-2] != lb.num_points:
         raise InputError(
             f"expected features of shape (N, C) or (B, N, C) with N = {lb.num_points}, got {tuple(x.shape)}"
@@ -35,12 +35,13 @@ def check_shape(x: Tensor, lb: LaplaceBeltrami) -> None:
 def as_columns(f: Tensor, lb: LaplaceBeltrami) -> Tensor:
     """(N, C) or (B, N, C) of the f of a user, which may be (N,), too; integers and masks in the operator's type.
 
-    Errors as for `check_shape`, and InputError for complex numbers.
+    Errors as for `check_shape`, and InputError for complex numbers, NaN and infinity.
     """
     x = f[:, None] if isinstance(f, Tensor) and f.ndim == 1 else f
     check_shape(x, lb)
     if x.is_complex():
         raise InputError(f"expected real f, got {x.dtype}; torch.view_as_real(f) makes channels")
+    check_finite(x)
     return x if x.is_floating_point() else x.to(lb.dtype)
 
 

@@ -10,9 +10,10 @@ from jaxtyping import Bool, Float, Int
 from scipy import sparse
 from torch import Tensor
 
-from torchlb.errors import InputError
+from torchlb.errors import InputError, first_few
 from torchlb.galerkin.medium import Medium
 from torchlb.galerkin.pair import stored
+from torchlb.linalg.checks import check_tensor
 from torchlb.linalg.sparse import to_scipy
 from torchlb.operator.laplace_beltrami import LaplaceBeltrami
 from torchlb.operator.medium import medium_of
@@ -79,8 +80,7 @@ def conducting(lb: LaplaceBeltrami, conductivity: Tensor) -> Conducting:
     ------
     InputError : for another shape, values that are not positive, and operators that are not of a triangle mesh.
     """
-    if not isinstance(conductivity, Tensor):
-        raise TypeError(f"conductivity: expected a tensor, got {type(conductivity)}")
+    check_tensor(conductivity, "conductivity")
     medium = medium_of(lb)
     kappa = conductivity.detach().cpu().double()
     if kappa.shape not in ((lb.num_points,), (len(medium.faces),)):
@@ -88,8 +88,12 @@ def conducting(lb: LaplaceBeltrami, conductivity: Tensor) -> Conducting:
             f"conductivity: expected one of each vertex, ({lb.num_points},), or face, ({len(medium.faces)},), got "
             f"{tuple(kappa.shape)}"
         )
-    if not bool(((kappa > 0) & kappa.isfinite()).all()):
-        raise InputError(f"conductivity: expected finite, positive values, got {kappa.min():.3g}")
+    bad = (~((kappa > 0) & kappa.isfinite())).nonzero()[:, 0]
+    if len(bad):
+        raise InputError(
+            f"conductivity: expected finite, positive values, got {float(kappa[bad[0]]):.3g}, … at {len(bad)} of "
+            f"{len(kappa)} vertices or faces ({first_few(bad)})"
+        )
     at_gauss_points = medium.at_gauss_points(kappa)
     mass = sparse.triu(_mass(lb, lb.weak_crow, lb.weak_col, lb.weak_values))
     pair = stored(medium.stiffness(at_gauss_points) + 1j * mass)

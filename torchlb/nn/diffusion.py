@@ -122,7 +122,7 @@ def _flow(
 def _spectral(basis: Eigenbasis, x: Tensor, time: Tensor) -> Tensor:
     """Φ e^{−λt} Φᵀ(πx)."""
     decay = torch.exp(-basis.eigenvalues.to(x.dtype)[..., None] * time)
-    return basis.from_basis(decay * basis.to_basis(x))
+    return basis.from_basis(decay * basis.analyse(basis.functionals, x))
 
 
 def _deflated(
@@ -134,7 +134,7 @@ def _deflated(
             "method='deflated': the slow eigenvectors are too close to dependent, or fewer than the components; "
             "ask for another k, or use method='chebyshev' or 'spectral'"
         )
-    coefficients = basis.to_basis_obliquely(x)
+    coefficients = basis.analyse(basis.left, x)
     v, inverse, turned = basis.modal_transform.to(x.dtype).unbind(-3)
     rates, frequencies = basis.decay_rates.to(x.dtype)[..., None].unbind(-3)
     decay = torch.exp(-rates * time)
@@ -158,7 +158,7 @@ def _deflated_pair(
     """e^{−λt} on the span, the flow of the linear pair with lumped mass on the rest, from which it does not return."""
     if lb.fixed is not None:
         x = x * ~lb.fixed[:, None]
-    values, coefficients = basis.eigenvalues.to(x.dtype), basis.to_basis(x)
+    values, coefficients = basis.eigenvalues.to(x.dtype), basis.analyse(basis.left, x)
     slow = basis.from_basis(torch.exp(-values[..., None] * time) * coefficients)
     if lb.has_pairs(lb.num_points):
         return slow
@@ -172,7 +172,7 @@ def _deflated_pair(
     rest = root.to(x.dtype)[:, None] * (x - basis.from_basis(coefficients))
     rest = heat(pattern, matrix.to(x.dtype), rest, time, *options)
     rest = rest / root.to(x.dtype)[:, None] * torch.exp(-fastest * (whole - time))
-    return slow + rest - basis.from_basis(basis.to_basis(rest))
+    return slow + rest - basis.from_basis(basis.analyse(basis.left, rest))
 
 
 def _linear_flow(lb: LaplaceBeltrami) -> tuple[list[Tensor], Tensor, Tensor]:

@@ -9,6 +9,7 @@ from jaxtyping import Float, Shaped
 from torch import Tensor
 
 from torchlb.errors import InputError
+from torchlb.linalg.checks import check_finite
 from torchlb.linalg.once import once_differentiable
 from torchlb.linalg.sparse import compute_dtype, symmetric_product
 from torchlb.nn.checks import as_columns, as_times, uncompiled
@@ -182,7 +183,7 @@ def _data(lb: LaplaceBeltrami, data: Tensor | float | None, kind: int, f: Tensor
         return None
     name = ("boundary_values", "flux")[kind]
     if not lb.has_weak_form:
-        raise InputError(f"{name}: a stencil has no place for them; build from a triangle mesh")
+        raise InputError(f"{name}: {_without_pair(lb)}")
     fixed = torch.zeros_like(lb.mass, dtype=torch.bool) if lb.fixed is None else lb.fixed
     counts = _poured(lb, ~fixed) if kind == 1 else fixed
     if not bool(counts.any()):
@@ -196,7 +197,9 @@ def _data(lb: LaplaceBeltrami, data: Tensor | float | None, kind: int, f: Tensor
         ) from error
     values = values[:, None] if f.ndim == 1 else values
     columns, _ = _columns(values, None)
-    return torch.where(counts[:, None], columns, 0.0)
+    columns = torch.where(counts[:, None], columns, 0.0)
+    check_finite(columns, name)
+    return columns
 
 
 def _poured(lb: LaplaceBeltrami, free: Tensor) -> Tensor:
@@ -205,6 +208,17 @@ def _poured(lb: LaplaceBeltrami, free: Tensor) -> Tensor:
         return torch.zeros_like(free)
     size = lb.weak_values[2].abs()
     return symmetric_product(lb.weak_crow, lb.weak_col, size, free.to(size)[:, None])[:, 0] > 0
+
+
+def _without_pair(lb: LaplaceBeltrami) -> str:
+    """Why there is no place for boundary data, and what to do."""
+    if lb.dim == 2 and (lb.source == "mesh" or lb.points.shape[1] <= 3):
+        return "the stencil has no place for them, the weak pair has; build without weak_form=False"
+    return (
+        f"only a weak pair has a place for them, and a shape of dimension {lb.dim} in R^{lb.points.shape[1]} has none; "
+        "give values by a system of the stencil (docs/pde.md, 'Boundary values without a weak pair'); "
+        "condition='dirichlet' alone holds u = 0"
+    )
 
 
 def _missing(lb: LaplaceBeltrami, kind: int) -> str:

@@ -26,7 +26,7 @@ from torch import Tensor
 from torch.utils.weak import WeakIdKeyDictionary
 
 from torchlb.linalg.conjugate_gradients import Linear, conjugate_gradients
-from torchlb.linalg.factor import Factor, cholesky, factorized
+from torchlb.linalg.factor import Factor, factorized
 from torchlb.linalg.sparse import multiply, to_scipy
 from torchlb.linalg.two_levels import Matrix, absolute_row_sums, main_entries, two_levels
 from torchlb.nn.conduction import Conducting
@@ -102,9 +102,9 @@ def solve_columns(
 
 
 class _Components:
-    """Means over the connected components of a shape, and which of them have a Dirichlet point."""
+    """Means over the connected components of a shape, and which of them a condition holds: on these K is regular."""
 
-    def __init__(self, lb: Operator) -> None:
+    def __init__(self, lb: Operator, held_rows: np.ndarray | None = None) -> None:
         if isinstance(lb, LaplaceBeltrami) and not lb.has_weak_form:
             crow, col = lb.crow, lb.col
         else:
@@ -114,13 +114,14 @@ class _Components:
         self.count, number = csgraph.connected_components(graph, directed=False)
         self.of = torch.from_numpy(number.astype(np.int64)).to(col.device)
         held = torch.zeros(self.count, device=col.device)
-        if lb.fixed is not None:
-            held = held.index_add(0, self.of, lb.fixed.float())
+        rows = lb.fixed if held_rows is None else torch.from_numpy(held_rows).to(col.device)
+        if rows is not None:
+            held = held.index_add(0, self.of, rows.float())
         if self.count > 1:
             held = held[self.of]
         self.free = (held == 0)[
             :, None
-        ]  # points whose component has no Dirichlet point; one for all if there is one
+        ]  # points of components without; one for all if there is one
 
     def sums(self, weights: Float[Tensor, "N 1"], x: Float[Tensor, "N C"]) -> Float[Tensor, "_ C"]:
         """Of every point the weighted sum over its component; one row for all where there is one component."""
@@ -281,7 +282,7 @@ class PairSystem:
             free = self.free[:, 0].cpu().numpy()
             keep = sparse.diags_array(free)
             matrix = keep @ matrix @ keep + sparse.diags_array((1 - free) * matrix.diagonal())
-        return cholesky((matrix + matrix.T) / 2)
+        return Factor(sparse.csr_array((matrix + matrix.T) / 2))
 
     def _mean(self, weights: Tensor, x: Tensor) -> Tensor:
         """Weighted sums over components that no Dirichlet point holds, by their areas; 0 on the others."""
@@ -303,11 +304,11 @@ class StencilSystem:
         assert isinstance(lb, LaplaceBeltrami)
         matrix = -sparse.csr_array(lb.to_scipy(), dtype=np.float64)
         sums = matrix.sum(axis=1)
-        if lb.fixed is not None:
-            sums[has_outflow(matrix, torch.finfo(lb.dtype).eps)] = 0
+        outflow = has_outflow(matrix, torch.finfo(lb.dtype).eps) & lb.loses
+        sums[outflow] = 0
         matrix = matrix - sparse.diags_array(sums)  # in float32 constants would decay
         self.free = None if lb.fixed is None else (~lb.fixed).double()[:, None]
-        self.components = _Components(lb) if t is None else None
+        self.components = _Components(lb, outflow) if t is None else None
         if self.components is None:
             matrix = sparse.eye_array(lb.num_points) + t * matrix
             self.lu = factorized(sparse.csc_array(matrix), 1e-2)

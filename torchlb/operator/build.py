@@ -38,7 +38,7 @@ from torchlb.operator.inputs import ArrayLike, check_points
 from torchlb.stability.certificate import Certificate
 from torchlb.stability.enforce import certify
 from torchlb.stencils.assemble import Stencils, assemble
-from torchlb.stencils.conditions import CONDITIONS, Condition, ConditionName
+from torchlb.stencils.conditions import CONDITIONS, PAIRED, Condition, ConditionName
 from torchlb.stencils.rows import Reason, Rows, matrix_rows
 from torchlb.stencils.shape import Shape, cloud_shape, mesh_shape, surface_shape
 
@@ -84,6 +84,15 @@ class Options:
                 "certificate makes the stencil stable instead"
             )
         weak = triangles if self.weak_form is None else self.weak_form
+        if (
+            weak
+            and self.held is not None
+            and type(self.held) is not PAIRED.get(str(self.condition))
+        ):
+            raise InputError(
+                f"condition: eigenpairs, heat and solves are of the weak pair, which has {list(PAIRED)} alone and "
+                f"would ignore {self.condition!r}; weak_form=False builds the stencil, which has it"
+            )
         return replace(
             self, weak_form=weak, certify=not weak if self.certify is None else self.certify
         )
@@ -99,7 +108,7 @@ class Options:
             self.num_neighbors,
             projection=(self.projection, [*get_args(Projection)]),
             weights=(self.weights, [*get_args(WeightsName)]),
-            condition=(self.condition or "neumann", [*get_args(ConditionName)]),
+            condition=(self.condition or "neumann", [*CONDITIONS]),
         )
 
 

@@ -9,7 +9,7 @@ from typing import Any, Literal, get_args
 import numpy as np
 from torch import Tensor
 
-from torchlb.errors import InputError
+from torchlb.errors import InputError, InputTypeError
 from torchlb.operator.checks import check_faces
 from torchlb.operator.inputs import ArrayLike, check_points
 from torchlb.operator.laplace_beltrami import LaplaceBeltrami
@@ -28,8 +28,8 @@ def build_operator(
 ) -> LaplaceBeltrami:
     """The operator of a mesh, or of a cloud where `faces` is None or empty, by whichever builder fits.
 
-    Parameters are those of `torchlb.load_or_build`; raises what the builder raises, and TypeError for an option that
-    it does not have.
+    Parameters are those of `torchlb.load_or_build`; raises what the builder raises, and InputTypeError for an option
+    that it does not have.
     """
     builder, _, faces = builder_of(vertices, faces, operator)
     options = complete_options(builder, options)
@@ -55,14 +55,14 @@ def builder_of(
 
 
 def complete_options(builder: Builder, options: dict[str, Any]) -> dict[str, Any]:
-    """All options with their defaults, but `progress`, which changes nothing; TypeError for one that is none."""
+    """All options with their defaults, but `progress`, which changes nothing; InputTypeError for another."""
     known = _defaults(builder)
     _check_names(builder.__name__, options, known)
     return known | options
 
 
 def check_options_of(operator: str, options: dict[str, Any]) -> None:
-    """ValueError or TypeError for what is no operator, or an option of it for neither meshes nor clouds."""
+    """InputError for what is no operator, or an option of it for neither meshes nor clouds."""
     _check_operator(operator)
     known = _defaults(LaplaceBeltrami.from_mesh) | _defaults(LaplaceBeltrami.from_points)
     known = _defaults(LaplaceBeltrami.from_cotangent) if operator == "cotangent" else known
@@ -84,6 +84,6 @@ def _defaults(builder: Builder) -> dict[str, Any]:
 def _check_names(owner: str, options: dict[str, Any], known: dict[str, Any]) -> None:
     unknown = options.keys() - known.keys()
     if unknown:
-        raise TypeError(
+        raise InputTypeError(
             f"{owner} has no option {', '.join(sorted(unknown))}; its options are {', '.join(known) or 'none'}"
         )

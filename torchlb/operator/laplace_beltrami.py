@@ -6,8 +6,9 @@ from collections.abc import Sequence
 from typing import Any, Literal
 
 import torch
+from torch import Tensor
 
-from torchlb.errors import InputError, warn
+from torchlb.errors import InputError, InputTypeError, warn
 from torchlb.fits.rules import WeightsName
 from torchlb.geometry.frames import Projection
 from torchlb.geometry.surface import SurfaceSummary
@@ -21,7 +22,7 @@ from torchlb.operator.batching import (
 from torchlb.operator.inputs import ArrayLike, float_type, warn_of_gradients
 from torchlb.operator.stencil_face import StencilFace
 from torchlb.operator.storage import FIT_FIELDS, REPORT_FIELDS
-from torchlb.operator.weak_face import WeakFace
+from torchlb.operator.weak_face import MatrixName, WeakFace
 from torchlb.spectral.eigenbasis import (
     stack_eigenbases,
     unstack_eigenbases,
@@ -190,13 +191,13 @@ class LaplaceBeltrami(StencilFace, WeakFace):
         Features are the shapes' below each other, (ΣN, C). Indices of shape s (its faces, say) move by
         ``lb.offsets[s]``. The weak pair is there if all have one. Eigenbases that the shapes hold are taken over; the
         others are solved when asked for.
-        Raises InputError for shapes of different dimension, floating type or device, or for none; TypeError for what
-        is no sequence of operators.
+        Raises InputError for shapes of different dimension, floating type or device, or for none; InputTypeError for
+        what is no sequence of operators.
         """
         if isinstance(shapes, LaplaceBeltrami) or not all(
             isinstance(shape, LaplaceBeltrami) for shape in shapes
         ):
-            raise TypeError("batch: expected a sequence of operators, [lb, …]")
+            raise InputTypeError("batch: expected a sequence of operators, [lb, …]")
         if len(shapes) == 0:
             raise InputError("batch: got no shapes")
         sizes = [n for shape in shapes for n in shape.sizes or (shape.num_points,)]
@@ -215,6 +216,26 @@ class LaplaceBeltrami(StencilFace, WeakFace):
             joined = cls.from_buffers(join_buffers([s.tensors for s in shapes]), state, basis)
         remember_shapes(joined, shapes)
         return joined
+
+    def product(self, name: MatrixName, f: Tensor) -> Tensor:
+        """A matrix of the operator times f, of the shape of f, differentiable in f any number of times.
+
+        In the wider of the types of f and the operator, at least float32, also under autocast; a half-precision f gives
+        its own. ``lb.stiffness @ f`` is torch's product, which takes one type alone, and no half precision on the CPU.
+
+        Parameters
+        ----------
+        name : "stiffness", "mass", "boundary_mass", as `to_scipy` has them; "laplacian" is ``lb(f)``.
+        f : (N,), (N, C) or (B, N, C), of any type.
+
+        Raises InputError for another name or shape, and where there is no such matrix.
+        """
+        if name == "laplacian":
+            return self(f)
+        crow, col, values = self.parts_of(name)  # symmetric: the transpose is itself
+        return self._multiplied(
+            [crow, col, crow, col, torch.arange(len(col), device=col.device)], values, f
+        )
 
     def unbatch(self) -> list[LaplaceBeltrami]:
         """The operators of the shapes of a `batch`, with all that they had: certificates, bounds, eigenbases.

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import torch
 from jaxtyping import Bool, Float
-from scipy import sparse
 from torch import Tensor
 
 from torchlb.errors import InputError
 from torchlb.geometry.boundary import boundary_faces
-from torchlb.linalg.sparse import csr_product, csr_tensor, to_scipy
+from torchlb.linalg.checks import check_tensor
+from torchlb.linalg.sparse import csr_product, csr_tensor
 from torchlb.operator.report import StencilReport
 from torchlb.operator.storage import REPORT_FIELDS, OperatorStorage
 
@@ -21,13 +21,6 @@ class StencilFace(OperatorStorage):
     def matrix(self) -> Tensor:
         """Δ as a torch sparse CSR tensor (N, N), 1/ℓ²; a view of the buffers."""
         return csr_tensor(self.crow, self.col, self.values, self.num_points)
-
-    def to_scipy(self) -> sparse.csr_array:
-        """Δ as a scipy CSR matrix (N, N), 1/ℓ², negative semidefinite like `igl.cotmatrix`, but strong: no mass in it.
-
-        Weak matrices with the signs and masses of other libraries: `torchlb.interop.conventions`.
-        """
-        return to_scipy(self.crow, self.col, self.values, self.shape)
 
     @property
     def report(self) -> StencilReport:
@@ -58,18 +51,23 @@ class StencilFace(OperatorStorage):
         return self._apply_rows(self.values, f, transposed=True)
 
     def _apply_rows(self, values: Tensor, f: Tensor, transposed: bool = False) -> Tensor:
-        """The product with one set of values on the pattern, or its transpose, for any layout of f."""
-        if not isinstance(f, Tensor):
-            raise TypeError(f"expected f as a tensor, got {type(f)}; torch.as_tensor(f) makes one")
+        """The product with one set of values on the pattern of Δ, or its transpose, for any layout of f."""
+        pattern = [self.crow, self.col, self.crow_t, self.col_t, self.order_t]
+        return self._multiplied(pattern, values, f, transposed)
+
+    def _multiplied(
+        self, pattern: list[Tensor], values: Tensor, f: Tensor, transposed: bool = False
+    ) -> Tensor:
+        """As `csr_product`, for any layout of f."""
+        check_tensor(f)
         if f.ndim == 1:
-            return self._apply_rows(values, f[:, None], transposed)[:, 0]
+            return self._multiplied(pattern, values, f[:, None], transposed)[:, 0]
         if not (f.ndim in (2, 3) and f.shape[-2] == self.num_points):
             raise InputError(
                 f"expected f of shape (N,), (N, C) or (B, N, C) with N = {self.num_points}, "
                 f"got {tuple(f.shape)}"
             )
         columns = f if f.ndim == 2 else f.transpose(0, 1).flatten(1)
-        pattern = [self.crow, self.col, self.crow_t, self.col_t, self.order_t]
         result = csr_product(pattern, values, columns, transposed)
         if f.ndim == 2:
             return result
@@ -77,8 +75,10 @@ class StencilFace(OperatorStorage):
 
     def local_gradient(self, f: Tensor) -> Tensor:
         """∇f in the frames, (N, d, C) for f (N, C), (N, d) for (N,), (B, N, d, C) for (B, N, C). Units of f by 1/ℓ."""
-        parts = [self._apply_rows(values, f) for values in self.gradient_values]
-        return torch.stack(parts, dim=1 if f.ndim < 3 else 2)
+        check_tensor(f)
+        with torch.autocast(f.device.type, enabled=False):
+            parts = [self._apply_rows(values, f) for values in self.gradient_values]
+            return torch.stack(parts, dim=1 if f.ndim < 3 else 2)
 
     def gradient(self, f: Tensor) -> Tensor:
         """∇f as tangent vectors of space, (N, n, C) for f (N, C), (N, n) for (N,), (B, N, n, C) for (B, N, C).
@@ -86,9 +86,12 @@ class StencilFace(OperatorStorage):
         Units of f by 1/ℓ. Order p + 1 or better where the stencil has order p.
         """
         local = self.local_gradient(f)
-        if f.ndim == 1:
-            return torch.einsum("ind,id->in", self.frames.to(local.dtype), local)
-        return torch.einsum("ind,...idc->...inc", self.frames.to(local.dtype), local)
+        return self._turned("ind,id->in" if f.ndim == 1 else "ind,...idc->...inc", local)
+
+    def _turned(self, equation: str, local: Tensor) -> Tensor:
+        """The frames times a field, in its type, also under autocast: rounding before a derivative grows by 1/h."""
+        with torch.autocast(local.device.type, enabled=False):
+            return torch.einsum(equation, self.frames.to(local.dtype), local)
 
     def divergence(self, v: Tensor) -> Tensor:
         """div v = Σ_c E_c · ∂_c v of space vectors v: (N,) for (N, n), (N, C) for (N, n, C), batches (B, N, C) too.
@@ -97,6 +100,7 @@ class StencilFace(OperatorStorage):
         curvature. Units of v by 1/ℓ. It is consistent, but neither −1 times the adjoint of `gradient` nor exactly
         conservative: ∫ div v = 0 on a closed surface, and div ∇f = Δf, up to the order of the stencils.
         """
+        check_tensor(v, "v")
         if v.ndim == 2:
             return self.divergence(v[..., None])[:, 0]
         size, n = self.num_points, self.points.shape[1]
@@ -106,20 +110,21 @@ class StencilFace(OperatorStorage):
                 f"{tuple(v.shape)}"
             )
         local = self.local_gradient(v.flatten(-2)).unflatten(-1, v.shape[-2:])  # (…, N, d, n, C)
-        return torch.einsum("ind,...idnc->...ic", self.frames.to(local.dtype), local)
+        return self._turned("ind,...idnc->...ic", local)
 
     def hessian(self, f: Tensor) -> Tensor:
         """∇²f, covariant second derivatives E_b·∂_a(∇f) in the frames: (N, d, d) for f (N,), (N, d, d, C) for (N, C).
 
         Symmetric, units of f by 1/ℓ², of order p; first order at best in low-order rows. Its trace is Δf up to that.
         """
+        check_tensor(f)
         if f.ndim == 1:
             return self.hessian(f[:, None])[..., 0]
         if f.ndim != 2:
             raise InputError(f"expected f of shape (N,) or (N, C), got {tuple(f.shape)}")
         slope = self.gradient(f)  # (N, n, C)
         change = self.local_gradient(slope.flatten(1)).unflatten(-1, slope.shape[1:])
-        result = torch.einsum("inb,ianc->iabc", self.frames.to(change.dtype), change)
+        result = self._turned("inb,ianc->iabc", change)
         return (result + result.transpose(1, 2)) / 2
 
     def mean_curvature_normal(self) -> Float[Tensor, "N n"]:

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+from typing import Literal, get_args
+
 import torch
+from scipy import sparse
 from torch import Tensor
 
 from torchlb.errors import InputError
@@ -20,9 +23,10 @@ from torchlb.spectral.eigensolver import blockwise_eigenbasis
 from torchlb.spectral.pencil import pencil_eigenbasis
 from torchlb.stencils.conditions import CONDITIONS
 
+MatrixName = Literal["laplacian", "stiffness", "mass", "boundary_mass"]
 NO_PAIR = (
-    "{}: this operator has no weak pair (weak_form=False, or no surface in R² or R³); build it from a triangle mesh "
-    "or the points of a surface, or use the stencil, lb.matrix"
+    "{}: this operator has no weak pair, which triangle meshes and clouds of surfaces in R² or R³ have unless built "
+    "with weak_form=False, and curves and solids have not; the stencil is lb.matrix"
 )
 
 
@@ -41,7 +45,7 @@ class WeakFace(OperatorStorage):
         A view of the buffers. A Dirichlet condition leaves it as it is: K also says what values at the boundary, where
         `fixed` is set, do inside; solves take out its rows and columns. Raises InputError without a weak pair.
         """
-        return self._weak_matrix("stiffness", 0)
+        return csr_tensor(*self.parts_of("stiffness"), self.num_points)
 
     @property
     def mass_matrix(self) -> Tensor:
@@ -49,19 +53,43 @@ class WeakFace(OperatorStorage):
 
         Raises InputError without a weak pair.
         """
-        return self._weak_matrix("mass_matrix", 1)
+        return csr_tensor(*self.parts_of("mass"), self.num_points)
 
     @property
     def boundary_mass(self) -> Tensor:
         """B, torch sparse CSR (N, N), ℓ^{d−1}: uᵀBv = ∫uv along the boundary. Raises InputError where there is none."""
-        if self.has_weak_form and len(self.weak_values) < 3:
-            raise InputError("boundary_mass: the shape is closed")
-        return self._weak_matrix("boundary_mass", 2)
+        return csr_tensor(*self.parts_of("boundary_mass"), self.num_points)
 
-    def _weak_matrix(self, name: str, number: int) -> Tensor:
+    def parts_of(self, name: str) -> tuple[Tensor, Tensor, Tensor]:
+        """crow, col and values of a matrix: "laplacian", "stiffness", "mass" or "boundary_mass"."""
+        if name not in get_args(MatrixName):
+            raise InputError(f"name: expected one of {list(get_args(MatrixName))}, got {name!r}")
+        if name == "laplacian":
+            return self.crow, self.col, self.values
         if not self.has_weak_form:
             raise InputError(NO_PAIR.format(name))
-        return csr_tensor(self.weak_crow, self.weak_col, self.weak_values[number], self.num_points)
+        if name == "boundary_mass" and len(self.weak_values) < 3:
+            raise InputError("boundary_mass: the shape is closed")
+        number = get_args(MatrixName).index(name) - 1
+        return self.weak_crow, self.weak_col, self.weak_values[number]
+
+    def to_scipy(self, name: MatrixName = "laplacian") -> sparse.csr_array:
+        """Δ, or another matrix of the operator, as a scipy CSR matrix (N, N) on the CPU.
+
+        Parameters
+        ----------
+        name : "laplacian" is Δ, 1/ℓ², negative semidefinite like `igl.cotmatrix`, but strong: no mass in it. The others
+            are `stiffness`, `mass_matrix` and `boundary_mass`, which raise InputError where there are none.
+
+        Weak matrices with the signs and masses of other libraries: `torchlb.interop.conventions`.
+        """
+        return to_scipy(*self.parts_of(name), self.shape)
+
+    @property
+    def loses(self) -> bool:
+        """Whether a condition takes something away, so that rows at the boundary do not sum to zero."""
+        kinds = [CONDITIONS.get(name) for name in self._conditions if name is not None]
+        return not all(kind is not None and kind.conserves for kind in kinds)
 
     def eigenbasis(
         self, k: int, *, tolerance: float | None = None, store: bool = False
@@ -117,9 +145,7 @@ class WeakFace(OperatorStorage):
     def _stencil_eigenbasis(self, k: int) -> Eigenbasis:
         """From the rows of Δ, in the inner product of the mass."""
         matrix = to_scipy(self.crow, self.col, self.values, self.shape)
-        conditions = [CONDITIONS.get(condition or "") for condition in self._conditions]
-        outflow = not all(c is None or c.conserves for c in conditions)
-        options = {"outflow": outflow, "rounding": torch.finfo(self.dtype).eps}
+        options = {"outflow": self.loses, "rounding": torch.finfo(self.dtype).eps}
         return blockwise_eigenbasis(matrix, self.mass, k, self.sizes, **options)
 
     def _pair_eigenbasis(self, k: int, tolerance: float | None) -> Eigenbasis:

@@ -10,6 +10,7 @@ from jaxtyping import Float, Shaped
 from torch import Tensor
 
 from torchlb.errors import InputError
+from torchlb.linalg.checks import check_finite, check_tensor
 
 
 def check_num_pairs(k: object) -> int:
@@ -106,51 +107,85 @@ class Eigenbasis:
     ) -> Float[Tensor, "*S k C"] | Float[Tensor, "*S k"]:
         """Coefficients Φᵀ(πf), ΦᵀMf for a symmetric pair, (…, k, C), or (…, S, k, C) for a batch of shapes.
 
-        (k,), or (S, k), for f (N,); InputError for another number of points.
+        (k,), or (S, k), for f (N,). In the type of f, that of the basis where f are integers; computed in that of f,
+        at least float32. InputError for another number of points, and for NaN or infinity in f.
         """
-        functionals = self.left if self.is_symmetric else self.mass[:, None] * self.eigenvectors
-        return self._analyse(functionals, f)
+        return self._checked(self.analyse(self.functionals, f), f)
 
     def to_basis_obliquely(
         self, f: Shaped[Tensor, "*B N C"] | Shaped[Tensor, " N"]
     ) -> Float[Tensor, "*S k C"] | Float[Tensor, "*S k"]:
         """Coefficients Wᵀf: zero on every left-over eigenvector of Δ, which Φᵀ(πf) is not."""
-        return self._analyse(self.left, f)
+        return self._checked(self.analyse(self.left, f), f)
+
+    @property
+    def functionals(self) -> Float[Tensor, "N k"]:
+        """ΠΦ, or MΦ for a symmetric pair: what `to_basis` multiplies by."""
+        return self.left if self.is_symmetric else self.mass[:, None] * self.eigenvectors
 
     def from_basis(
-        self, coefficients: Float[Tensor, "*S k C"] | Float[Tensor, "*S k"]
+        self, coefficients: Shaped[Tensor, "*S k C"] | Shaped[Tensor, "*S k"]
     ) -> Float[Tensor, "*B N C"] | Float[Tensor, " N"]:
-        """The function Φc with the given coefficients, (…, N, C), or (N,) for (k,) or (S, k)."""
+        """The function Φc with the given coefficients, (…, N, C), or (N,) for (k,) or (S, k).
+
+        In the type of the coefficients, as for `to_basis`; InputError for another number of them.
+        """
+        check_tensor(coefficients, "coefficients")
         if coefficients.ndim == self.eigenvalues.ndim:
             return self.from_basis(coefficients[..., None])[..., 0]
+        rows = self.eigenvalues.shape
+        if coefficients.shape[-1 - len(rows) : -1] != rows:
+            raise InputError(
+                f"expected coefficients of shape {(*rows,)} or (…, {', '.join(map(str, rows))}, C), got "
+                f"{tuple(coefficients.shape)}"
+            )
         return self.synthesise(self.eigenvectors, coefficients)
 
     def synthesise(
-        self, functions: Float[Tensor, "N k"], coefficients: Float[Tensor, "*S k C"]
+        self, functions: Float[Tensor, "N k"], coefficients: Shaped[Tensor, "*S k C"]
     ) -> Float[Tensor, "*B N C"]:
         """Σ_k functions[:, k] c_k, with the coefficients of its own shape at every point."""
-        functions = functions.to(coefficients.dtype)
-        if self.sizes is None:
-            return functions @ coefficients
-        parts = zip(functions.split(self.sizes), coefficients.unbind(-3), strict=True)
-        return torch.cat([block @ c for block, c in parts], dim=-2)
+        functions, c, dtype = self._typed(functions, coefficients)
+        with torch.autocast(c.device.type, enabled=False):
+            if self.sizes is None:
+                return (functions @ c).to(dtype)
+            parts = zip(functions.split(self.sizes), c.unbind(-3), strict=True)
+            return torch.cat([block @ column for block, column in parts], dim=-2).to(dtype)
 
-    def _analyse(self, functionals: Tensor, f: Tensor) -> Tensor:
-        """Of integers and masks, too, in the type of the basis."""
-        if not isinstance(f, Tensor):
-            raise TypeError(f"expected f as a tensor, got {type(f)}; torch.as_tensor(f) makes one")
+    def analyse(
+        self, functionals: Float[Tensor, "N k"], f: Shaped[Tensor, "*B N C"] | Shaped[Tensor, " N"]
+    ) -> Tensor:
+        """Σ_i functionals[i] f_i, over the points of each shape. NaN in f pass on, and no GPU is waited for."""
+        check_tensor(f)
         if f.ndim == 1:
-            return self._analyse(functionals, f[:, None])[..., 0]
+            return self.analyse(functionals, f[:, None])[..., 0]
         if f.shape[-2:-1] != self.mass.shape:
             raise InputError(
                 f"expected f of shape (N,) or (…, N, C) with N = {len(self.mass)}, got {tuple(f.shape)}"
             )
-        f = f if f.is_floating_point() or f.is_complex() else f.to(functionals.dtype)
-        functionals = functionals.to(f.dtype)
-        if self.sizes is None:
-            return functionals.mT @ f
-        parts = zip(functionals.split(self.sizes), f.split(self.sizes, dim=-2), strict=True)
-        return torch.stack([block.mT @ g for block, g in parts], dim=-3)
+        functionals, f, dtype = self._typed(functionals, f)
+        with torch.autocast(f.device.type, enabled=False):
+            if self.sizes is None:
+                return (functionals.mT @ f).to(dtype)
+            parts = zip(functionals.split(self.sizes), f.split(self.sizes, dim=-2), strict=True)
+            return torch.stack([block.mT @ g for block, g in parts], dim=-3).to(dtype)
+
+    @staticmethod
+    def _typed(functions: Tensor, f: Tensor) -> tuple[Tensor, Tensor, torch.dtype]:
+        """Both in the type to multiply in, that of f and at least float32, and the type of the result.
+
+        Integers and masks are of the type of the basis. In half precision masses and functions of small shapes are 0.
+        """
+        dtype = f.dtype if f.is_floating_point() or f.is_complex() else functions.dtype
+        wide = torch.promote_types(dtype, torch.float32)
+        return functions.to(wide), f.to(wide), dtype
+
+    @staticmethod
+    def _checked(coefficients: Tensor, f: Tensor) -> Tensor:
+        """The coefficients; where they are not finite f may be the reason."""
+        if not torch.compiler.is_compiling() and not bool(coefficients.isfinite().all()):
+            check_finite(f)
+        return coefficients
 
 
 def unstack_eigenbases(basis: Eigenbasis) -> list[Eigenbasis]:

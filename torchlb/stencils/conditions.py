@@ -76,5 +76,7 @@ class Dirichlet(Condition):
 
 
 ConditionName = Literal["neumann", "dirichlet"]
-CONDITIONS: dict[str, Condition] = {"neumann": Neumann(), "dirichlet": Dirichlet()}
+PAIRED: dict[str, type[Condition]] = {"neumann": Neumann, "dirichlet": Dirichlet}
+"""The conditions that the weak pair has, too: the natural one, and the one that takes out rows and columns."""
+CONDITIONS: dict[str, Condition] = {name: kind() for name, kind in PAIRED.items()}
 """The values of the option `condition`; None stands for no condition at all."""

@@ -1,0 +1,38 @@
+"""What every product with functions on points asks of them: a tensor of real or complex numbers, all finite."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from torchlb.errors import InputError, InputTypeError, first_few
+
+
+def check_tensor(f: object, what: str = "f") -> None:
+    """InputTypeError unless it is a tensor.
+
+    >>> check_tensor([1.0])
+    Traceback (most recent call last):
+    torchlb.errors.InputTypeError: expected f as a tensor, got <class 'list'>; torch.as_tensor(f) makes one
+    """
+    if not isinstance(f, Tensor):
+        raise InputTypeError(
+            f"expected {what} as a tensor, got {type(f)}; torch.as_tensor({what}) makes one"
+        )
+
+
+def check_finite(f: Tensor, what: str = "f") -> None:
+    """InputError that names the points where f, (N,) or (…, N, C), is NaN or infinite; not in compiled code.
+
+    >>> check_finite(torch.tensor([0.0, torch.nan, torch.inf]))  # doctest: +ELLIPSIS
+    Traceback (most recent call last):
+    torchlb.errors.InputError: f: expected finite values, got NaN or infinity at 2 of 3 points (1, 2); ...
+    """
+    if torch.compiler.is_compiling() or bool(f.isfinite().all()):
+        return
+    bad = (~f.isfinite()).nonzero()[:, max(f.ndim - 2, 0)].unique()
+    raise InputError(
+        f"{what}: expected finite values, got NaN or infinity at {len(bad)} of {f.shape[max(f.ndim - 2, 0)]} points "
+        f"({first_few(bad)}); give these points values, as torch.nan_to_num({what}) does, or build the operator "
+        "without them"
+    )
