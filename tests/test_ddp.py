@@ -1,4 +1,4 @@
-"""Training under torchrun on two processes (DDP, gloo) is the training of one process."""
+"""Training under torchrun on two processes (DDP, gloo): that of one process, and with another shape on each."""
 
 import json
 import os
@@ -48,3 +48,65 @@ def test_two_processes_give_the_loss_curve_of_one(tmp_path):
     assert one[-1] < one[0] / 5
     assert (tmp_path / "two" / "loss.png").read_bytes().startswith(b"\x89PNG")
     assert len(list((tmp_path / "two" / "cache").iterdir())) == 4
+
+
+TWO_SHAPES = """
+import torch
+import torch.distributed as dist
+from torch import nn
+from torch.nn.parallel import DistributedDataParallel
+from torchlb import Diffusion, LaplaceBeltrami
+from torchlb.surfaces import Ellipsoid
+
+
+class Takes(nn.Module):
+    def __init__(self):
+        super().__init__()
+        self.diffusion = Diffusion(3, k=4, init_time=0.1).double()
+
+    def forward(self, x, lb):
+        return self.diffusion(x, lb)
+
+
+class Holds(Takes):
+    def __init__(self, lb):
+        super().__init__()
+        self.lb = lb
+
+    def forward(self, x):
+        return super().forward(x, self.lb)
+
+
+def own_buffers(model):
+    modules = model.named_modules()
+    return [f"{name}.{b}" for name, m in modules if isinstance(m, LaplaceBeltrami) for b in m.tensors]
+
+
+dist.init_process_group("gloo")
+rank = dist.get_rank()
+for sizes in ((60, 90), (60, 60)):  # of the same size, one would be replaced by the other in silence
+    vertices, faces = Ellipsoid((1.0, 0.8, 0.6 + 0.2 * rank)).mesh(sizes[rank])
+    lb = LaplaceBeltrami.from_cotangent(vertices, faces)
+    values, model = lb.values.clone(), Holds(lb)
+    DistributedDataParallel._set_params_and_buffers_to_ignore_for_model(model, own_buffers(model))
+    held, taken = DistributedDataParallel(model), DistributedDataParallel(Takes())
+    for _ in range(2):
+        one, other = held(vertices), taken(vertices, lb)
+        (one.square().sum() + other.square().sum()).backward()
+    assert torch.equal(one, other) and torch.equal(lb.values, values) and torch.equal(lb.points, vertices)
+    gradients = [held.module.diffusion.raw_time.grad, taken.module.diffusion.raw_time.grad]
+    assert torch.equal(*gradients) and bool((gradients[0] != 0).all())
+dist.destroy_process_group()
+"""
+
+
+def test_each_process_has_a_shape_of_its_own(tmp_path):
+    """As an argument, or held by the model and named to DDP: buffers are otherwise those of the first process."""
+    script = tmp_path / "two_shapes.py"
+    script.write_text(TWO_SHAPES)
+    environment = {**os.environ, "PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1"}
+    torchrun = ["-m", "torch.distributed.run", "--standalone", "--nproc_per_node=2", str(script)]
+    done = subprocess.run(
+        [sys.executable, *torchrun], env=environment, capture_output=True, text=True, timeout=300
+    )
+    assert done.returncode == 0, done.stderr

@@ -303,7 +303,7 @@ def test_eigenpairs_are_those_in_any_unit(unit):
     [("from_mesh", "float64"), ("from_mesh", "float32"), ("from_cotangent", "float64")],
 )
 def test_a_stiffness_matrix_has_no_factor(build, dtype):
-    """K1 = 0, which rounding hides: the last pivot is 1e-14, K⁻¹ would be 1e14. K + cM and K without a point have one."""
+    """K1 = 0, which rounding hides: the last pivot is 1e-14, K⁻¹ 1e14. K + cM has one, and K without a point."""
     vertices, faces = Sphere().mesh(300)
     lb = getattr(LaplaceBeltrami, build)(vertices.numpy().astype(dtype), faces)
     stiffness, mass = lb.to_scipy("stiffness"), lb.to_scipy("mass")
