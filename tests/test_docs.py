@@ -129,6 +129,14 @@ TRIGGERS = {
     "boundary_values: the": lambda: torchlb.poisson_solve(
         LaplaceBeltrami.from_mesh(VERTICES, FACES), 0 * VERTICES[:, 0], boundary_values=1.0
     ),
+    "boundary_values: only": lambda: torchlb.poisson_solve(
+        LaplaceBeltrami.from_points(Circle().points(30), order=1),
+        torch.zeros(30),
+        boundary_values=1.0,
+    ),
+    "f: expected finite": lambda: torchlb.heat_flow(
+        LaplaceBeltrami.from_mesh(VERTICES, FACES), torch.nan * VERTICES[:, 0], 0.1
+    ),
     "…: not a mesh": lambda: (
         Path("shape.obj").write_text("nothing"),
         torchlb.interop.trimesh.read_shape("shape.obj"),

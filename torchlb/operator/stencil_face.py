@@ -76,9 +76,11 @@ class StencilFace(OperatorStorage):
     def local_gradient(self, f: Tensor) -> Tensor:
         """∇f in the frames, (N, d, C) for f (N, C), (N, d) for (N,), (B, N, d, C) for (B, N, C). Units of f by 1/ℓ."""
         check_tensor(f)
-        with torch.autocast(f.device.type, enabled=False):
-            parts = [self._apply_rows(values, f) for values in self.gradient_values]
-            return torch.stack(parts, dim=1 if f.ndim < 3 else 2)
+        if torch.is_autocast_enabled(f.device.type):
+            with torch.autocast(f.device.type, enabled=False):
+                return self.local_gradient(f)
+        parts = [self._apply_rows(values, f) for values in self.gradient_values]
+        return torch.stack(parts, dim=1 if f.ndim < 3 else 2)
 
     def gradient(self, f: Tensor) -> Tensor:
         """∇f as tangent vectors of space, (N, n, C) for f (N, C), (N, n) for (N,), (B, N, n, C) for (B, N, C).
@@ -90,8 +92,10 @@ class StencilFace(OperatorStorage):
 
     def _turned(self, equation: str, local: Tensor) -> Tensor:
         """The frames times a field, in its type, also under autocast: rounding before a derivative grows by 1/h."""
-        with torch.autocast(local.device.type, enabled=False):
-            return torch.einsum(equation, self.frames.to(local.dtype), local)
+        if torch.is_autocast_enabled(local.device.type):
+            with torch.autocast(local.device.type, enabled=False):
+                return self._turned(equation, local)
+        return torch.einsum(equation, self.frames.to(local.dtype), local)
 
     def divergence(self, v: Tensor) -> Tensor:
         """div v = Σ_c E_c · ∂_c v of space vectors v: (N,) for (N, n), (N, C) for (N, n, C), batches (B, N, C) too.

@@ -110,13 +110,17 @@ class Eigenbasis:
         (k,), or (S, k), for f (N,). In the type of f, that of the basis where f are integers; computed in that of f,
         at least float32. InputError for another number of points, and for NaN or infinity in f.
         """
-        return self._checked(self.analyse(self.functionals, f), f)
+        coefficients = self.analyse(self.functionals, f)
+        check_finite(f)
+        return coefficients
 
     def to_basis_obliquely(
         self, f: Shaped[Tensor, "*B N C"] | Shaped[Tensor, " N"]
     ) -> Float[Tensor, "*S k C"] | Float[Tensor, "*S k"]:
         """Coefficients Wᵀf: zero on every left-over eigenvector of Δ, which Φᵀ(πf) is not."""
-        return self._checked(self.analyse(self.left, f), f)
+        coefficients = self.analyse(self.left, f)
+        check_finite(f)
+        return coefficients
 
     @property
     def functionals(self) -> Float[Tensor, "N k"]:
@@ -145,12 +149,14 @@ class Eigenbasis:
         self, functions: Float[Tensor, "N k"], coefficients: Shaped[Tensor, "*S k C"]
     ) -> Float[Tensor, "*B N C"]:
         """Σ_k functions[:, k] c_k, with the coefficients of its own shape at every point."""
+        if torch.is_autocast_enabled(coefficients.device.type):
+            with torch.autocast(coefficients.device.type, enabled=False):
+                return self.synthesise(functions, coefficients)
         functions, c, dtype = self._typed(functions, coefficients)
-        with torch.autocast(c.device.type, enabled=False):
-            if self.sizes is None:
-                return (functions @ c).to(dtype)
-            parts = zip(functions.split(self.sizes), c.unbind(-3), strict=True)
-            return torch.cat([block @ column for block, column in parts], dim=-2).to(dtype)
+        if self.sizes is None:
+            return (functions @ c).to(dtype)
+        parts = zip(functions.split(self.sizes), c.unbind(-3), strict=True)
+        return torch.cat([block @ column for block, column in parts], dim=-2).to(dtype)
 
     def analyse(
         self, functionals: Float[Tensor, "N k"], f: Shaped[Tensor, "*B N C"] | Shaped[Tensor, " N"]
@@ -163,12 +169,14 @@ class Eigenbasis:
             raise InputError(
                 f"expected f of shape (N,) or (…, N, C) with N = {len(self.mass)}, got {tuple(f.shape)}"
             )
+        if torch.is_autocast_enabled(f.device.type):
+            with torch.autocast(f.device.type, enabled=False):
+                return self.analyse(functionals, f)
         functionals, f, dtype = self._typed(functionals, f)
-        with torch.autocast(f.device.type, enabled=False):
-            if self.sizes is None:
-                return (functionals.mT @ f).to(dtype)
-            parts = zip(functionals.split(self.sizes), f.split(self.sizes, dim=-2), strict=True)
-            return torch.stack([block.mT @ g for block, g in parts], dim=-3).to(dtype)
+        if self.sizes is None:
+            return (functionals.mT @ f).to(dtype)
+        parts = zip(functionals.split(self.sizes), f.split(self.sizes, dim=-2), strict=True)
+        return torch.stack([block.mT @ g for block, g in parts], dim=-3).to(dtype)
 
     @staticmethod
     def _typed(functions: Tensor, f: Tensor) -> tuple[Tensor, Tensor, torch.dtype]:
@@ -179,13 +187,6 @@ class Eigenbasis:
         dtype = f.dtype if f.is_floating_point() or f.is_complex() else functions.dtype
         wide = torch.promote_types(dtype, torch.float32)
         return functions.to(wide), f.to(wide), dtype
-
-    @staticmethod
-    def _checked(coefficients: Tensor, f: Tensor) -> Tensor:
-        """The coefficients; where they are not finite f may be the reason."""
-        if not torch.compiler.is_compiling() and not bool(coefficients.isfinite().all()):
-            check_finite(f)
-        return coefficients
 
 
 def unstack_eigenbases(basis: Eigenbasis) -> list[Eigenbasis]:
