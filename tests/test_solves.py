@@ -367,8 +367,8 @@ def test_times_that_cannot_be(t):
 @pytest.mark.parametrize(
     ("name", "data", "message"),
     [
-        ("stencil", {"flux": 1.0}, "a stencil has no place"),
-        ("stencil", {"boundary_values": 1.0}, "a stencil has no place"),
+        ("stencil", {"flux": 1.0}, "the stencil has no place"),
+        ("stencil", {"boundary_values": 1.0}, "the stencil has no place"),
         ("pair", {"flux": 1.0}, "the shape is closed"),
         ("neumann", {"boundary_values": 1.0}, "condition='dirichlet'"),
         ("pair", {"boundary_values": 1.0}, "the shape is closed"),
@@ -502,3 +502,14 @@ def test_swapped_arguments_are_named(unchecked):
     for function in (heat_flow, implicit_step):
         with pytest.raises(TypeError, match=r"expected an operator, got a Tensor .* \(lb, f\)"):
             function(lb.mass, lb, 0.1)
+
+
+def test_boundary_data_on_curves_and_solids_get_true_advice():
+    """No mesh of triangles is a solid."""
+    arc = torch.linspace(0, 1, 30, dtype=torch.float64)[:, None] * torch.tensor([1.0, 0.0])
+    edges = torch.arange(29)[:, None] + torch.arange(2)
+    lb = LaplaceBeltrami.from_mesh(arc, edges, order=1, condition="dirichlet")
+    with pytest.raises(
+        ValueError, match=r"only a weak pair .*dimension 1 in R\^2.*by a system of the stencil"
+    ):
+        poisson_solve(lb, arc[:, 0], boundary_values=1.0)
