@@ -5,9 +5,10 @@ import numpy as np
 import pytest
 import torch
 import trimesh
+from scipy.spatial import Delaunay
 
 from torchlb import InputError, LaplaceBeltrami, geodesic_distance
-from torchlb.surfaces import Sphere
+from torchlb.surfaces import Sphere, Torus, UnitDisk
 
 
 def test_distances_are_those_over_the_given_triangles():
@@ -50,3 +51,61 @@ def test_sources_that_are_none(sources):
     lb = LaplaceBeltrami.from_cotangent(*Sphere().mesh(300))
     with pytest.raises(InputError, match="sources"):
         geodesic_distance(lb, sources)
+
+
+def _disk_of_random_points(count):
+    points = np.random.default_rng(0).uniform(-1, 1, (2 * count, 2))
+    points = points[(points**2).sum(1) < 0.98][:count]
+    angle = 2 * np.pi * np.arange(150) / 150
+    points = np.concatenate([points, np.stack([np.cos(angle), np.sin(angle)], 1)])
+    return torch.from_numpy(np.pad(points, ((0, 0), (0, 1)))), Delaunay(points).simplices
+
+
+@pytest.mark.parametrize("mesh", [UnitDisk().mesh(500), UnitDisk().mesh(2000), "random"])
+def test_distance_from_the_rim_of_a_disk(mesh):
+    """1 − r; that to the polygon is less, by its sagitta h²/8, and a front that converges costs no more."""
+    vertices, faces = _disk_of_random_points(2000) if mesh == "random" else mesh
+    lb, radius = LaplaceBeltrami.from_cotangent(vertices, faces), vertices.norm(dim=1)
+    distance = geodesic_distance(lb, radius > 1 - 1e-9)
+    inside = radius < 0.95
+    ratio = (distance / (1 - radius))[inside]
+    assert (ratio - 1).abs().mean() < 0.006
+    assert ratio.min() > 0.93
+
+
+def test_distance_from_an_arc():
+    """Half of the rim: a fan around each end, a converging front before it."""
+    vertices, faces = UnitDisk().mesh(2000)
+    radius = vertices.norm(dim=1)
+    arc = (radius > 1 - 1e-9) & (vertices[:, 0] > 0)
+    exact = torch.where(
+        vertices[:, 0] > 0, 1 - radius, torch.cdist(vertices, vertices[arc]).amin(1)
+    )
+    distance = geodesic_distance(LaplaceBeltrami.from_cotangent(vertices, faces), arc)
+    assert (distance - exact).abs().mean() < 0.005 * exact.mean()
+
+
+@pytest.mark.parametrize("surface", [Sphere(), Torus(), "random", "cloud"])
+def test_distance_to_several_points_is_the_least_of_those_to_each(surface):
+    if surface == "random":
+        lb = LaplaceBeltrami.from_cotangent(*_disk_of_random_points(1000))
+    elif surface == "cloud":
+        lb = LaplaceBeltrami.from_points(Sphere().points(1000))
+    else:
+        lb = LaplaceBeltrami.from_cotangent(*surface.mesh(1000))
+    sources = range(10, 1000, 66)
+    least = torch.stack([geodesic_distance(lb, source) for source in sources]).amin(0)
+    distance = geodesic_distance(lb, sources)
+    assert (distance - least).abs().mean() < 2e-3 * least.mean()
+
+
+def test_distance_from_a_region():
+    """Half a torus: exact distances on the polyhedron from its vertices, less at most an edge's height at the first."""
+    vertices, faces = Torus().mesh(1000)
+    inside = vertices[:, 0] > 0
+    every, none = np.arange(len(vertices)), np.zeros(0, dtype=int)
+    sources = inside.nonzero()[:, 0].numpy()
+    exact = igl.exact_geodesic(vertices.numpy(), faces.numpy(), sources, none, every, none)
+    distance = geodesic_distance(LaplaceBeltrami.from_cotangent(vertices, faces), inside)
+    assert (distance[inside] == 0).all()
+    assert np.abs(distance.numpy() - exact).mean() < 0.01 * exact.mean()
