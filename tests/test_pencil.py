@@ -203,6 +203,17 @@ def test_components_have_one_zero_eigenvalue_each_and_a_global_constant(size):
     check_pairs(basis, stiffness, mass_matrix)
 
 
+def test_of_many_components_only_as_many_constants_as_wanted():
+    """n zeros of n parts would be a dense basis, (N, n); the first k have KΦ = 0 and ΦᵀMΦ = I, and one is constant."""
+    parts, edge = 3000, sparse.csr_array([[1.0, -1.0], [-1.0, 1.0]])
+    stiffness = sparse.kron(sparse.eye_array(parts), edge, format="csr")
+    mass_matrix = sparse.diags_array(np.repeat(1 + np.arange(parts) / parts, 2)).tocsr()
+    basis = solved(stiffness, mass_matrix, 7)
+    assert (basis.eigenvalues == torch.zeros(7)).all()
+    assert (basis.eigenvectors[:, 0] == basis.eigenvectors[0, 0]).all()
+    check_pairs(basis, stiffness, mass_matrix)
+
+
 @pytest.mark.parametrize("size", [50, 3000])
 def test_fixed_points_are_zeros_of_the_eigenvectors(size):
     stiffness, mass_matrix = path_matrix(size, 0.0), sparse.eye_array(size).tocsr()

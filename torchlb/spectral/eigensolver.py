@@ -111,15 +111,59 @@ def solve_eigenbasis(
             null_left = left_null_vector(delta, areas, q)[0].numpy()
         except StabilityError as error:
             raise EigenbasisError(SINGULAR.format(len(pi))) from error
-    wanted = max(min(k, len(pi)) - int(conserving.sum()), 0)
+    if conserving.sum() > k:
+        areas = np.where(conserving, np.bincount(component, pi), 0.0)
+        phi = constants(component, areas, k)
+        scale = areas / np.where(conserving, np.bincount(component, null_left), 1.0)
+        left = (null_left * scale[component])[:, None] * phi
+        values, phi, pi, left = map(torch.from_numpy, (np.zeros(k), phi, pi, left))
+        return Eigenbasis(values, phi, pi, left)
+    wanted = min(k, len(pi)) - int(conserving.sum())
     parts = []
-    for c in range(count):
-        index = np.flatnonzero(component == c)
+    for c, index in enumerate(members(component)):
         null = null_left[index] if conserving[c] else None
         parts.append(_part(a[index][:, index], index, pi[index], null, wanted))
     cut = _cut(parts, wanted)
     solved = [_ritz(part, cut) for part in parts]
-    return _merged(parts, solved, pi, min(k, len(pi)))
+    return _merged(parts, solved, pi)
+
+
+def members(component: np.ndarray) -> list[np.ndarray]:
+    """The points of every component, ascending, of the component of each point.
+
+    >>> members(np.array([0, 1, 0]))
+    [array([0, 2]), array([1])]
+    """
+    order = np.argsort(component, kind="stable")
+    return np.split(order, np.cumsum(np.bincount(component))[:-1])
+
+
+def constants(
+    component: np.ndarray, areas: Float[np.ndarray, " P"], k: int
+) -> Float[np.ndarray, "N k"]:
+    """The first k of orthonormal functions that are constant on every component; the first is so everywhere.
+
+    They vanish on components whose area is given as 0; k is at most the number of the others.
+
+    >>> constants(np.array([0, 0, 1]), np.array([2.0, 2.0]), 2)
+    array([[ 0.5,  0.5],
+           [ 0.5,  0.5],
+           [ 0.5, -0.5]])
+    """
+    if k == 0:
+        return np.zeros((len(component), 0))
+    on = areas > 0
+    root = np.sqrt(areas[on])
+    values = np.zeros((len(areas), k))
+    values[on] = global_first(root, k) / root[:, None]
+    values[on, 0] = 1 / linalg.norm(root)
+    return values[component]
+
+
+def global_first(root: Float[np.ndarray, " P"], k: int) -> Float[np.ndarray, "P k"]:
+    """Orthonormal columns, the first along √area, with which the constants of components are recombined."""
+    t = np.linalg.qr(np.column_stack([root, np.eye(len(root), k - 1)]))[0]
+    return t * np.sign(t[0, 0])
 
 
 def _part(
@@ -289,7 +333,7 @@ def _exact_modes(b: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return rates, np.stack([v, inverse, turn @ inverse])
 
 
-def _merged(parts: list[_Part], solved: list[Solved], pi: np.ndarray, k: int) -> Eigenbasis:
+def _merged(parts: list[_Part], solved: list[Solved], pi: np.ndarray) -> Eigenbasis:
     """The components side by side: their constants recombined so that the first is global, the rest ascending."""
     conserving = np.array([part.null_left is not None for part in parts])
     count = int(conserving.sum())
@@ -312,18 +356,15 @@ def _merged(parts: list[_Part], solved: list[Solved], pi: np.ndarray, k: int) ->
     if count:
         index = [part.index for part in parts if part.null_left is not None]
         root = np.sqrt(np.array([pi[index].sum() for index in index]))
-        t = np.linalg.qr(np.column_stack([root, np.eye(count)[:, : count - 1]]))[0]
-        t *= np.sign(t[0, 0])
+        t = global_first(root, count)
         phi[:, :count], left[:, :count] = phi[:, :count] @ t, left[:, :count] @ t
         v[:count], others[:, :, :count] = t.T @ v[:count], others[:, :, :count] @ t
         phi[np.concatenate(index), 0] = 1 / linalg.norm(root)
     modes: dict[str, Any] = {}
-    if count <= k and np.isfinite(transform).all():
+    if np.isfinite(transform).all():
         modes = {
             "decay_rates": torch.from_numpy(rates),
             "modal_transform": torch.from_numpy(np.stack([v, *others])),
         }
-    keep = slice(None) if count <= k else slice(k)
-    arrays = (values[keep], phi[:, keep], pi, left[:, keep])
-    tensors: Any = [torch.from_numpy(np.ascontiguousarray(x)) for x in arrays]
+    tensors: Any = [torch.from_numpy(np.ascontiguousarray(x)) for x in (values, phi, pi, left)]
     return Eigenbasis(*tensors, **modes)

@@ -27,7 +27,7 @@ from torchlb.linalg.lanczos import Inverse, inverse, lanczos
 from torchlb.linalg.sparse import both_products, multiply, on_one_pattern
 from torchlb.linalg.two_levels import Matrix, absolute_row_sums, main_entries, two_levels
 from torchlb.spectral.eigenbasis import Eigenbasis
-from torchlb.spectral.eigensolver import GAP
+from torchlb.spectral.eigensolver import GAP, constants, members
 
 TOLERANCE, LOOSEST = 1.5e-8, 1e-3
 """Times k², since errors of quadratic elements grow with λ², and at most: one sweep, in general, or one and a half."""
@@ -51,6 +51,7 @@ SAFETY = 4.0
 TINY, DEPENDENT = 1e-300, 1e-12
 
 Sparse = sparse.csr_array
+Pair = tuple[Sparse, Sparse]
 Blocks = tuple[np.ndarray, ...]  # U, KU, MU
 
 
@@ -60,7 +61,7 @@ class _Part(NamedTuple):
     points: np.ndarray
     stiffness: Sparse
     mass_matrix: Sparse
-    linear: tuple[Sparse, Sparse] | None  # K₁, M₁
+    linear: Pair | None  # K₁, M₁
     conserving: bool  # no point is fixed, so that constants have the eigenvalue 0
 
 
@@ -70,11 +71,11 @@ def pencil_eigenbasis(
     mass: Float[Tensor, " N"],
     k: int,
     *,
-    linear: tuple[Sparse, Sparse] | None = None,
+    linear: Pair | None = None,
     fixed: Bool[np.ndarray, " N"] | None = None,
     tolerance: float | None = None,
 ) -> Eigenbasis:
-    """The min(k, N) smallest eigenpairs of K u = λ M u, and more where a group of equal ones would be split.
+    """The min(k, N) smallest eigenpairs of K u = λ M u, and more where a group of equal ones (but 0) would be split.
 
     Parameters
     ----------
@@ -108,41 +109,51 @@ def pencil_eigenbasis(
     matrices[1] = matrices[1] / unit
     if linear is not None:
         linear = linear[0], linear[1] / unit
-    parts = _parts(matrices[0], matrices[1], linear, held)
+    near = None if linear is None else (_narrow(linear[0]), _narrow(linear[1]))
+    whole = matrices[0], matrices[1]
+    component, pattern = _components(whole, near)
+    areas = np.bincount(component, matrices[1].sum(axis=1))
+    areas[component[held]] = 0.0
+    zeros = min(int((areas > 0).sum()), k)
     if linear is None:
         tolerance = EXACT**2
     elif tolerance is None:
         tolerance = min(TOLERANCE * k**2, LOOSEST)
+    parts = _parts(whole, near, held, component, pattern) if zeros < k else []
     found = [_pairs(part, k, tolerance) for part in parts]
-    return _merged(parts, found, mass, k, tolerance, unit)
+    null = constants(component, areas, zeros)
+    return _merged(parts, found, (null, whole[1] @ null), mass, k, tolerance, unit)
+
+
+def _components(whole: Pair, near: Pair | None) -> tuple[np.ndarray, Sparse]:
+    """The component of every point, as both matrices connect them, and the pattern of the linear pair."""
+    pattern = _joined(*(near or whole))
+    count, component = csgraph.connected_components(pattern, directed=False)
+    if near and count > 1:  # fits may reach from one to the other
+        component = csgraph.connected_components(_joined(*whole), directed=False)[1]
+    return component, pattern
 
 
 def _parts(
-    stiffness: Sparse, mass_matrix: Sparse, linear: tuple[Sparse, Sparse] | None, fixed: np.ndarray
+    whole: Pair, near: Pair | None, fixed: np.ndarray, component: np.ndarray, pattern: Sparse
 ) -> list[_Part]:
-    """The components, as both matrices connect them, without their fixed points.
+    """The components without their fixed points.
 
     They are numbered along the surface (Cuthill–McKee), which halves the time of the products.
     """
-    near = None if linear is None else (_narrow(linear[0]), _narrow(linear[1]))
-    pattern = _joined(*(near or (stiffness, mass_matrix)))
-    count, component = csgraph.connected_components(pattern, directed=False)
-    if near and count > 1:  # fits may reach from one to the other
-        joint = _joined(stiffness, mass_matrix)
-        count, component = csgraph.connected_components(joint, directed=False)
     order = csgraph.reverse_cuthill_mckee(pattern, symmetric_mode=True)
     parts = []
-    for c in range(count):
-        whole = order[component[order] == c]
-        free = whole[~fixed[whole]]
+    for own in members(component[order]):
+        points = order[own]
+        free = points[~fixed[points]]
         if len(free):
-            own = None if near is None else _renumbered(near, free)
-            k, m = _renumbered((stiffness, mass_matrix), free)
-            parts.append(_Part(free, k, m, own, len(free) == len(whole)))
+            linear = None if near is None else _renumbered(near, free)
+            k, m = _renumbered(whole, free)
+            parts.append(_Part(free, k, m, linear, len(free) == len(points)))
     return parts
 
 
-def _renumbered(pair: tuple[Sparse, Sparse], order: np.ndarray) -> tuple[Sparse, Sparse]:
+def _renumbered(pair: Pair, order: np.ndarray) -> Pair:
     """Symmetric matrices with these rows and columns, in this order."""
     if not on_one_pattern(*pair):
         one, other = (sparse.csr_array(matrix[order].T)[order] for matrix in pair)
@@ -175,7 +186,7 @@ def _constant(mass_matrix: Sparse) -> np.ndarray:
 
 
 def _pairs(part: _Part, k: int, tolerance: float) -> tuple[np.ndarray, ...]:
-    """The k smallest eigenvalues of a component, or all, with groups whole, their relative errors, U, and MU."""
+    """The k smallest eigenvalues of a component, or all, with groups whole, their relative errors, U, and MU; not 0."""
     size, zero = len(part.points), int(part.conserving)
     count = min(k + GUARD, size)
     if size <= max(DENSE, SHARE * count):
@@ -205,16 +216,14 @@ def _pairs(part: _Part, k: int, tolerance: float) -> tuple[np.ndarray, ...]:
                 return _pairs(part._replace(linear=None), k, EXACT**2)
             values, errors, u, mu = swept
     if zero:
-        values[0], errors[0] = 0.0, 0.0
-        u[:, 0] = _constant(part.mass_matrix)
-        mu[:, 0] = part.mass_matrix @ u[:, 0]
+        values[0] = 0.0
     if (values[zero:] <= 0).any():
         raise EigenbasisError(
             f"eigenbasis: the stiffness has the eigenvalue {values[zero:].min():.3g} on a component of {size} points, "
             "where it should be positive"
         )
     keep = _closed(values, k, tolerance)
-    return values[:keep], errors[:keep], u[:, :keep], mu[:, :keep]
+    return values[zero:keep], errors[zero:keep], u[:, zero:keep], mu[:, zero:keep]
 
 
 def _closed(values: np.ndarray, k: int, tolerance: float) -> int:
@@ -353,40 +362,33 @@ def _ritz(space: Blocks, count: int) -> tuple[np.ndarray, Blocks]:
 def _merged(
     parts: list[_Part],
     found: list[tuple[np.ndarray, ...]],
+    null: tuple[np.ndarray, np.ndarray],
     mass: Tensor,
     k: int,
     tolerance: float,
     unit: float,
 ) -> Eigenbasis:
-    """The components side by side, ascending, in units of `mass`; their constants recombined: the first is global."""
-    values, errors = (np.concatenate([f[i] for f in found] or [np.zeros(0)]) for i in (0, 1))
-    columns = np.cumsum([0, *(len(f[0]) for f in found)])
-    constants = [at for part, at in zip(parts, columns[:-1], strict=True) if part.conserving]
-    rest = np.setdiff1d(np.arange(len(values)), constants)
-    rest = rest[np.argsort(values[rest], kind="stable")]
-    order = np.concatenate([np.array(constants, dtype=int), rest])
-    values, errors = values[order], errors[order]
+    """After Φ and MΦ of constants what else the components have, ascending, in units of `mass`."""
+    zeros = null[0].shape[1]
+    values, errors = (np.concatenate([np.zeros(zeros), *(f[i] for f in found)]) for i in (0, 1))
+    order = np.arange(len(values))
+    order[zeros:] = zeros + np.argsort(values[zeros:], kind="stable")
+    values = values[order]
     keep = _closed(values, k, tolerance) if len(values) else 0
+    values, errors = values[:keep], errors[order[:keep]]
     phi, left = np.zeros((2, len(mass), keep))
-    for part, (_, _, *vectors), at in zip(parts, found, columns[:-1], strict=True):
+    phi[:, :zeros], left[:, :zeros] = null
+    at = zeros
+    for part, (own, _, *vectors) in zip(parts, found, strict=True):
         mine = order[:keep] - at
-        others = (mine < 0) | (mine >= vectors[0].shape[1])
-        for whole, own in zip((phi, left), vectors, strict=True):
-            block = own.take(np.where(others, 0, mine), 1)
-            block[:, others] = 0.0
-            whole[part.points] = block
-    count = len(constants)
-    if count:
-        nulls = [part for part in parts if part.conserving]
-        root = np.sqrt([part.mass_matrix.sum() for part in nulls])
-        t = np.linalg.qr(np.column_stack([root, np.eye(count)[:, : count - 1]]))[0]
-        t *= np.sign(t[0, 0])
-        phi[:, :count], left[:, :count] = phi[:, :count] @ t, left[:, :count] @ t
-        phi[np.concatenate([part.points for part in nulls]), 0] = 1 / linalg.norm(root)
+        here = np.flatnonzero((mine >= 0) & (mine < len(own)))
+        for whole, columns in zip((phi, left), vectors, strict=True):
+            whole[part.points[:, None], here] = columns.take(mine[here], 1)
+        at += len(own)
     signs = np.where(-phi.min(0) > phi.max(0), -1.0, 1.0)  # the largest entry is positive
     phi *= signs / unit**0.5
     left *= signs * unit**0.5
-    arrays = (values[:keep] / unit, phi, left, errors[:keep].copy())
+    arrays = (values / unit, phi, left, errors)
     eigenvalues, eigenvectors, left, errors = (torch.from_numpy(x) for x in arrays)
     mass = mass.detach().cpu().double()
     return Eigenbasis(
