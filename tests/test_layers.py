@@ -5,6 +5,7 @@ import json
 import shutil
 import subprocess
 import sys
+from functools import partial
 
 import pytest
 import torch
@@ -361,6 +362,30 @@ def test_compiled_for_two_sizes_it_takes_all():
     assert max(graphs.values()) <= 4, graphs
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", ["pair", "stencil"])
+def test_one_graph_is_enough_for_what_conventions_promise(kind):
+    """`fullgraph=True`: products of the operator, and the layers that consist of them."""
+    run_apart("one graph", kind)
+
+
+def compiled_as_one_graph(kind):
+    """Check what docs/conventions.md promises of `fullgraph=True` against what is not compiled."""
+    vertices, faces = Sphere().mesh(110)
+    lb = LaplaceBeltrami.from_mesh(vertices.float(), faces, order=1, weak_form=kind == "pair")
+    lb.eigenbasis(K)
+    x = features(lb)
+    names = ["deflated", "spectral", "convolution", "gradients", "net", "original net"]
+    names += ["chebyshev", "contour"] if kind == "stencil" else []
+    functions = [partial(layer_of(name), lb=lb) for name in names]
+    functions += [lb, lb.gradient, lambda f: lb.divergence(lb.gradient(f[:, 0]))]
+    functions += [lambda f: lb.eigenbasis(K).from_basis(lb.eigenbasis(K).to_basis(f))]
+    for function in functions:
+        torch._dynamo.reset()
+        compiled = torch.compile(lambda f, g=function: g(f), backend="eager", fullgraph=True)
+        torch.testing.assert_close(compiled(x), function(x), rtol=1e-3, atol=1e-4)
+
+
 @every_layer
 def test_autocast_to_bfloat16_stays_close(eight, name):
     """Diffusion itself is computed in float32: exact. The pointwise networks around it are not."""
@@ -559,6 +584,8 @@ if __name__ == "__main__" and sys.argv[1] == "sizes":
         ("classifier", True),
     ]
     print(json.dumps({name: graphs_of_sizes(name, batched) for name, batched in kinds}))
+elif __name__ == "__main__" and sys.argv[1] == "one graph":
+    compiled_as_one_graph(sys.argv[2])
 elif __name__ == "__main__":
     compiled, plain = compiled_and_not(sys.argv[1], "batched" in sys.argv)
     torch.testing.assert_close(compiled, plain, rtol=1e-3, atol=1e-4)
