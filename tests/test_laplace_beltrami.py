@@ -693,3 +693,21 @@ def test_accuracy_on_the_nodes_of_deserno(projection, order, bound):
     harmonic = spherical_harmonic(5, 4)(points)
     lb = LaplaceBeltrami.from_points(points, order=order, projection=projection, certify=False)
     assert relative(lb(harmonic), -30 * harmonic) <= bound
+
+
+def test_small_shapes_take_one_thread_and_leave_the_number_as_it_was(monkeypatch):
+    """Of torch's, which spreads products that are not worth it; also where the build raises."""
+    seen, product = [], torch.linalg.qr
+    monkeypatch.setattr(
+        torch.linalg,
+        "qr",
+        lambda *a, **b: (seen.append(torch.get_num_threads()), product(*a, **b))[1],
+    )
+    before = torch.get_num_threads()
+    torch.set_num_threads(2)
+    try:
+        LaplaceBeltrami.from_mesh(*Sphere().mesh(100)).eigenbasis(5)
+        assert torch.get_num_threads() == 2
+        assert set(seen) == {1}
+    finally:
+        torch.set_num_threads(before)

@@ -5,5 +5,5 @@
 right-hand sides. `two_levels`: their preconditioner. `krylov`: null vectors and negative directions of matrices too
 large to factor, by multigrid, GMRES and conjugate gradients. `spectral_bounds`: where the spectrum of an operator lies.
 `exponential`: e^{tL}x by Chebyshev series or by a contour integral, with derivatives. `once`: an error for second
-derivatives, where there are none.
+derivatives, where there are none. `threads`: one thread for small tensors.
 """

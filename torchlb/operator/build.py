@@ -22,6 +22,7 @@ from torchlb.geometry.neighbors import nearest_neighbors
 from torchlb.geometry.numbering import Numbering
 from torchlb.geometry.orientation import mended_normals
 from torchlb.geometry.surface import NEAREST, SurfaceSummary, cloud_surface
+from torchlb.linalg.threads import threads_for
 from torchlb.operator.checks import (
     check_boundary,
     check_dimension,
@@ -196,7 +197,7 @@ def build_cloud(
     if isinstance(where, Tensor):
         where = numbering.sorted(where)
     settings = {"num_neighbors": options.num_neighbors, "condition": options.held}
-    with renumbered(numbering.given):
+    with renumbered(numbering.given), threads_for(len(points)):
         oriented = True
         if normals is not None:
             normals, oriented = settled_normals(here, numbering.sorted(normals))
@@ -302,7 +303,7 @@ def build_mesh(
     where = check_boundary(boundary, len(vertices))
     progress = progress and sys.stderr.isatty()
     numbering, here, corners, _ = numbered_mesh(vertices, corners, flip=degree > 0)
-    with renumbered(numbering.given):
+    with renumbered(numbering.given), threads_for(len(vertices)):
         shape = mesh_shape(
             here,
             corners,

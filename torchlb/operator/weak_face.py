@@ -10,6 +10,7 @@ from torch import Tensor
 
 from torchlb.errors import InputError
 from torchlb.linalg.sparse import csr_tensor, to_scipy
+from torchlb.linalg.threads import threads_for
 from torchlb.operator.batching import shapes_of
 from torchlb.operator.checks import check_tolerance
 from torchlb.operator.storage import OperatorStorage
@@ -122,7 +123,8 @@ class WeakFace(OperatorStorage):
         check_tolerance(tolerance)
         errors = self.basis_relative_errors[..., :k]
         if not self.has_pairs(k) or (tolerance is not None and (errors > tolerance).any()):
-            with torch.inference_mode(False):  # it is kept, and a training may follow
+            # It is kept, and a training may follow.
+            with torch.inference_mode(False), threads_for(self.num_points):
                 self.keep_basis(self._solved_basis(max(k, self.num_pairs), tolerance))
         if store:
             self.keep_basis(store=True)
