@@ -15,6 +15,7 @@ import torch
 from jaxtyping import Float, Int
 from scipy import sparse
 from scipy.sparse import csgraph
+from scipy.spatial import KDTree
 from torch import Tensor
 
 from torchlb.errors import InputError
@@ -36,8 +37,7 @@ def geodesic_distance(
     """Distance along the surface to the nearest of the sources, ℓ; infinite where no path leads to one.
 
     On surfaces the error falls a little faster than the spacing: on a sphere of 2,000 vertices it is 0.4 % in the mean,
-    and of several sources as of one. Sources joined by an edge are a curve, the edge included: those of a boundary or
-    a region give the distance to it, which at their neighbours is less than to the nearest vertex.
+    and of several sources about as of one: the least of the distances from each. It is never below the straight line.
     On curves and in more dimensions, and where there are no triangles, paths follow edges. Computed on the
     CPU, without derivatives.
 
@@ -122,9 +122,9 @@ def _straightened(
 ) -> Float[np.ndarray, " N"]:
     """Sweeps over the triangles at points whose distances fell, until none falls any more by `enough`.
 
-    The path to a point i that crosses the edge jk of a triangle starts between the feet of j and k, where the paths to
-    these start. If they are the same, distances are those to one point, else to a curve; and where no straight path
-    crosses jk, it is through j or k.
+    The path to a point i that crosses the edge jk of a triangle starts at the source of j or at that of k, its `foot`;
+    where no straight path crosses jk, it is through j or k. If the two have different sources, the distance of k from
+    that of j is not known: it is no less than the straight line, nor than its own.
     """
     i, j, k = triangles
     if len(i) == 0:
@@ -138,52 +138,39 @@ def _straightened(
             t = np.flatnonzero((fallen[j] > 0) | (fallen[k] > 0))
             at_i, at_j, at_k = i[t], j[t], k[t]
             d_j, d_k = distance[at_j], distance[at_k]
-            unfolded = d_j, d_k, along[t], height[t], base[t]
-            path, share = _from_point(*unfolded)
-            if several:
-                apart = _distances(foot, at_j, at_k)
-                path, share = np.where(apart > 0, _from_curve(*unfolded, apart), (path, share))
             by_j, by_k = d_j + to_j[t], d_k + to_k[t]
-            crosses = (share >= 0) & (share <= 1)
-            path = np.where(crosses, path, np.minimum(by_j, by_k))
+            place = along[t], height[t], base[t]
+            if several:
+                same = (foot[at_j] == foot[at_k]).all(1)
+                line_j, line_k = (
+                    np.linalg.norm(foot[a] - points[b], axis=1)
+                    for a, b in ((at_k, at_j), (at_j, at_k))
+                )
+                from_j = _from_point(d_j, np.where(same, d_k, np.maximum(d_k, line_k)), *place)
+                from_k = _from_point(np.where(same, d_j, np.maximum(d_j, line_j)), d_k, *place)
+                by_j, by_k = np.fmin(by_j, from_j), np.fmin(by_k, from_k)
+                path = np.minimum(by_j, by_k)
+            else:
+                path = _from_point(d_j, d_k, *place)
+                path = np.where(np.isnan(path), np.minimum(by_j, by_k), path)
             before, starts = distance.copy(), np.flatnonzero(np.diff(at_i, prepend=-1))
             ends = at_i[starts]
             distance[ends] = np.minimum(np.minimum.reduceat(path, starts), before[ends])
             fallen = np.where(distance < before, before - distance, 0.0)
             if several:
                 s = np.flatnonzero((path == distance[at_i]) & (path < before[at_i]))
-                share = np.where(crosses, share, by_k < by_j)[s, None]
-                foot_j, foot_k = foot[at_j[s]], foot[at_k[s]]
-                foot[at_i[s]] = foot_j + share * (foot_k - foot_j)  # to the bit where they are one
+                foot[at_i[s]] = np.where((by_j <= by_k)[s, None], foot[at_j[s]], foot[at_k[s]])
     return distance
 
 
-def _from_point(
-    d_j: Side, d_k: Side, along: Side, height: Side, base: Side
-) -> tuple[np.ndarray, np.ndarray]:
-    """Distance from i to the point that is d_j and d_k away, across jk, and where the path divides jk.
+def _from_point(d_j: Side, d_k: Side, along: Side, height: Side, base: Side) -> Side:
+    """Distance from i to the point that is d_j and d_k away, across jk; NaN where the path does not cross jk.
 
     `along`, `height` : where i is, as in `_apex`.
     """
     source, depth = _apex(d_j, d_k, base)
-    crossing = (source * height + along * depth) / (height + depth)
-    return np.hypot(source - along, depth + height), crossing / base
-
-
-def _from_curve(
-    d_j: Side, d_k: Side, along: Side, height: Side, base: Side, apart: Side
-) -> tuple[np.ndarray, np.ndarray]:
-    """The same where j and k have feet, `apart` from each other, on a curve, or are nearest to different points.
-
-    Distances grow by 1 along paths. Between those to j and k the front is `width` wide and at the feet, d behind, it
-    is `apart`: so paths meet at a point width·d/(width − apart) behind, whose inverse is the curvature of the front.
-    """
-    slope = (d_k - d_j) / base
-    climb = np.sqrt(1 - slope**2)
-    width = climb * base
-    share = (climb * along - slope * height) / width
-    bend = (apart - width) * width * share * (1 - share) / np.maximum(d_j + d_k, TINY)
-    return d_j + slope * along + climb * height + bend, share
+    share = (source * height + along * depth) / ((height + depth) * base)
+    return np.where((share >= 0) & (share <= 1), np.hypot(source - along, depth + height), np.nan)
 
 
 def _apex(left: np.ndarray, right: np.ndarray, base: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
