@@ -150,7 +150,8 @@ def test_linear_elements_are_the_cotangent_with_its_full_mass(surface):
     """The pair beside that of quadratic ones: libigl's matrices to rounding, a test of the assembly."""
     vertices, faces = surface.mesh(400)
     frames = complete_frames(vertex_normals(vertices, faces))
-    fits = VertexFits(GraphBalls(vertices, mesh_graph(faces, len(vertices)), frames), (2,))
+    balls = GraphBalls(vertices, mesh_graph(faces, len(vertices)), frames)
+    fits = VertexFits(balls, (2,)).complete()
     pair = mesh_pair(vertices, faces, fits, 2).linear
     args = vertices.numpy(), faces.numpy()
     expected = -igl.cotmatrix(*args), igl.massmatrix(*args, igl.MASSMATRIX_TYPE_FULL)

@@ -10,6 +10,8 @@ from torch import Tensor
 
 from torchlb.fits.polynomials import monomials
 from torchlb.galerkin.assembly import CHUNK, area_element, flat_metric, metric
+from torchlb.galerkin.coarse import coarse_triangles, cover_of
+from torchlb.galerkin.delaunay import Cover
 from torchlb.galerkin.elements import EDGES, lattice, triangle
 from torchlb.galerkin.nodes import Nodes
 from torchlb.galerkin.rim import RimCurves, rim_curves
@@ -52,6 +54,7 @@ class CurvedMesh:
     curved : (E,), which edges are.
     bent : (X,), which nodes stand on the surface instead of on a flat triangle.
     lengths : (F, 3), mollified.
+    coarse : (F,), which triangles are flat for the reasons of `coarse_triangles`; and what stands for them.
     rim : numbers of the boundary edges; and the curves over them.
     """
 
@@ -60,16 +63,22 @@ class CurvedMesh:
     curved: Bool[Tensor, " E"]
     bent: Bool[Tensor, " X"]
     lengths: Float[Tensor, "F 3"]
+    coarse: Bool[Tensor, " F"]
+    cover: Cover
     rim: Int[Tensor, " G"]
     curves: RimCurves
 
 
 def curve(
-    points: Float[Tensor, "N n"], fits: VertexFits, nodes: Nodes
+    points: Float[Tensor, "N n"],
+    fits: VertexFits,
+    nodes: Nodes,
+    held: Bool[Tensor, " N"] | None = None,
 ) -> tuple[CurvedMesh, Float[Tensor, "F Q 3"]]:
     """Stand the nodes on the graphs of their vertices where these agree, and flatten what they would distort.
 
-    With it comes the metric at the Gauss points, of flat triangles from mollified lengths.
+    With it comes the metric at the Gauss points, of flat triangles from mollified lengths. `held` are vertices with a
+    Dirichlet condition: boundary edges between them are no mirrors.
     """
     rim = (nodes.uses == 1).nonzero()[:, 0]
     curves = rim_curves(points, nodes.edges[rim], RIM[nodes.degree])
@@ -82,8 +91,14 @@ def curve(
     ratio = (start - flat).norm(dim=1) / _sizes(points, nodes)
     curved, whole = _by_edge(nodes, sound & (ratio <= STEEP))
     curved &= ~_opposed(points, nodes) & (nodes.uses <= 2)
+    free = nodes.uses == 1
+    if held is not None:
+        free &= ~held[nodes.edges].all(1)
+    coarse = coarse_triangles(points, nodes, fits.degree > 0, free)
+    curved[nodes.edge[coarse].flatten()] = False
     places, curved, bent, g, lengths = _flattened(points, nodes, (flat, standing), curved, whole)
-    return CurvedMesh(nodes, places, curved, bent, lengths, rim, curves), g
+    cover = cover_of(nodes, lengths, coarse, free)
+    return CurvedMesh(nodes, places, curved, bent, lengths, coarse, cover, rim, curves), g
 
 
 def _opposed(points: Tensor, nodes: Nodes) -> Bool[Tensor, " E"]:

@@ -6,6 +6,8 @@ flips that only lessen a fold: a crease of the surface itself has such triangles
 
 from __future__ import annotations
 
+from math import cos, radians
+
 import torch
 from torch import Tensor
 
@@ -17,6 +19,8 @@ ALIGNED = 0.5
 """Least cosine between a triangle's normal and those of its vertices."""
 GOOD = 0.1
 """Least quality 4√3 area/Σℓ² of a triangle; 1 if it is equilateral."""
+FAIR, LEVEL = 0.3, cos(radians(1))
+"""The same of a triangle in one plane with a neighbour; cosine of normals in one plane."""
 
 
 def flipped(vertices: Tensor, faces: Tensor) -> Tensor:
@@ -29,13 +33,15 @@ def flipped(vertices: Tensor, faces: Tensor) -> Tensor:
     alignment, quality = _scores(vertices, normals, faces)
     gone, size = faces.new_zeros(0), len(vertices)
     while True:
-        bad = ((alignment < ALIGNED) | (quality < GOOD)).nonzero()[:, 0]
+        poor = (alignment < ALIGNED) | (quality < GOOD)
+        bad = (poor | (quality < FAIR)).nonzero()[:, 0]
         pairs = _flips(faces, bad, gone, size) if len(bad) else None
         if pairs is None:
             return faces
         left, right, after = pairs
         before = torch.stack([faces[left], faces[right]], dim=1)
         gain = _value(vertices, normals, after) - _value(vertices, normals, before)
+        gain[~poor[left] & ~_level(vertices, before)] = -1.0
         gain[_scores(vertices, normals, after)[0].amin(1) < ALIGNED] = -1.0
         chosen = _independent(gain, left, right, after, len(faces))
         if len(chosen) == 0:
@@ -69,6 +75,16 @@ def _scores(vertices: Tensor, normals: Tensor, faces: Tensor) -> tuple[Tensor, T
     unit = normal / twice.clamp_min(torch.finfo(normal.dtype).tiny)
     alignment = dot(unit[..., None, :], normals[faces]).amin(-1)
     return alignment, 2 * 3**0.5 * twice[..., 0] / sides.square().sum((-1, -2))
+
+
+def _level(vertices: Tensor, pairs: Tensor) -> Tensor:
+    """Whether two triangles lie in one plane."""
+    corners = vertices[pairs]
+    normal = torch.linalg.cross(
+        corners[..., 1, :] - corners[..., 0, :], corners[..., 2, :] - corners[..., 0, :]
+    )
+    one, other = normal.unbind(1)
+    return dot(one, other) > LEVEL * one.norm(dim=1) * other.norm(dim=1)
 
 
 def _value(vertices: Tensor, normals: Tensor, pairs: Tensor) -> Tensor:

@@ -2,18 +2,18 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from scipy import sparse
 from torch import Tensor
 
 from torchlb.galerkin.assembly import CHUNK, area_element, element_matrices, flat_metric, summed
 from torchlb.galerkin.curving import curve
-from torchlb.galerkin.elements import Element, triangle
+from torchlb.galerkin.elements import Element, lattice, triangle
 from torchlb.galerkin.nodes import lagrange_nodes
 from torchlb.galerkin.pair import upper_product
 from torchlb.galerkin.prolongation import prolongation
@@ -28,29 +28,55 @@ class Medium:
 
     Attributes
     ----------
-    faces : (F, 3), of the mesh.
-    lengths : (F, 3), of its edges, ℓ, in the order of `EDGES`.
+    faces : (T, 3), triangles.
+    lengths : (T, 3), of their edges, ℓ, in the order of `EDGES`.
     prolongation : P, (N + X, N), from the vertices to the nodes.
-    nodes : (F, n), of each element.
-    metric : (F, Q, 3), at its Gauss points.
+    nodes : (T, n), of each element.
+    metric : (T, Q, 3), at its Gauss points.
     element : its shape functions there.
+    shares : (T, F), how much of each face of the mesh is in an element; rows sum to one, or to a half where two copies
+        of a triangle stand for it.
     """
 
-    faces: Int[Tensor, "F 3"]
-    lengths: Float[Tensor, "F 3"]
+    faces: Int[Tensor, "T 3"]
+    lengths: Float[Tensor, "T 3"]
     prolongation: Any
-    nodes: Int[Tensor, "F n"]
-    metric: Float[Tensor, "F Q 3"]
+    nodes: Int[Tensor, "T n"]
+    metric: Float[Tensor, "T Q 3"]
     element: Element
+    shares: Any
 
     @classmethod
     def curved(
-        cls, points: Float[Tensor, "N n"], faces: Int[Tensor, "F 3"], fits: VertexFits, degree: int
+        cls,
+        points: Float[Tensor, "N n"],
+        faces: Int[Tensor, "F 3"],
+        fits: VertexFits,
+        degree: int,
+        held: Bool[Tensor, " N"] | None = None,
     ) -> Medium:
-        """That of `mesh_pair` with elements of degree r ≥ 2."""
-        mesh, metric = curve(points, fits, lagrange_nodes(faces, len(points), degree))
-        p = prolongation(points, fits, mesh)
-        return cls(faces, mesh.lengths, p, mesh.nodes.elements, metric, triangle(degree))
+        """That of `mesh_pair` with elements of degree r ≥ 2; those of the cover have linear nodes of their own."""
+        mesh, metric = curve(points, fits, lagrange_nodes(faces, len(points), degree), held)
+        p: Any = prolongation(points, fits, mesh)
+        element, inner = triangle(degree), lattice(degree)[3:]
+        fit, cover = ~mesh.coarse, mesh.cover
+        own = torch.arange(len(cover.faces) * len(inner)).view(-1, len(inner))
+        weights = inner.repeat(len(cover.faces), 1).flatten().numpy()
+        where = own.flatten().repeat_interleave(3), cover.faces.repeat_interleave(len(inner), 0)
+        where = where[0].numpy(), where[1].flatten().numpy()
+        linear = sparse.csr_array((weights, where), shape=(own.numel(), len(points)))
+        flat = flat_metric(cover.lengths)[:, None].expand(-1, len(element.weights), 3)
+        same: Any = sparse.eye_array(len(faces), format="csr")
+        shares = same[fit.numpy()], cover.mixed() @ same[mesh.coarse.numpy()] / 2
+        return cls(
+            torch.cat([faces[fit], cover.faces]),
+            torch.cat([mesh.lengths[fit], cover.lengths]),
+            sparse.csr_array(sparse.vstack([p, linear])),
+            torch.cat([mesh.nodes.elements[fit], torch.cat([cover.faces, p.shape[0] + own], 1)]),
+            torch.cat([metric[fit], flat]),
+            element,
+            sparse.csr_array(sparse.vstack(shares)),
+        )
 
     @classmethod
     def linear(cls, points: Float[Tensor, "N n"], faces: Int[Tensor, "F 3"]) -> Medium:
@@ -59,34 +85,41 @@ class Medium:
         element = triangle(1)
         metric = flat_metric(lengths)[:, None].expand(-1, len(element.weights), 3)
         same: Any = sparse.eye_array(len(points), format="csr")
-        return cls(faces, lengths, same, faces, metric, element)
+        shares: Any = sparse.eye_array(len(faces), format="csr")
+        return cls(faces, lengths, same, faces, metric, element, shares)
 
-    def restored(self, numbering: Numbering, order: Int[Tensor, " F"]) -> Medium:
-        """With the user's numbers of the points, and their order of the faces."""
-        back, p, given = order.argsort(), self.prolongation, numbering.given.numpy()
-        p = sparse.csr_array((p.data, given[p.indices], p.indptr), shape=p.shape)
-        faces = numbering.given[self.faces[back]]
-        lengths, nodes, metric = (t[back] for t in (self.lengths, self.nodes, self.metric))
-        return Medium(faces, lengths, p, nodes, metric, self.element)
+    def restored(self, numbering: Numbering, order: Int[Tensor, " F"], num_faces: int) -> Medium:
+        """With the user's numbers of the points and of so many faces, `order` those of the faces here."""
+        given = numbering.given
+        p, shares = (
+            sparse.csr_array((m.data, of.numpy()[m.indices], m.indptr), shape=(m.shape[0], size))
+            for m, of, size in (
+                (self.prolongation, given, len(given)),
+                (self.shares, order, num_faces),
+            )
+        )
+        return replace(self, faces=given[self.faces], prolongation=p, shares=shares)
 
-    def at_gauss_points(self, conductivity: Tensor) -> Float[Tensor, "F Q"]:
+    def at_gauss_points(self, conductivity: Tensor) -> Float[Tensor, "T Q"]:
         """κ there, differentiable: of the vertices (N,), whose logarithm is prolonged, or of each face, if F ≠ N.
 
-        So it is positive, and of high order where the fits are.
+        So it is positive, and of high order where the fits are. Half of it on each of two copies of a triangle.
         """
         if len(conductivity) != self.prolongation.shape[1]:
-            return conductivity[:, None].expand(-1, len(self.element.weights))
+            of_element = _prolonged(conductivity, self.shares)
+            return of_element[:, None].expand(-1, len(self.element.weights))
         at_nodes = _prolonged(conductivity.log(), self.prolongation)
-        return (at_nodes[self.nodes] @ self.element.values.T).exp()
+        copies = torch.from_numpy(self.shares.sum(axis=1))[:, None]
+        return copies * (at_nodes[self.nodes] @ self.element.values.T).exp()
 
-    def stiffness(self, conductivity: Float[Tensor, "F Q"]) -> sparse.csr_array:
+    def stiffness(self, conductivity: Float[Tensor, "T Q"]) -> sparse.csr_array:
         """Upper triangle of PᵀK_FE(κ)P, which is positive semidefinite for every κ > 0; its rows sum to zero."""
         p = self.prolongation
         blocks = element_matrices(self.metric, self.element, conductivity)
         elements = summed(blocks.real, self.nodes, p.shape[0])
         return upper_product(p, elements)
 
-    def coarse_stiffness(self, conductivity: Float[Tensor, "F Q"]) -> sparse.csr_array:
+    def coarse_stiffness(self, conductivity: Float[Tensor, "T Q"]) -> sparse.csr_array:
         """K₁(κ) of linear elements on flat triangles, with the mean of κ on each: it preconditions."""
         shape, share = triangle(1), self.element.weights / self.element.weights.sum()
         mean = (conductivity @ share)[:, None].expand(-1, len(shape.weights))
@@ -94,7 +127,7 @@ class Medium:
         blocks = element_matrices(metric, shape, mean).real
         return summed(blocks, self.faces, self.prolongation.shape[1])
 
-    def sensitivity(self, w: Float[Tensor, "N C"], u: Float[Tensor, "N C"]) -> Float[Tensor, "F Q"]:
+    def sensitivity(self, w: Float[Tensor, "N C"], u: Float[Tensor, "N C"]) -> Float[Tensor, "T Q"]:
         """∂/∂κ of Σ_c w_cᵀK(κ)u_c at the Gauss points: weights times ∇w·∇u."""
         at_nodes = [torch.from_numpy(self.prolongation @ x.numpy()) for x in (w, u)]
         found = []

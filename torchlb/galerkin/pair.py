@@ -7,12 +7,19 @@ from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from scipy import sparse
 from torch import Tensor
 
 from torchlb import compiled
-from torchlb.galerkin.assembly import assemble_mass, element_matrices, flat_metric, summed
+from torchlb.galerkin.assembly import (
+    area_element,
+    assemble_mass,
+    element_matrices,
+    flat_metric,
+    summed,
+)
+from torchlb.galerkin.coarse import boundary_shares
 from torchlb.galerkin.curving import CurvedMesh, curve, mollified
 from torchlb.galerkin.elements import segment, triangle
 from torchlb.galerkin.nodes import lagrange_nodes
@@ -24,6 +31,8 @@ ROWS = 2**13
 """Rows of a product at a time."""
 ROOM = 2**20
 """Entries of a product at a time, where it is compiled."""
+LUMPED = 0.8
+"""Share of lumped mass in that of flat triangles."""
 SMALLEST = 0.1
 """Share of its linear mass that the mass of a vertex has at least."""
 
@@ -80,6 +89,7 @@ def mesh_pair(
     degree: int,
     stars: Int[Tensor, "S 3"] | None = None,
     numbering: Numbering | None = None,
+    held: Bool[Tensor, " N"] | None = None,
 ) -> WeakPair:
     """The pair of a triangle mesh, from the fits of its vertices, with elements of degree r ≥ 2.
 
@@ -88,20 +98,22 @@ def mesh_pair(
     is let go as soon as it was used.
     """
     count = len(points)
-    mesh, metric = curve(points, fits, lagrange_nodes(faces, count, degree))
+    mesh, metric = curve(points, fits, lagrange_nodes(faces, count, degree), held)
     del fits.surface.heights
-    linear = _linear(mesh.lengths, faces, count)
+    flat = flat_pair(mesh, count)
+    of_fits = ~mesh.coarse
+    linear = _linear(mesh.lengths[of_fits], faces[of_fits], count) + flat
     p = prolongation(points, fits, mesh)
-    blocks = element_matrices(metric, triangle(degree))
+    blocks = element_matrices(metric[of_fits], triangle(degree))
     del metric
-    elements = summed(blocks, mesh.nodes.elements, len(mesh.places))
+    elements = summed(blocks, mesh.nodes.elements[of_fits], len(mesh.places))
     del blocks
-    mass = positive_mass(p, _row_sums(elements), mesh, linear)
-    rim = None if len(mesh.rim) == 0 else p.T @ (_rim_mass(mesh) @ p)
+    mass = positive_mass(p, _row_sums(elements), mesh, linear - flat) + _row_sums(flat)
+    rim = None if len(mesh.rim) == 0 else _rim_mass(points, mesh, p)
     ends = mesh.nodes.edges, mesh.nodes.edges[mesh.curved]
     edges = [torch.bincount(e.flatten(), minlength=count) for e in ends]
     del mesh
-    upper = [upper_product(p, elements), sparse.triu(linear)]
+    upper = [upper_product(p, elements) + sparse.triu(flat), sparse.triu(linear)]
     del p, elements
     if stars is not None and len(stars):
         extra = _star_pair(points, stars)
@@ -163,6 +175,26 @@ def _linear(lengths: Tensor, faces: Tensor, count: int) -> sparse.csr_array:
     return summed(element_matrices(flat, triangle(1)), faces, count)
 
 
+def flat_pair(mesh: CurvedMesh, count: int) -> sparse.csr_array:
+    """K + iM of the flat triangles: linear elements on a Delaunay triangulation of them, each half of its two copies.
+
+    Their mass is mostly lumped, to the mixed Voronoi areas of Meyer et al. (2003). The leading errors of lumped and
+    consistent mass have opposite signs, and cancel in the mean of both where solutions are resolved; on long triangles
+    the stiffness is too large besides, which lumped mass makes good.
+    """
+    faces, lengths, _ = mesh.cover
+    element, metric = triangle(1), flat_metric(lengths)
+    blocks = element_matrices(metric[:, None].expand(-1, len(element.weights), 3), element)
+    area = area_element(metric)[:, None] / 2
+    xx, xy, yy = metric.unbind(1)
+    dot = torch.stack([xy, xx - xy, yy - xy], 1)  # of the two sides at each corner
+    others = dot.roll(1, 1) * dot.roll(-1, 1) / (16 * area)
+    lumped = area / 4 + torch.minimum(others.clamp_min(0), area / 4)
+    blocks.imag.mul_(1 - LUMPED)
+    blocks.imag[:, ::4] += LUMPED * lumped
+    return summed(blocks / 2, faces, count)
+
+
 def _star_pair(points: Tensor, stars: Int[Tensor, "S 3"]) -> sparse.csr_array:
     """A third of the linear elements on local stars: each triangle is in those of its three corners."""
     lengths = (points[stars[:, [1, 2, 0]]] - points[stars]).norm(dim=2)
@@ -203,15 +235,20 @@ def _row_sums(pair: Any) -> Float[np.ndarray, " N"]:
     return sums.imag.copy()
 
 
-def _rim_mass(mesh: CurvedMesh) -> sparse.csr_array:
-    """∫ φ_i φ_j along the boundary."""
+def _rim_mass(points: Tensor, mesh: CurvedMesh, p: Any) -> Any:
+    """∫ φ_i φ_j along the boundary, lumped at coarse triangles."""
     nodes, shape = mesh.nodes, segment(mesh.nodes.degree)
     on_edge = nodes.degree - 1
     first = len(mesh.places) - len(nodes.shares)
-    between = first + mesh.rim[:, None] * on_edge + torch.arange(on_edge)
-    elements = torch.cat([nodes.edges[mesh.rim], between], 1)
+    lying = torch.zeros_like(mesh.curved)
+    lying[nodes.edge[mesh.coarse].flatten()] = True
+    rim = mesh.rim[~lying[mesh.rim]]
+    between = first + rim[:, None] * on_edge + torch.arange(on_edge)
+    elements = torch.cat([nodes.edges[rim], between], 1)
     speed = torch.einsum("qnd,gnc->gqc", shape.gradients, mesh.places[elements]).norm(dim=2)
-    return assemble_mass(speed, elements, shape, len(mesh.places))
+    of_curves = assemble_mass(speed, elements, shape, len(mesh.places))
+    shares = boundary_shares(points, nodes.edges[mesh.rim[lying[mesh.rim]]], mesh.cover)
+    return p.T @ (of_curves @ p) + sparse.diags_array(shares.numpy(), format="csr")
 
 
 def stored(upper: Any, rim: Any = None, numbering: Numbering | None = None) -> SparsePair:

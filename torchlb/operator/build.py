@@ -14,6 +14,7 @@ from torch.nn.functional import pad
 from torchlb.baseline.cotangent import cotangent_laplacian
 from torchlb.errors import InputError, first_few, renumbered, warn
 from torchlb.fits.rules import WeightsName
+from torchlb.galerkin.coarse import with_area
 from torchlb.galerkin.flips import flipped
 from torchlb.galerkin.pair import ELEMENTS, SparsePair, WeakPair, mesh_pair
 from torchlb.geometry.boundary import boundary_faces
@@ -255,7 +256,7 @@ def _build_on_surface(
     )
     pair, fits = None, shape.fits
     if fits is not None:
-        pair = mesh_pair(places, surface.faces, fits, degree, surface.stars, numbering)
+        pair = mesh_pair(places, surface.faces, fits, degree, surface.stars, numbering, shape.held)
         assert pair.mass is not None
         shape = replace(shape, areas=pair.mass)
         warn_of_doubts(surface, fits, pair.mass)
@@ -269,11 +270,14 @@ def numbered_mesh(
 ) -> tuple[Numbering, Float[Tensor, "N n"], Int[Tensor, "F v"], Int[Tensor, " F"]]:
     """A numbering, the mesh in it, and of each face its place among those given.
 
-    Folds and slivers are flipped away where there is to be a pair; for the stencil, too, whose neighbours and first
-    normals come from the faces.
+    Where there is to be a pair, triangles without area along the boundary are left out, folds and slivers flipped away;
+    for the stencil, too, whose neighbours and first normals come from the faces.
     """
     numbering = Numbering.along_tree(points)
     here, (corners, order) = numbering.sorted(points), numbering.faces(faces)
+    if flip and corners.shape[1] == 3:
+        kept = with_area(here, corners)
+        corners, order = corners[kept], order[kept]
     if flip and points.shape[1] <= 3:
         corners = flipped(pad(here, (0, 3 - here.shape[1])), corners)
     return numbering, here, corners, order
@@ -318,7 +322,9 @@ def build_mesh(
             warn(NOWHERE)
         pair = None
         if shape.fits is not None:
-            pair = mesh_pair(here, corners, shape.fits, degree, numbering=numbering)
+            pair = mesh_pair(
+                here, corners, shape.fits, degree, numbering=numbering, held=shape.held
+            )
             assert pair.mass is not None
             shape = replace(shape, areas=pair.mass)
         remedy = "a finer mesh, or one without noise, has better ones"

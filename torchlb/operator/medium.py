@@ -34,12 +34,12 @@ def _made(lb: LaplaceBeltrami) -> Medium:
             "batch": "solve shape by shape, lb.unbatch()",
         }.get(lb.source, "build from a triangle mesh, with its weak pair")
         raise InputError(f"conductivity: this operator has no elements; {remedy}")
-    points, faces = lb.points.detach().cpu().double(), lb.faces.cpu()
+    points, given = lb.points.detach().cpu().double(), lb.faces.cpu()
     if lb.source == "cotangent":
-        return Medium.linear(points, faces)
+        return Medium.linear(points, given)
     options = Options(**lb.options)
     degree, degrees = options.elements
-    numbering, points, faces, order = numbered_mesh(points, faces, flip=True)
+    numbering, points, faces, order = numbered_mesh(points, given, flip=True)
     shape = mesh_shape(
         points,
         faces,
@@ -50,5 +50,6 @@ def _made(lb: LaplaceBeltrami) -> Medium:
         progress=False,
     )
     assert shape.fits is not None
-    medium = Medium.curved(points, faces, shape.fits, degree)
-    return medium.restored(numbering, order)
+    held = None if lb.fixed is None else numbering.sorted(lb.fixed.cpu())
+    medium = Medium.curved(points, faces, shape.fits, degree, held)
+    return medium.restored(numbering, order, len(given))

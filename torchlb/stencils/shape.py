@@ -75,6 +75,11 @@ class Shape:
     on_mesh: bool = False
     fits: VertexFits | None = None
 
+    @property
+    def held(self) -> Bool[Tensor, " N"] | None:
+        """Points whose values are zero by the condition; None if there are none."""
+        return None if self.boundary is None or self.condition.conserves else self.boundary.mask
+
 
 def cloud_shape(
     points: Float[Tensor, "N n"],

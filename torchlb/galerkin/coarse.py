@@ -1,0 +1,130 @@
+"""Triangles too coarse for fits between their corners: long ones along the boundary, parts without vertices inside."""
+
+from __future__ import annotations
+
+from math import cos, radians
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from torchlb.galerkin.delaunay import Cover, delaunay_cover
+from torchlb.galerkin.elements import EDGES
+from torchlb.galerkin.nodes import Nodes
+from torchlb.geometry.manifold import edges_of
+from torchlb.geometry.vectors import at
+
+LYING = cos(radians(120))
+"""Cosine of the angle across from a boundary edge, below which its triangle lies along the boundary."""
+CREASED = cos(radians(60))
+"""Cosine between the normals of two triangles, below which their edge is one of the shape's."""
+NO_AREA = 1e-5
+"""Height over the longest edge, below which a triangle at the boundary is one of rounding."""
+AT_ONCE = 2**8
+"""Vertices that are held against all boundary edges at a time."""
+
+
+def with_area(points: Float[Tensor, "N n"], faces: Int[Tensor, "F 3"]) -> Bool[Tensor, " F"]:
+    """All triangles but those along the boundary that rounding alone has made, and without which no vertex is alone."""
+    kept, count = torch.ones(len(faces), dtype=torch.bool), len(points)
+    corners = at(points, faces)
+    sides = (corners.roll(-1, 1) - corners.roll(-2, 1)).norm(dim=2)  # across from the corners
+    longest, place = sides.max(1)
+    spare = sides.sum(1) - 2 * longest
+    low = spare < 2 * NO_AREA**2 * longest  # the height is at most √(spare · longest / 2)
+    while low.any():
+        found = edges_of(faces[kept].numpy(), count)
+        rim = torch.zeros(len(faces), 3, dtype=torch.bool)
+        rim[kept] = torch.from_numpy(np.asarray(found.uses)[found.of] == 1).view(-1, 3)
+        out = low & kept & (rim.sum(1) == 1) & rim[torch.arange(len(faces)), place]
+        left = torch.bincount(faces[kept & ~out].flatten(), minlength=count)
+        out &= (left[faces] > 0).all(1)
+        if not out.any():
+            break
+        kept &= ~out
+    return kept
+
+
+def coarse_triangles(
+    points: Float[Tensor, "N n"],
+    nodes: Nodes,
+    fitted: Bool[Tensor, " N"],
+    free: Bool[Tensor, " E"],
+) -> Bool[Tensor, " F"]:
+    """Those that lie along the free boundary, and those around which all is edges of the shape or has no fit."""
+    return _lying(points, nodes, free) | _without_inside(points, nodes, fitted)
+
+
+def _lying(points: Tensor, nodes: Nodes, free: Bool[Tensor, " E"]) -> Bool[Tensor, " F"]:
+    """Triangles with an obtuse angle across from a free edge of the boundary, or from an edge of such a triangle."""
+    corners = at(points, nodes.faces)
+    apex = corners.roll(-2, 1)  # across from the sides of `EDGES`
+    one, other = corners - apex, corners.roll(-1, 1) - apex
+    obtuse = (one * other).sum(2) < LYING * one.norm(dim=2) * other.norm(dim=2)
+    met, lying = free.clone(), torch.zeros(len(nodes.faces), dtype=torch.bool)
+    while True:
+        new = (met[nodes.edge] & obtuse).any(1) & ~lying
+        if not new.any():
+            return lying
+        lying |= new
+        met[nodes.edge[new].flatten()] = True
+
+
+def _without_inside(points: Tensor, nodes: Nodes, fitted: Bool[Tensor, " N"]) -> Bool[Tensor, " F"]:
+    """Triangles whose corners have no fit; or lie on edges of the shape, as all fitted neighbours do."""
+    bound = ~fitted
+    if points.shape[1] == 3:
+        corners = at(points, nodes.faces)
+        normal = torch.linalg.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+        normal = torch.nn.functional.normalize(normal, eps=torch.finfo(normal.dtype).tiny)
+        total = points.new_zeros(len(nodes.edges), 3)
+        total.index_add_(0, nodes.edge.flatten(), normal.repeat_interleave(3, 0))
+        # |m + n|² = 2 + 2 m·n of two units
+        creased = (nodes.uses == 2) & (total.square().sum(1) < 2 + 2 * CREASED)
+        bound[nodes.edges[creased].flatten()] = True
+    near_inside = ~bound
+    near_inside[nodes.edges[near_inside[nodes.edges].any(1)].flatten()] = True
+    return ~near_inside[nodes.faces].any(1) | ~fitted[nodes.faces].any(1)
+
+
+def cover_of(
+    nodes: Nodes, lengths: Float[Tensor, "F 3"], coarse: Tensor, free: Bool[Tensor, " E"]
+) -> Cover:
+    """The Delaunay triangulation of the coarse triangles and their mirror image, glued along the free boundary."""
+    fixed = (nodes.uses == 1) & ~free
+    fixed[nodes.edge[~coarse].flatten()] = True
+    return delaunay_cover(nodes.faces[coarse], lengths[coarse], nodes.edge[coarse], fixed)
+
+
+def boundary_shares(
+    points: Float[Tensor, "N n"], ends: Int[Tensor, "G 2"], cover: Cover
+) -> Float[Tensor, " N"]:
+    """Lengths of the boundary edges of coarse triangles at the vertices, ℓ, in all those edges' length.
+
+    A side of the cover that joins a vertex to its copy crosses such an edge, the one half of that side away: the
+    vertex has its share there, and the ends have less.
+    """
+    start, along = points[ends[:, 0]], points[ends[:, 1]] - points[ends[:, 0]]
+    square = along.square().sum(1)
+    own = torch.stack([cover.faces[:, i] == cover.faces[:, j] for i, j in EDGES], 1)
+    vertex, half = cover.faces[own], cover.lengths[own] / 2
+    edge = [torch.arange(len(ends)).repeat(2)]
+    where, who = [torch.cat([0 * square, 0 * square + 1])], [ends.T.flatten()]
+    crossing = list(zip(vertex.split(AT_ONCE), half.split(AT_ONCE), strict=True))
+    for x, distance in crossing if len(ends) else []:
+        offset = points[x, None] - start
+        share = ((offset * along).sum(2) / square).clamp(0, 1)
+        away = (offset - share[..., None] * along).norm(dim=2)
+        away[(x[:, None, None] == ends).any(2)] = torch.inf
+        nearest = (away - distance[:, None]).abs().argmin(1)
+        edge.append(nearest)
+        where.append(share.gather(1, nearest[:, None])[:, 0])
+        who.append(x)
+    edge, where, who = torch.cat(edge), torch.cat(where), torch.cat(who)
+    order = where.argsort(stable=True)
+    order = order[edge[order].argsort(stable=True)]
+    edge, where, who = edge[order], where[order], who[order]
+    piece = torch.where(edge[1:] == edge[:-1], where.diff() * square.sqrt()[edge[1:]], 0.0) / 2
+    result = torch.zeros_like(points[:, 0])
+    return result.index_add_(0, who[1:], piece).index_add_(0, who[:-1], piece)

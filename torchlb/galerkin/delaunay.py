@@ -1,0 +1,150 @@
+"""Intrinsic Delaunay triangles of what is flat, glued to its mirror image along the boundary (Sharp, Crane 2020).
+
+A boundary edge across from an obtuse angle ties the vertex there to the line between its ends, however long that is. On
+the surface and its mirror image, each triangle twice, it is an edge like all others, and may be flipped as well.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import torch
+from jaxtyping import Bool, Float, Int
+from scipy import sparse
+from torch import Tensor
+
+from torchlb.galerkin.elements import EDGES
+
+DELAUNAY = 1e-6
+"""How far the cotangents across from an edge may sum to less than zero, so that rounding flips nothing."""
+
+
+class Cover(NamedTuple):
+    """Triangles that cover others twice.
+
+    Attributes
+    ----------
+    faces : (2F, 3); copies of a vertex are one vertex, and sides may join it to itself.
+    lengths : (2F, 3), ℓ, of the sides in the order of `EDGES`.
+    flips : in order, (two triangles, share of the first in the area of both) of flips at one time.
+    """
+
+    faces: Int[Tensor, "two_F 3"]
+    lengths: Float[Tensor, "two_F 3"]
+    flips: list[tuple[Int[Tensor, "C 2"], Float[Tensor, " C"]]]
+
+    def mixed(self) -> sparse.csr_array:
+        """(2F, F), of each triangle what share of the given ones it has, as far as means over two triangles tell."""
+        count = len(self.faces) // 2
+        one: Any = sparse.eye_array(count, format="csr")
+        result: Any = sparse.vstack([one, one], format="csr")
+        for pair, share in self.flips:
+            same = torch.ones(2 * count, dtype=torch.float64)
+            same[pair.flatten()] = 0
+            row = torch.cat([torch.arange(2 * count), pair[:, [0, 0, 1, 1]].flatten()])
+            col = torch.cat([torch.arange(2 * count), pair[:, [0, 1, 0, 1]].flatten()])
+            weight = torch.stack([share, 1 - share, share, 1 - share], 1).flatten()
+            where = row.numpy(), col.numpy()
+            result = sparse.csr_array((torch.cat([same, weight]).numpy(), where)) @ result
+        return result
+
+
+def delaunay_cover(
+    faces: Int[Tensor, "F 3"],
+    lengths: Float[Tensor, "F 3"],
+    edge: Int[Tensor, "F 3"],
+    fixed: Bool[Tensor, " E"],
+) -> Cover:
+    """Triangles that cover the given ones twice, flipped until they are Delaunay but for the edges that are `fixed`.
+
+    `edge` numbers the edges of the faces. However many faces an edge has, each is glued there to the back of the next.
+    """
+    sheets = torch.cat([faces, faces.flip(1)])
+    sides = torch.cat([lengths, lengths[:, [1, 0, 2]]])
+    twin, flips = _glued(faces, edge, fixed), []
+    active = torch.arange(len(twin))
+    while True:
+        active = active[(twin[active] > active) & (active // 3 != twin[active] // 3)]
+        weight = _cotangents(sides, active) + _cotangents(sides, twin[active])
+        lacking = weight < -DELAUNAY
+        chosen = _apart(active[lacking], twin[active[lacking]], weight[lacking], len(sheets))
+        if len(chosen) == 0:
+            return Cover(sheets, sides, flips)
+        flips.append(_flip(sheets, sides, twin, chosen))
+        slots = (3 * flips[-1][0].view(-1, 1) + torch.arange(3)).flatten()
+        met = torch.minimum(slots, twin[slots])
+        active = torch.unique(torch.cat([active[lacking], met[met >= 0]]))
+
+
+def _glued(faces: Tensor, edge: Tensor, fixed: Tensor) -> Int[Tensor, " six_F"]:
+    """Of side s of face f of the cover, number 3f + s, the side that it is glued to; −1 where it is fixed."""
+    count = len(faces)
+    front = torch.arange(3 * count)
+    back = 3 * (count + front // 3) + torch.tensor([1, 0, 2])[front % 3]
+    starts, ends = (faces[:, [pair[i] for pair in EDGES]].flatten() for i in (0, 1))
+    up = torch.where(starts < ends, front, back)  # the copy that runs from the lower vertex on
+    down = front + back - up
+    order = edge.flatten().argsort(stable=True)
+    number = edge.flatten()[order]
+    _, uses = torch.unique_consecutive(number, return_counts=True)
+    following = torch.arange(1, 3 * count + 1)
+    following[uses.cumsum(0) - 1] = uses.cumsum(0) - uses  # the last is glued to the first
+    twin = torch.full((6 * count,), -1)
+    one, other = up[order], down[order[following]]
+    free = ~fixed[number]
+    twin[one[free]], twin[other[free]] = other[free], one[free]
+    return twin
+
+
+def _foot(
+    sides: Float[Tensor, "T 3"], slot: Int[Tensor, " H"]
+) -> tuple[Float[Tensor, " H"], Float[Tensor, " H"]]:
+    """Of the corner across from a side: the place of its foot on the side's line, from its start, and its height, ℓ."""
+    face, side = slot // 3, slot % 3
+    own, after, before = (sides[face, (side + i) % 3] for i in range(3))
+    foot = ((before - after) * (before + after) / own + own) / 2
+    return foot, ((before - foot) * (before + foot)).clamp_min(0).sqrt()
+
+
+def _cotangents(sides: Tensor, slot: Tensor) -> Float[Tensor, " H"]:
+    """Of the angles across from sides."""
+    face, side = slot // 3, slot % 3
+    own, after, before = (sides[face, (side + i) % 3] for i in range(3))
+    _, height = _foot(sides, slot)
+    tiny = torch.finfo(sides.dtype).tiny
+    return (after.square() + before.square() - own.square()) / (2 * own * height).clamp_min(tiny)
+
+
+def _apart(one: Tensor, other: Tensor, weight: Tensor, num_faces: int) -> Int[Tensor, " C"]:
+    """Of these sides those with the least weight of all that share a face."""
+    order = weight.argsort(stable=True)
+    rank = torch.arange(len(order))
+    first = torch.full((num_faces,), len(order))
+    pair = one[order] // 3, other[order] // 3
+    for face in pair:
+        first.scatter_reduce_(0, face, rank, "amin")
+    return one[order[(first[pair[0]] == rank) & (first[pair[1]] == rank)]]
+
+
+def _flip(
+    sheets: Tensor, sides: Tensor, twin: Tensor, chosen: Int[Tensor, " C"]
+) -> tuple[Int[Tensor, "C 2"], Float[Tensor, " C"]]:
+    """Flip sides, in place: of (a, b, c) and (b, a, d) make (c, d, b) and (d, c, a); as in `Cover.flips`."""
+    other = twin[chosen]
+    f, g = chosen // 3, other // 3
+    (ab, bc, ca), (ba, ad, db) = (
+        [3 * face + (slot + i) % 3 for i in range(3)] for face, slot in ((f, chosen), (g, other))
+    )
+    (x, y), (z, w) = _foot(sides, chosen), _foot(sides, other)
+    across = torch.hypot(x + z - sides.view(-1)[ab], y + w)
+    a, b, c, d = (sheets.view(-1)[slot] for slot in (ab, ba, ca, db))
+    length = [sides.view(-1)[slot] for slot in (db, bc, ca, ad)]
+    sheets[f], sheets[g] = torch.stack([c, d, b], 1), torch.stack([d, c, a], 1)
+    sides[f] = torch.stack([across, length[0], length[1]], 1)
+    sides[g] = torch.stack([across, length[2], length[3]], 1)
+    place = torch.arange(len(twin))
+    for old, face, slot in ((ab, f, 0), (db, f, 1), (bc, f, 2), (ba, g, 0), (ca, g, 1), (ad, g, 2)):
+        place[old] = 3 * face + slot
+    moved = torch.where(twin >= 0, place[twin], -1)
+    twin[place] = moved
+    return torch.stack([f, g], 1), y / (y + w)
