@@ -88,7 +88,7 @@ class Medium:
         shares: Any = sparse.eye_array(len(faces), format="csr")
         return cls(faces, lengths, same, faces, metric, element, shares)
 
-    def restored(self, numbering: Numbering, order: Int[Tensor, " F"], num_faces: int) -> Medium:
+    def restored(self, numbering: Numbering, order: Int[Tensor, " G"], num_faces: int) -> Medium:
         """With the user's numbers of the points and of so many faces, `order` those of the faces here."""
         given = numbering.given
         p, shares = (

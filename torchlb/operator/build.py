@@ -267,7 +267,7 @@ def _build_on_surface(
 
 def numbered_mesh(
     points: Float[Tensor, "N n"], faces: Int[Tensor, "F v"], *, flip: bool
-) -> tuple[Numbering, Float[Tensor, "N n"], Int[Tensor, "F v"], Int[Tensor, " F"]]:
+) -> tuple[Numbering, Float[Tensor, "N n"], Int[Tensor, "G v"], Int[Tensor, " G"]]:
     """A numbering, the mesh in it, and of each face its place among those given.
 
     Where there is to be a pair, triangles without area along the boundary are left out, folds and slivers flipped away;

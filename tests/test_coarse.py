@@ -1,0 +1,144 @@
+"""Triangles too coarse for fits: long ones along a boundary, sheared ones, parts without vertices inside."""
+
+import igl
+import numpy as np
+import pytest
+import robust_laplacian
+import torch
+import trimesh
+from scipy.sparse.linalg import eigsh
+from scipy.spatial import Delaunay
+
+from torchlb import LaplaceBeltrami
+from torchlb.galerkin.assembly import element_matrices, flat_metric, summed
+from torchlb.galerkin.delaunay import delaunay_cover
+from torchlb.galerkin.elements import triangle
+from torchlb.galerkin.nodes import lagrange_nodes
+from torchlb.operator.medium import medium_of
+from torchlb.surfaces import UnitDisk
+
+SQUARE = np.sort([np.pi**2 * (i * i + j * j) for i in range(8) for j in range(8)])[:12]
+
+
+def in_the_plane(points, faces):
+    points = torch.as_tensor(points)
+    return torch.cat([points, 0 * points[:, :1]], 1), torch.as_tensor(faces).long()
+
+
+def random_square(n):
+    """Delaunay triangles of random points and the corners: the boundary has four edges, of length 1."""
+    points = np.random.default_rng(0).uniform(size=(n, 2))
+    points = np.concatenate([points, [[0, 0], [1, 0], [1, 1], [0, 1]]])
+    return in_the_plane(points, Delaunay(points).simplices)
+
+
+def rounded_square(n, decimals):
+    """A turned grid, rounded: the hull has triangles with hardly any height, or none."""
+    grid = np.stack(np.meshgrid(np.linspace(0, 1, n), np.linspace(0, 1, n)), -1).reshape(-1, 2)
+    points = grid @ np.array([[np.cos(0.7), np.sin(0.7)], [-np.sin(0.7), np.cos(0.7)]])
+    points = points.round(decimals) if decimals else points.astype(np.float32).astype(float)
+    return in_the_plane(points, Delaunay(points).simplices)
+
+
+LONG = [
+    (random_square(300), 5e-3, 3e-2),
+    (random_square(1000), 1e-3, 5e-3),
+    (rounded_square(20, None), 3e-4, 1e-3),
+    (rounded_square(20, 3), 2e-3, 5e-3),
+]
+
+
+@pytest.mark.filterwarnings("ignore")
+@pytest.mark.parametrize(("mesh", "median", "worst"), LONG)
+def test_long_triangles_along_the_boundary_bind_nothing(mesh, median, worst):
+    """λ = π²(i² + j²) of the square; with Dirichlet's condition i, j > 0; κ = 1 and lengths stay."""
+    lb = LaplaceBeltrami.from_mesh(*mesh, certify=False)
+    error = np.abs(lb.eigenbasis(12).eigenvalues.numpy() / np.maximum(SQUARE, 1e-9) - 1)[1:]
+    assert np.median(error) < median
+    assert error.max() < worst
+    np.testing.assert_allclose(float(lb.boundary_mass.to_dense().sum()), 4, rtol=3e-3)
+    held = LaplaceBeltrami.from_mesh(*mesh, certify=False, condition="dirichlet")
+    least = float(held.eigenbasis(1).eigenvalues[0])
+    np.testing.assert_allclose(least, 2 * np.pi**2, rtol=2e-2)
+    for operator in (lb, held):
+        medium = medium_of(operator)
+        for count in (len(mesh[0]), len(mesh[1])):
+            ones = torch.ones(count, dtype=torch.float64)
+            diagonal = medium.stiffness(medium.at_gauss_points(ones)).diagonal()
+            expected = operator.stiffness.to_dense().diagonal()
+            np.testing.assert_allclose(diagonal, expected, rtol=1e-9)
+
+
+def test_a_few_slivers_along_the_boundary_cost_nothing():
+    """λ = j'² of the unit disk, with vertices hardly inside of four boundary edges: median below 1e-3."""
+    vertices, _ = UnitDisk().mesh(600)
+    exact = np.repeat([0, 1.8411837813, 3.0542369282, 3.8317059702, 4.2011889412], [1, 2, 2, 1, 2])
+    points = vertices[:, :2].numpy()
+    rim = np.flatnonzero(np.hypot(*points.T) > 1 - 1e-9)
+    rim = rim[np.argsort(np.arctan2(*points[rim].T))]
+    added = (points[rim[:40:10]] + points[rim[1:41:10]]) / 2 * (1 - 1e-4)
+    errors = []
+    for p in (points, np.concatenate([points, added])):
+        lb = LaplaceBeltrami.from_mesh(*in_the_plane(p, Delaunay(p).simplices), certify=False)
+        errors.append(np.abs(lb.eigenbasis(8).eigenvalues.numpy() - exact**2)[1:] / exact[1:] ** 2)
+    assert np.median(errors[1]) < 1e-3, [np.median(e) for e in errors]
+
+
+@pytest.mark.parametrize("shear", [3, 8])
+def test_sheared_triangles_in_a_plane_are_flipped(shear):
+    """A parallelogram in triangles that are all obtuse has the eigenvalues of the one in Delaunay triangles."""
+    x, y = np.meshgrid(np.linspace(0, 1, 20), np.linspace(0, 1, 20))
+    points = np.stack([x + shear * y, y], -1).reshape(-1, 2)
+    i = np.arange(400).reshape(20, 20)
+    a, b, c, d = (part.ravel() for part in (i[:-1, :-1], i[:-1, 1:], i[1:, 1:], i[1:, :-1]))
+    sheared = np.concatenate([np.stack([a, b, c], 1), np.stack([a, c, d], 1)])
+    found = []
+    for faces in (sheared, Delaunay(points).simplices):
+        lb = LaplaceBeltrami.from_mesh(*in_the_plane(points, faces), certify=False)
+        found.append(lb.eigenbasis(10).eigenvalues.numpy()[1:])
+    np.testing.assert_allclose(*found, rtol=5e-3)
+
+
+def part(name):
+    shape = {
+        "annulus": lambda: trimesh.creation.annulus(0.5, 1, 1, sections=48),
+        "cylinder": lambda: trimesh.creation.cylinder(1, 2, sections=64),
+    }[name]()
+    return np.array(shape.vertices), np.array(shape.faces)
+
+
+@pytest.mark.filterwarnings("ignore")
+@pytest.mark.parametrize("name", ["annulus", "cylinder"])
+def test_parts_without_vertices_inside_are_as_good_as_by_the_cotangent(name):
+    """Median of λ_1 to λ_11 against robust_laplacian's on the refined part: at most 1.2 of the better of both peers."""
+    vertices, faces = part(name)
+
+    def robust(v, f):
+        stiffness, mass = robust_laplacian.mesh_laplacian(v, f)
+        return np.sort(eigsh(stiffness, 12, mass, sigma=-0.01)[0])[1:]
+
+    fine = vertices, faces
+    for _ in range(2):
+        fine = igl.upsample(*fine)
+    coarse, exact = robust(*fine), robust(*igl.upsample(*fine))
+    exact = exact + (exact - coarse) / 3
+    lb = LaplaceBeltrami.from_mesh(vertices, faces)
+    baseline = LaplaceBeltrami.from_cotangent(vertices, faces)
+    found = lb.eigenbasis(12), baseline.eigenbasis(12)
+    values = [basis.eigenvalues.numpy()[1:] for basis in found] + [robust(vertices, faces)]
+    ours, *peers = (np.median(np.abs(v / exact - 1)) for v in values)
+    assert ours < 1.2 * min(peers)
+
+
+def test_the_delaunay_cover_is_that_of_robust_laplacian():
+    """Half of the linear elements on it: the stiffness of Sharp and Crane's tufted cover."""
+    vertices, faces = random_square(200)
+    nodes = lagrange_nodes(faces, len(vertices), 2)
+    lengths = (vertices[faces].roll(-1, 1) - vertices[faces]).norm(dim=2)
+    cover = delaunay_cover(faces, lengths, nodes.edge, torch.zeros(len(nodes.edges)).bool())
+    metric = flat_metric(cover.lengths)[:, None].expand(-1, len(triangle(1).weights), 3)
+    ours = summed(element_matrices(metric, triangle(1)), cover.faces, len(vertices)) / 2
+    stiffness, mass = robust_laplacian.mesh_laplacian(vertices.numpy(), faces.numpy(), 0.0)
+    assert abs(ours.real - stiffness).max() < 1e-9 * abs(stiffness).max()
+    np.testing.assert_allclose(ours.imag.sum(axis=1), mass.diagonal(), atol=1e-9)
+    np.testing.assert_allclose(cover.mixed().sum(axis=1), 1)
