@@ -1,5 +1,7 @@
 """Triangles too coarse for fits: long ones along a boundary, sheared ones, parts without vertices inside."""
 
+import warnings
+
 import igl
 import numpy as np
 import pytest
@@ -82,6 +84,15 @@ def test_a_few_slivers_along_the_boundary_cost_nothing():
         lb = LaplaceBeltrami.from_mesh(*in_the_plane(p, Delaunay(p).simplices), certify=False)
         errors.append(np.abs(lb.eigenbasis(8).eigenvalues.numpy() - exact**2)[1:] / exact[1:] ** 2)
     assert np.median(errors[1]) < 1e-3, [np.median(e) for e in errors]
+
+
+def test_the_cotangent_says_where_long_triangles_lie_along_the_boundary():
+    """It is 55 % off there; on a disk with even triangles nothing is said."""
+    with pytest.warns(UserWarning, match="of the boundary .* has long triangles along it"):
+        LaplaceBeltrami.from_cotangent(*random_square(200))
+    with warnings.catch_warnings():
+        warnings.filterwarnings("error", "cotangent operator")
+        LaplaceBeltrami.from_cotangent(*UnitDisk().mesh(200))
 
 
 @pytest.mark.parametrize("shear", [3, 8])

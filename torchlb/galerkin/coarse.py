@@ -53,10 +53,12 @@ def coarse_triangles(
     free: Bool[Tensor, " E"],
 ) -> Bool[Tensor, " F"]:
     """Those that lie along the free boundary, and those around which all is edges of the shape or has no fit."""
-    return _lying(points, nodes, free) | _without_inside(points, nodes, fitted)
+    return lying_triangles(points, nodes, free) | _without_inside(points, nodes, fitted)
 
 
-def _lying(points: Tensor, nodes: Nodes, free: Bool[Tensor, " E"]) -> Bool[Tensor, " F"]:
+def lying_triangles(
+    points: Float[Tensor, "N n"], nodes: Nodes, free: Bool[Tensor, " E"]
+) -> Bool[Tensor, " F"]:
     """Triangles with an obtuse angle across from a free edge of the boundary, or from an edge of such a triangle."""
     corners = at(points, nodes.faces)
     apex = corners.roll(-2, 1)  # across from the sides of `EDGES`

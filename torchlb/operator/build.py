@@ -14,8 +14,9 @@ from torch.nn.functional import pad
 from torchlb.baseline.cotangent import cotangent_laplacian
 from torchlb.errors import InputError, first_few, renumbered, warn
 from torchlb.fits.rules import WeightsName
-from torchlb.galerkin.coarse import with_area
+from torchlb.galerkin.coarse import lying_triangles, with_area
 from torchlb.galerkin.flips import flipped
+from torchlb.galerkin.nodes import lagrange_nodes
 from torchlb.galerkin.pair import ELEMENTS, SparsePair, WeakPair, mesh_pair
 from torchlb.geometry.boundary import boundary_faces
 from torchlb.geometry.frames import Projection
@@ -45,6 +46,8 @@ from torchlb.stencils.rows import Reason, Rows, matrix_rows
 from torchlb.stencils.shape import Shape, cloud_shape, mesh_shape, surface_shape
 
 NOWHERE = "condition='dirichlet' holds nowhere: no boundary, or `boundary` has none of it; leave the condition out"
+LONG_BOUNDARY = 0.1
+"""Share of the boundary's length at long triangles from which on a warning names them."""
 MANY = 0.5
 """Share of low-order rows from which on a warning names them."""
 REMEDY = "do the points lie on a manifold of dimension {}? If not, pass its dimension as `dim`; else add points"
@@ -342,6 +345,7 @@ def build_cotangent(vertices: ArrayLike, faces: ArrayLike) -> AssembledOperator:
             f"faces: the cotangent operator needs triangles, got {tuple(corners.shape)}"
         )
     corners = mended_faces(vertices, corners)
+    _warn_of_long_triangles(vertices, corners)
     matrix, mass = cotangent_laplacian(vertices, corners)
     shape = mesh_shape(vertices, corners, 0, condition=None, areas=mass)
     centers = torch.arange(len(vertices))
@@ -356,6 +360,23 @@ def build_cotangent(vertices: ArrayLike, faces: ArrayLike) -> AssembledOperator:
         weak.append(share[row] * diagonal)
     pair = WeakPair(SparsePair(rows.crow, rows.col, torch.stack(weak)))
     return AssembledOperator.of(rows, shape, pair, corners, "cotangent", {})
+
+
+def _warn_of_long_triangles(vertices: Float[Tensor, "N n"], faces: Int[Tensor, "F 3"]) -> None:
+    """A warning where much of the boundary is that of triangles that lie along it."""
+    nodes = lagrange_nodes(faces, len(vertices), 2)
+    rim = nodes.uses == 1
+    of = torch.zeros_like(rim)
+    of[nodes.edge[lying_triangles(vertices, nodes, rim)].flatten()] = True
+    length = (vertices[nodes.edges[:, 0]] - vertices[nodes.edges[:, 1]]).norm(dim=1)
+    long, whole = length[of & rim].sum(), length[rim].sum()
+    if long > LONG_BOUNDARY * whole:
+        ends = nodes.edges[of & rim].unique()
+        warn(
+            f"cotangent operator: {long / whole:.0%} of the boundary ({first_few(ends)}) has long triangles along it, "
+            "which tie the vertices there to straight lines, and eigenvalues may be far too large; "
+            "LaplaceBeltrami.from_mesh has no such ties"
+        )
 
 
 def _finished(
