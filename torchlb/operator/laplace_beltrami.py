@@ -178,7 +178,7 @@ class LaplaceBeltrami(StencilFace, WeakFace):
         vertices : (N, 3), ℓ.  faces : (F, 3) indices.
 
         Its gradient is the first-order fit to the vertices around each point, and ∂_ν f = 0 at a boundary.
-        Long triangles along a boundary tie its vertices to straight lines: a warning says so, `from_mesh` is right there.
+        Long triangles along a boundary tie its vertices to lines: a warning says so, and `from_mesh` is right there.
         Raises InputError for bad input and for vertices without area.
         """
         warn_of_gradients(vertices, "vertices")
