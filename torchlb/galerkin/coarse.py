@@ -19,6 +19,8 @@ LYING = cos(radians(120))
 """Cosine of the angle across from a boundary edge, below which its triangle lies along the boundary."""
 CREASED = cos(radians(60))
 """Cosine between the normals of two triangles, below which their edge is one of the shape's."""
+SPARSE = 3
+"""Vertices on edges of the shape, or without a fit, for each other one, over which there is nothing inside."""
 NO_AREA = 1e-5
 """Height over the longest edge, below which a triangle at the boundary is one of rounding."""
 AT_ONCE = 2**8
@@ -74,7 +76,7 @@ def lying_triangles(
 
 
 def _without_inside(points: Tensor, nodes: Nodes, fitted: Bool[Tensor, " N"]) -> Bool[Tensor, " F"]:
-    """Triangles whose corners have no fit; or lie on edges of the shape, as all fitted neighbours do."""
+    """Triangles without a fit at any corner, or around each of whose corners nearly all vertices lie on edges."""
     bound = ~fitted
     if points.shape[1] == 3:
         corners = at(points, nodes.faces)
@@ -85,9 +87,11 @@ def _without_inside(points: Tensor, nodes: Nodes, fitted: Bool[Tensor, " N"]) ->
         # |m + n|² = 2 + 2 m·n of two units
         creased = (nodes.uses == 2) & (total.square().sum(1) < 2 + 2 * CREASED)
         bound[nodes.edges[creased].flatten()] = True
-    near_inside = ~bound
-    near_inside[nodes.edges[near_inside[nodes.edges].any(1)].flatten()] = True
-    return ~near_inside[nodes.faces].any(1) | ~fitted[nodes.faces].any(1)
+    weight = torch.where(bound, 1, -SPARSE)
+    around = weight.clone()
+    for one, other in nodes.edges.T, nodes.edges.T.flip(0):
+        around.index_add_(0, one, weight[other])
+    return (around > 0)[nodes.faces].all(1) | ~fitted[nodes.faces].any(1)
 
 
 def cover_of(

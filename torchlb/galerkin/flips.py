@@ -19,8 +19,8 @@ ALIGNED = 0.5
 """Least cosine between a triangle's normal and those of its vertices."""
 GOOD = 0.1
 """Least quality 4√3 area/Σℓ² of a triangle; 1 if it is equilateral."""
-FAIR, LEVEL = 0.3, cos(radians(1))
-"""The same of a triangle in one plane with a neighbour; cosine of normals in one plane."""
+FAIR, LEVEL = 0.3, cos(radians(0.01))
+"""The same where the surface is a plane; and the cosine of normals there."""
 
 
 def flipped(vertices: Tensor, faces: Tensor) -> Tensor:
@@ -41,7 +41,8 @@ def flipped(vertices: Tensor, faces: Tensor) -> Tensor:
         left, right, after = pairs
         before = torch.stack([faces[left], faces[right]], dim=1)
         gain = _value(vertices, normals, after) - _value(vertices, normals, before)
-        gain[~poor[left] & ~_level(vertices, before)] = -1.0
+        even = torch.minimum(alignment[left], alignment[right]) > LEVEL
+        gain[~(poor[left] | even)] = -1.0
         gain[_scores(vertices, normals, after)[0].amin(1) < ALIGNED] = -1.0
         chosen = _independent(gain, left, right, after, len(faces))
         if len(chosen) == 0:
@@ -75,16 +76,6 @@ def _scores(vertices: Tensor, normals: Tensor, faces: Tensor) -> tuple[Tensor, T
     unit = normal / twice.clamp_min(torch.finfo(normal.dtype).tiny)
     alignment = dot(unit[..., None, :], normals[faces]).amin(-1)
     return alignment, 2 * 3**0.5 * twice[..., 0] / sides.square().sum((-1, -2))
-
-
-def _level(vertices: Tensor, pairs: Tensor) -> Tensor:
-    """Whether two triangles lie in one plane."""
-    corners = vertices[pairs]
-    normal = torch.linalg.cross(
-        corners[..., 1, :] - corners[..., 0, :], corners[..., 2, :] - corners[..., 0, :]
-    )
-    one, other = normal.unbind(1)
-    return dot(one, other) > LEVEL * one.norm(dim=1) * other.norm(dim=1)
 
 
 def _value(vertices: Tensor, normals: Tensor, pairs: Tensor) -> Tensor:
