@@ -16,6 +16,7 @@ from torchlb.galerkin.assembly import element_matrices, flat_metric, summed
 from torchlb.galerkin.delaunay import delaunay_cover
 from torchlb.galerkin.elements import triangle
 from torchlb.galerkin.nodes import lagrange_nodes
+from torchlb.nn.conduction import conducting
 from torchlb.operator.medium import medium_of
 from torchlb.surfaces import UnitDisk
 
@@ -66,6 +67,7 @@ def test_long_triangles_along_the_boundary_bind_nothing(mesh, median, worst):
         medium = medium_of(operator)
         for count in (len(mesh[0]), len(mesh[1])):
             ones = torch.ones(count, dtype=torch.float64)
+            assert conducting(operator, ones).shape == operator.shape
             diagonal = medium.stiffness(medium.at_gauss_points(ones)).diagonal()
             expected = operator.stiffness.to_dense().diagonal()
             np.testing.assert_allclose(diagonal, expected, rtol=1e-9)

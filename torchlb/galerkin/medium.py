@@ -78,6 +78,11 @@ class Medium:
             sparse.csr_array(sparse.vstack(shares)),
         )
 
+    @property
+    def num_faces(self) -> int:
+        """F, of the mesh."""
+        return self.shares.shape[1]
+
     @classmethod
     def linear(cls, points: Float[Tensor, "N n"], faces: Int[Tensor, "F 3"]) -> Medium:
         """That of linear elements, whose stiffness for κ = 1 is the cotangent's."""

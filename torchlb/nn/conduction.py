@@ -83,9 +83,9 @@ def conducting(lb: LaplaceBeltrami, conductivity: Tensor) -> Conducting:
     check_tensor(conductivity, "conductivity")
     medium = medium_of(lb)
     kappa = conductivity.detach().cpu().double()
-    if kappa.shape not in ((lb.num_points,), (len(medium.faces),)):
+    if kappa.shape not in ((lb.num_points,), (medium.num_faces,)):
         raise InputError(
-            f"conductivity: expected one of each vertex, ({lb.num_points},), or face, ({len(medium.faces)},), got "
+            f"conductivity: expected one of each vertex, ({lb.num_points},), or face, ({medium.num_faces},), got "
             f"{tuple(kappa.shape)}"
         )
     bad = (~((kappa > 0) & kappa.isfinite())).nonzero()[:, 0]
