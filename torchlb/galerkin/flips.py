@@ -19,7 +19,7 @@ ALIGNED = 0.5
 """Least cosine between a triangle's normal and those of its vertices."""
 GOOD = 0.1
 """Least quality 4√3 area/Σℓ² of a triangle; 1 if it is equilateral."""
-FAIR, LEVEL = 0.3, cos(radians(0.01))
+FAIR, LEVEL = 0.5, cos(radians(0.01))
 """The same where the surface is a plane; and the cosine of normals there."""
 
 
