@@ -15,7 +15,6 @@ import torch
 from jaxtyping import Float, Int
 from scipy import sparse
 from scipy.sparse import csgraph
-from scipy.spatial import KDTree
 from torch import Tensor
 
 from torchlb.errors import InputError
