@@ -28,6 +28,7 @@ from torchlb.geometry.manifold import (
 )
 from torchlb.geometry.neighbors import mesh_graph, nearest_neighbors
 from torchlb.geometry.noise import denoised
+from torchlb.geometry.outliers import lone_points, put_beside
 from torchlb.geometry.poles import Poles, corrected_normals
 from torchlb.geometry.stars import gaps_between, pieces_of, stars_in_gaps
 from torchlb.geometry.vectors import lengths
@@ -179,6 +180,10 @@ def _start(
 ) -> _Start:
     """Normals, those of the plane if the points are in one, else refined; and candidates from Delaunay's triangles."""
     candidates = nearest_neighbors(points, min(NEAREST, len(points)))
+    lone = lone_points(points.numpy(), candidates.numpy())
+    if lone.any():
+        points = torch.from_numpy(put_beside(points.numpy(), candidates.numpy(), lone))
+        candidates = nearest_neighbors(points, candidates.shape[1])
     frames, near = cloud_frames(points, candidates, 2, rounds=1), candidates.numpy()
     rim = np.zeros(len(points), dtype=bool) if boundary is None else boundary.numpy()
     planar = _planar_triangles(points.numpy())

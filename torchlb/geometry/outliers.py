@@ -1,0 +1,77 @@
+"""Lone points of a cloud, as scanners leave them in mid-air: they lie on no surface, and must not join what is apart.
+
+At the edges of what a depth camera sees, pixels hang between the front and the back; other scanners leave points about.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+from scipy.spatial import KDTree
+
+from torchlb.geometry.vectors import inner, lengths
+
+RING = 6
+"""The spacing of a point is the distance to its neighbour of this number."""
+LONE = 2.5
+"""Of a lone point, its spacing over the lower quartile of its neighbours'."""
+MATES = 8
+"""So many others of such a spacing has a point within twice its own, in a plane with it, where the density of a surface
+changes at once: half a disc has twelve."""
+FLAT, HIGH = 0.4, 0.2
+"""Points lie in a plane where the least of their singular values is so much of the middle one; and what a lone point
+stands above the plane of its neighbours, over its distance from their midst."""
+
+
+def lone_points(
+    points: Float[np.ndarray, "N 3"], near: Int[np.ndarray, "N K"]
+) -> Bool[np.ndarray, " N"]:
+    """Which points are far from all others by the spacing of these, above their plane, and in none with others like it."""
+    lone = np.zeros(len(points), dtype=bool)
+    spacing = lengths(points[near[:, min(RING, near.shape[1] - 1)]] - points)
+    usual = np.partition(spacing[near[:, 1:]], near.shape[1] // 4, axis=1)[:, near.shape[1] // 4]
+    far = np.flatnonzero(spacing > LONE * usual)
+    if len(far) == 0:
+        return lone
+    around = points[near[far, 1:]]
+    middle = around.mean(1)
+    normal = np.linalg.svd(around - middle[:, None], full_matrices=False)[2][:, 2]
+    above = points[far] - middle
+    lone[far] = np.abs(inner(above, normal)) > HIGH * lengths(above)
+    octave = np.floor(np.log2(spacing[far]))
+    for scale in np.unique(octave):
+        alike = points[spacing >= 2.0 ** (scale - 1)]
+        if len(alike) > MATES:
+            own = far[octave == scale]
+            distance, mates = KDTree(alike).query(points[own], k=MATES + 1)
+            flat = _in_a_plane(alike[mates[:, 1:]] - points[own, None])
+            lone[own] &= ~(flat & (distance[:, -1] <= 2 * spacing[own]))
+    return lone
+
+
+def _in_a_plane(offset: Float[np.ndarray, "B K 3"]) -> Bool[np.ndarray, " B"]:
+    """Whether these points and the one that they are given from lie near a plane."""
+    offset = np.concatenate([0 * offset[:, :1], offset], 1)
+    offset -= offset.mean(1, keepdims=True)
+    _, middle, least = np.linalg.svd(offset, compute_uv=False).T
+    return least < FLAT * middle
+
+
+def put_beside(
+    points: Float[np.ndarray, "N 3"], near: Int[np.ndarray, "N K"], lone: Bool[np.ndarray, " N"]
+) -> Float[np.ndarray, "N 3"]:
+    """The points, but the lone ones on the way from the nearest other point to its neighbours, a third along it."""
+    moved, others = points.copy(), np.flatnonzero(~lone)
+    tree = KDTree(points[others])
+    _, host = tree.query(points[lone])
+    _, ring = tree.query(points[others[host]], k=min(RING + 1, len(others)))
+    order = np.argsort(host, kind="stable")
+    turn = np.empty_like(host)  # the number of a lone point among those of its host
+    first = np.searchsorted(host[order], host[order])
+    turn[order] = np.arange(len(host)) - first
+    size = ring.shape[1] - 1
+    end = points[others[ring[np.arange(len(host)), 1 + turn % size]]]
+    start = points[others[host]]
+    share = 1 / (3.0 + turn // size)
+    moved[lone] = start + share[:, None] * (end - start)
+    return moved
