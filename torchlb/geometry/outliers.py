@@ -26,7 +26,7 @@ stands above the plane of its neighbours, over its distance from their midst."""
 def lone_points(
     points: Float[np.ndarray, "N 3"], near: Int[np.ndarray, "N K"]
 ) -> Bool[np.ndarray, " N"]:
-    """Which points are far from all others by the spacing of these, above their plane, and in none with others like it."""
+    """Which points are far from all others by the spacing of these, above their plane, and in none with their like."""
     lone = np.zeros(len(points), dtype=bool)
     spacing = lengths(points[near[:, min(RING, near.shape[1] - 1)]] - points)
     usual = np.partition(spacing[near[:, 1:]], near.shape[1] // 4, axis=1)[:, near.shape[1] // 4]
@@ -43,7 +43,8 @@ def lone_points(
         alike = points[spacing >= 2.0 ** (scale - 1)]
         if len(alike) > MATES:
             own = far[octave == scale]
-            distance, mates = KDTree(alike).query(points[own], k=MATES + 1)
+            found = KDTree(alike).query(points[own], k=MATES + 1)
+            distance, mates = (np.asarray(part) for part in found)
             flat = _in_a_plane(alike[mates[:, 1:]] - points[own, None])
             lone[own] &= ~(flat & (distance[:, -1] <= 2 * spacing[own]))
     return lone
@@ -58,13 +59,13 @@ def _in_a_plane(offset: Float[np.ndarray, "B K 3"]) -> Bool[np.ndarray, " B"]:
 
 
 def put_beside(
-    points: Float[np.ndarray, "N 3"], near: Int[np.ndarray, "N K"], lone: Bool[np.ndarray, " N"]
+    points: Float[np.ndarray, "N 3"], lone: Bool[np.ndarray, " N"]
 ) -> Float[np.ndarray, "N 3"]:
     """The points, but the lone ones on the way from the nearest other point to its neighbours, a third along it."""
     moved, others = points.copy(), np.flatnonzero(~lone)
     tree = KDTree(points[others])
-    _, host = tree.query(points[lone])
-    _, ring = tree.query(points[others[host]], k=min(RING + 1, len(others)))
+    host = np.asarray(tree.query(points[lone])[1])
+    ring = np.asarray(tree.query(points[others[host]], k=min(RING + 1, len(others)))[1])
     order = np.argsort(host, kind="stable")
     turn = np.empty_like(host)  # the number of a lone point among those of its host
     first = np.searchsorted(host[order], host[order])

@@ -29,6 +29,7 @@ from torchlb.geometry.manifold import (
 from torchlb.geometry.neighbors import mesh_graph, nearest_neighbors
 from torchlb.geometry.noise import denoised
 from torchlb.geometry.outliers import lone_points, put_beside
+from torchlb.geometry.places import Places, in_words, places_of
 from torchlb.geometry.poles import Poles, corrected_normals
 from torchlb.geometry.stars import gaps_between, pieces_of, stars_in_gaps
 from torchlb.geometry.vectors import lengths
@@ -43,8 +44,6 @@ ASKEW = 0.7
 """Cosine with the normal of the faces below which another one is none: those of points in a row are any across it."""
 SPECK = 4
 """Patches of fewer triangles are left out."""
-PLACES, PLACE = 8, 0.1
-"""Places that are named where sheets touch; and how large one is, over the width of the cloud."""
 FLAT = 1e-6
 """Thickness over width of a cloud that lies in a plane."""
 
@@ -64,7 +63,8 @@ class SurfaceSummary:
     noise : distance of the points from the surface, root mean square, ℓ; 0 if there is none to be seen.
     contacts : points the nearest of which is on another sheet, more than three edges away: which of them belong
         together is a guess. Shapes touch or are too thin for their points there.
-    places : where most of these are, up to `PLACES` points, ℓ.
+    places : where most of these are, up to eight points, ℓ.
+    lone : points in mid-air, as scanners leave them: they lie beside the surface, for all that is computed.
     """
 
     points: int
@@ -75,7 +75,8 @@ class SurfaceSummary:
     components: int
     noise: float
     contacts: int = 0
-    places: tuple[tuple[float, float, float], ...] = ()
+    places: Places = ()
+    lone: int = 0
 
     @classmethod
     def of(cls, entries: dict[str, Any]) -> SurfaceSummary:
@@ -87,6 +88,7 @@ class SurfaceSummary:
     def __str__(self) -> str:
         """Two lines, or three."""
         noise = f"; noise of {self.noise:.2g} smoothed" if self.noise else ""
+        noise += f"; {self.lone} lone points left out" if self.lone else ""
         text = (
             f"surface through the cloud: {self.reached} of {self.points} points, {self.stars} triangles of local stars"
             f"{noise}\n  {self.components} components, {self.boundary_loops} boundary loops, {self.holes_closed} gaps "
@@ -97,7 +99,7 @@ class SurfaceSummary:
     @property
     def contact(self) -> str:
         """Where sheets come closer to each other than the points are, in words."""
-        where = ", ".join(f"({x:g}, {y:g}, {z:g})" for x, y, z in self.places)
+        where = in_words(self.places)
         return (
             f"{self.contacts} points are nearest to one of another sheet, most of them near {where}"
         )
@@ -156,7 +158,10 @@ def cloud_surface(
     loops = boundary_loops(faces, count)
     pieces = pieces_of(np.concatenate([faces, stars]), count)
     figures = len(np.unique(faces)), len(stars), len(done), len(loops), int(pieces.max()) + 1
-    summary = SurfaceSummary(count, *figures, start.noise, *_contacts(cloud, faces))
+    touched = _contacts(cloud, faces)
+    where = places_of(places, cloud.neighbors, touched)
+    found_of_it = *figures, start.noise, int(touched.sum()), where, start.lone
+    summary = SurfaceSummary(count, *found_of_it)
     parts = (places, faces, stars, cloud.normals, cloud.neighbors)
     at, triangles, local, normals, near = (torch.from_numpy(part) for part in parts)
     frames = _upright(start.frames, normals)
@@ -171,6 +176,7 @@ class _Start(NamedTuple):
     two_sided: bool
     frames: Float[Tensor, "N 3 2"]
     noise: float
+    lone: int
 
 
 def _start(
@@ -181,8 +187,9 @@ def _start(
     """Normals, those of the plane if the points are in one, else refined; and candidates from Delaunay's triangles."""
     candidates = nearest_neighbors(points, min(NEAREST, len(points)))
     lone = lone_points(points.numpy(), candidates.numpy())
-    if lone.any():
-        points = torch.from_numpy(put_beside(points.numpy(), candidates.numpy(), lone))
+    count = int(lone.sum())
+    if count:
+        points = torch.from_numpy(put_beside(points.numpy(), lone))
         candidates = nearest_neighbors(points, candidates.shape[1])
     frames, near = cloud_frames(points, candidates, 2, rounds=1), candidates.numpy()
     rim = np.zeros(len(points), dtype=bool) if boundary is None else boundary.numpy()
@@ -194,7 +201,9 @@ def _start(
         cloud = Cloud(places, normals.numpy(), near, _reaches(places, near), rim)
         small = cloud.small(faces)
         every = np.ones(len(small), dtype=bool)
-        return _Start(cloud, Candidates(small, small, every, every, up.numpy()), True, frames, 0.0)
+        return _Start(
+            cloud, Candidates(small, small, every, every, up.numpy()), True, frames, 0.0, count
+        )
     normals = given
     if normals is None:
         first = torch.linalg.cross(*frames.unbind(-1))
@@ -210,7 +219,7 @@ def _start(
         normals = corrected_normals(points, normals, candidates, poles)
     side, two_sided = poles.sides(normals)
     cloud = Cloud(places, normals.numpy(), near, _reaches(places, near), rim)
-    return _Start(cloud, tetrahedra.candidates(cloud, side), two_sided, frames, noise)
+    return _Start(cloud, tetrahedra.candidates(cloud, side), two_sided, frames, noise, count)
 
 
 def _reaches(
@@ -347,8 +356,8 @@ def _planar_triangles(
     return Delaunay(centered @ axes[:2].T).simplices.astype(np.int64), axes[2]
 
 
-def _contacts(cloud: Cloud, faces: Faces) -> tuple[int, tuple[tuple[float, float, float], ...]]:
-    """How many points have their nearest one more than three edges away, or are that; and where most of them are."""
+def _contacts(cloud: Cloud, faces: Faces) -> Bool[np.ndarray, " N"]:
+    """Which points have their nearest one more than three edges away, or are that."""
     count = len(cloud.points)
     graph = sparse.csr_array(mesh_graph(torch.from_numpy(faces), count) + sparse.eye_array(count))
     nearest = cloud.neighbors[:, 1]
@@ -358,20 +367,7 @@ def _contacts(cloud: Cloud, faces: Faces) -> tuple[int, tuple[tuple[float, float
     met = (beyond * graph[apart]).sum(1)
     far, touched = apart[met == 0], np.zeros(count, dtype=bool)
     touched[far] = touched[nearest[far]] = True
-    near = cloud.neighbors[:, 1:]
-    i, j = np.arange(count).repeat(near.shape[1]), near.ravel()
-    both = touched[i] & touched[j]
-    group, points = components(i[both], j[both], count)[touched], cloud.points[touched]
-    number, width = np.bincount(group)[group], np.ptp(cloud.points, axis=0).max()
-    means: list[np.ndarray] = []
-    while number.any() and len(means) < PLACES:
-        first = group == group[number.argmax()]
-        around = first | (lengths(points - points[first].mean(0)) < PLACE * width)
-        means.append(points[around & (number > 0)].mean(0))
-        number[around] = 0
-    digits = 3 - int(np.floor(np.log10(width)))
-    places = [(np.round(mean, digits) + 0.0).tolist() for mean in means]  # and no −0
-    return int(touched.sum()), tuple((x, y, z) for x, y, z in places)
+    return touched
 
 
 def _kin(cloud: Cloud) -> tuple[np.ndarray, np.ndarray]:

@@ -36,7 +36,7 @@ from torchlb.operator.checks import (
     check_spread,
     mended_faces,
 )
-from torchlb.operator.doubts import warn_of_doubts, warn_of_walls
+from torchlb.operator.doubts import warn_of_doubts, warn_of_joins
 from torchlb.operator.inputs import ArrayLike, check_points
 from torchlb.stability.certificate import Certificate
 from torchlb.stability.enforce import certify
@@ -263,7 +263,7 @@ def _build_on_surface(
         assert pair.mass is not None
         shape = replace(shape, areas=pair.mass)
         warn_of_doubts(surface, fits, pair.mass)
-    warn_of_walls(surface, where)
+    warn_of_joins(surface, where)
     built = _finished(shape, "points", options, REMEDY.format(2), settings["progress"], pair)
     return replace(built, faces=numbering.given[surface.faces], surface=surface.summary)
 

@@ -1,0 +1,37 @@
+"""Places on a cloud, for reports and warnings."""
+
+from __future__ import annotations
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from torchlb.geometry.manifold import components
+from torchlb.geometry.vectors import lengths
+
+Places = tuple[tuple[float, float, float], ...]
+PLACES, PLACE = 8, 0.1
+"""Places that are named where something is in doubt; and how large one is, over the width of the cloud."""
+
+
+def in_words(places: Places) -> str:
+    """As (x, y, z), one after the other."""
+    return ", ".join(f"({x:g}, {y:g}, {z:g})" for x, y, z in places)
+
+
+def places_of(
+    points: Float[np.ndarray, "N 3"], near: Int[np.ndarray, "N K"], marked: Bool[np.ndarray, " N"]
+) -> Places:
+    """Where most of the marked points are, up to `PLACES` points, ℓ."""
+    i, j = np.arange(len(points)).repeat(near.shape[1] - 1), near[:, 1:].ravel()
+    both = marked[i] & marked[j]
+    group, width = components(i[both], j[both], len(points))[marked], np.ptp(points, axis=0).max()
+    number, points = np.bincount(group)[group], points[marked]
+    means: list[np.ndarray] = []
+    while number.any() and len(means) < PLACES:
+        first = group == group[number.argmax()]
+        around = first | (lengths(points - points[first].mean(0)) < PLACE * width)
+        means.append(points[around & (number > 0)].mean(0))
+        number[around] = 0
+    digits = 3 - int(np.floor(np.log10(width)))
+    found = [(np.round(mean, digits) + 0.0).tolist() for mean in means]  # and no −0
+    return tuple((x, y, z) for x, y, z in found)
