@@ -33,7 +33,8 @@ the smaller one."""
 PIECE = 24
 """Pieces of fewer points that only triangles in doubt join to others are in doubt themselves."""
 FAINT = 1e-3
-"""What triangles in doubt are weighed by to see what they do: so little that they neither conduct nor hold."""
+"""What triangles in doubt are weighed by to see what they do, and their mass by its square: they neither conduct nor
+hold, nor have slow modes of their own."""
 COARSE, PAIRS = 500, 11
 """Size of the space in which that is seen; eigenvalues that are compared, 0 among them."""
 WEAK = 1e-3
@@ -114,7 +115,8 @@ def _coarse_eigenvalues(
     import pyamg
 
     whole, mass = _elements(points, faces, weight)
-    faint, less = _elements(points, faces, np.where(doubtful, FAINT, 1.0) * weight)
+    faint, _ = _elements(points, faces, np.where(doubtful, FAINT, 1.0) * weight)
+    _, less = _elements(points, faces, np.where(doubtful, FAINT**2, 1.0) * weight)
     used = less > 0  # in no face at all are none
     whole, faint = (sparse.csr_matrix(matrix[used][:, used]) for matrix in (whole, faint))
     mass, less = mass[used], less[used]

@@ -18,7 +18,7 @@ LONE = 2.5
 MATES = 8
 """So many others of such a spacing has a point within twice its own, in a plane with it, where the density of a surface
 changes at once: half a disc has twelve."""
-FLAT, HIGH = 0.4, 0.2
+FLAT, HIGH = 0.3, 0.2
 """Points lie in a plane where the least of their singular values is so much of the middle one; and what a lone point
 stands above the plane of its neighbours, over its distance from their midst."""
 

@@ -16,6 +16,9 @@ from torchlb.geometry.vertex_fits import REASONS, VertexFits
 DOUBTFUL = 0.1
 """Share of the points that do not resolve the surface of a cloud, or of the area that those without a fit hold, from
 which on a warning names them."""
+NOISY = 0.3
+"""The first of these shares where the cloud is noisy, and was smoothed: 0.1 to 0.15 at a fifth of the spacing, which
+leaves eigenvalues within a few per cent; 0.66 at half of it."""
 CHANGE = 0.1
 """What triangles in doubt change of the first eigenvalues from which on a warning says where they are."""
 ASTRAY = 0.02
@@ -29,7 +32,8 @@ def warn_of_doubts(surface: CloudSurface, fits: VertexFits, mass: Float[Tensor, 
     flat = (fits.degree == 0) | apart
     large = float(mass[flat].sum() / mass.sum()) >= DOUBTFUL
     doubtful |= flat & large
-    if large or float(doubtful.double().mean()) >= DOUBTFUL:
+    most = NOISY if surface.summary.noise else DOUBTFUL
+    if large or float(doubtful.double().mean()) >= most:
         index = doubtful.nonzero()[:, 0]
         warn(
             f"points: at {len(index)} of {len(doubtful)} the cloud is too coarse or noisy for the surface through it "
