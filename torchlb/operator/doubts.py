@@ -19,8 +19,9 @@ which on a warning names them."""
 NOISY = 0.3
 """The first of these shares where the cloud is noisy, and was smoothed: 0.1 to 0.15 at a fifth of the spacing, which
 leaves eigenvalues within a few per cent; 0.66 at half of it."""
-CHANGE = 0.1
-"""What triangles in doubt change of the first eigenvalues from which on a warning says where they are."""
+CHANGE = 0.12
+"""What triangles in doubt change of one of the first eigenvalues over another, from which on a warning says where they
+are. Of 56 clouds with eigenvalues that are off by a tenth and more 46 change by more, of 79 others 15."""
 ASTRAY = 0.02
 """Of the points of a declared boundary: how many may lie inside."""
 
