@@ -203,8 +203,8 @@ def test_open_sheets_that_are_joined_are_told(gap):
 
 @pytest.mark.parametrize("seed", range(3))
 def test_handles_through_a_thin_wall_are_told(seed):
-    """Random points of a cup, whose wall is 1.4 spacings thick: χ is 2, or a warning names the place."""
-    profile = [(0, 0), (1, 0), (1, 2), (0.88, 2), (0.88, 0.12), (0, 0.12)]
+    """Random points of a cup, whose wall is 1.6 spacings thick: χ is 2, or a warning names the place."""
+    profile = [(0, 0), (1, 0), (1, 2), (0.86, 2), (0.86, 0.14), (0, 0.14)]
     cup = trimesh.creation.revolve(np.array(profile), sections=64)
     points = np.array(trimesh.sample.sample_surface(cup, 3000, seed=seed)[0])
     with warnings.catch_warnings(record=True) as caught:
