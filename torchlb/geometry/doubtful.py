@@ -42,12 +42,12 @@ WEAK = 1e-3
 
 
 def _surrounded(
-    points: Float[Tensor, "N 3"], normals: Float[Tensor, "N 3"], near: Int[Tensor, "N K"]
-) -> Bool[np.ndarray, " N"]:
-    """Which points have their own sheet all round: neighbours in the tangent plane without a gap of `GAP`."""
+    points: Float[Tensor, "N 3"], normals: Float[Tensor, "N 3"], near: Int[Tensor, "B K"]
+) -> Bool[np.ndarray, " B"]:
+    """Which first points of the rows have their own sheet all round, in the tangent plane without a gap of `GAP`."""
     good = admissible_neighbors(points, normals, near)[:, 1:]
     good &= good.cumsum(1) <= AROUND
-    flat = (points[near[:, 1:]] - points[near[:, :1]]) @ complete_frames(normals)
+    flat = (points[near[:, 1:]] - points[near[:, :1]]) @ complete_frames(normals[near[:, 0]])
     angle = torch.atan2(*flat.unbind(-1)).masked_fill(~good, torch.inf).sort(1).values
     after = torch.cat([angle[:, 1:], torch.full_like(angle[:, :1], torch.inf)], 1)
     after = torch.where(after.isinf(), angle[:, :1] + 2 * torch.pi, after)
@@ -72,7 +72,8 @@ def in_doubt(surface: CloudSurface, faces: Faces) -> Bool[np.ndarray, " F"]:
     steep_i, steep_j = (np.abs(inner(edge, normals[k])) > STEEP * length for k in (i, j))
     steep = steep_i | steep_j
     if steep.any():
-        amid = _surrounded(surface.points, surface.normals, surface.neighbors)
+        amid, ends = np.zeros(count, dtype=bool), np.unique([i[steep], j[steep]])
+        amid[ends] = _surrounded(surface.points, surface.normals, surface.neighbors[ends])
         across = (steep_i & amid[i]) | (steep_j & amid[j])
         close = np.zeros(count, dtype=bool)
         close[i[across]] = close[j[across]] = True
@@ -116,9 +117,9 @@ def _coarse_eigenvalues(
     """The first eigenvalues with the doubtful faces, and with these as faint as `FAINT`, in one coarse space."""
     import pyamg
 
-    whole, mass = _elements(points, faces, weight)
-    faint, _ = _elements(points, faces, np.where(doubtful, FAINT, 1.0) * weight)
-    _, less = _elements(points, faces, np.where(doubtful, FAINT**2, 1.0) * weight)
+    whole, mass = _elements(points, faces, weight, weight)
+    scale = np.where(doubtful, FAINT, 1.0)
+    faint, less = _elements(points, faces, scale * weight, scale**2 * weight)
     used = less > 0  # in no face at all are none
     whole, faint = (sparse.csr_matrix(matrix[used][:, used]) for matrix in (whole, faint))
     mass, less = mass[used], less[used]
@@ -145,7 +146,10 @@ def _coarse_eigenvalues(
 
 
 def _elements(
-    points: Float[np.ndarray, "N 3"], faces: Faces, weight: Float[np.ndarray, " F"]
+    points: Float[np.ndarray, "N 3"],
+    faces: Faces,
+    weight: Float[np.ndarray, " F"],
+    density: Float[np.ndarray, " F"],
 ) -> tuple[sparse.csr_array, Float[np.ndarray, " N"]]:
     """Stiffness of linear elements and their lumped mass; flat triangles as if a little higher."""
     count = len(points)
@@ -155,4 +159,4 @@ def _elements(
     entry = np.einsum("fkx,flx->fkl", side, side) * (weight / (4 * area))[:, None, None]
     row, col = faces.repeat(3, axis=1).ravel(), np.tile(faces, 3).ravel()
     stiffness = sparse.coo_array((entry.ravel(), (row, col)), shape=(count, count)).tocsr()
-    return stiffness, np.bincount(faces.ravel(), (area * weight).repeat(3) / 3, count)
+    return stiffness, np.bincount(faces.ravel(), (area * density).repeat(3) / 3, count)
