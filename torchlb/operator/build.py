@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 from dataclasses import asdict, dataclass, replace
-from typing import Any, get_args
+from typing import Any
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -13,13 +13,11 @@ from torch.nn.functional import pad
 
 from torchlb.baseline.cotangent import cotangent_laplacian
 from torchlb.errors import InputError, first_few, renumbered, warn
-from torchlb.fits.rules import WeightsName
 from torchlb.galerkin.coarse import lying_triangles, with_area
 from torchlb.galerkin.flips import flipped
 from torchlb.galerkin.nodes import lagrange_nodes
-from torchlb.galerkin.pair import ELEMENTS, SparsePair, WeakPair, mesh_pair
+from torchlb.galerkin.pair import SparsePair, WeakPair, mesh_pair
 from torchlb.geometry.boundary import boundary_faces
-from torchlb.geometry.frames import Projection
 from torchlb.geometry.neighbors import nearest_neighbors
 from torchlb.geometry.numbering import Numbering
 from torchlb.geometry.orientation import mended_normals
@@ -31,17 +29,17 @@ from torchlb.operator.checks import (
     check_distinct,
     check_faces,
     check_normals,
-    check_options,
     check_scale,
     check_spread,
     mended_faces,
 )
 from torchlb.operator.doubts import warn_of_doubts, warn_of_joins
 from torchlb.operator.inputs import ArrayLike, check_points
+from torchlb.operator.options import Options
 from torchlb.stability.certificate import Certificate
 from torchlb.stability.enforce import certify
 from torchlb.stencils.assemble import Stencils, assemble
-from torchlb.stencils.conditions import CONDITIONS, PAIRED, Condition, ConditionName
+from torchlb.stencils.conditions import CONDITIONS
 from torchlb.stencils.rows import Reason, Rows, matrix_rows
 from torchlb.stencils.shape import Shape, cloud_shape, mesh_shape, surface_shape
 
@@ -51,70 +49,6 @@ LONG_BOUNDARY = 0.1
 MANY = 0.5
 """Share of low-order rows from which on a warning names them."""
 REMEDY = "do the points lie on a manifold of dimension {}? If not, pass its dimension as `dim`; else add points"
-
-
-@dataclass(frozen=True)
-class Options:
-    """The choices that a user makes, as given."""
-
-    order: int
-    normal_order: int | None
-    projection: Projection
-    weights: WeightsName
-    num_neighbors: int | None
-    condition: ConditionName | None
-    weak_form: bool | None
-    certify: bool | None
-
-    @property
-    def q(self) -> int:
-        """Order of the tangent frames: p + 1 unless given."""
-        return self.order + 1 if self.normal_order is None else self.normal_order
-
-    @property
-    def held(self) -> Condition | None:
-        """The condition at the boundary, as what it does to rows."""
-        return None if self.condition is None else CONDITIONS[self.condition]
-
-    @property
-    def elements(self) -> tuple[int, tuple[int, ...]]:
-        """Degree of the elements and degrees of the fits of the weak pair, where there is to be one."""
-        return ELEMENTS[min(self.order, max(ELEMENTS))] if self.weak_form else (0, ())
-
-    def settled(self, triangles: bool) -> Options:
-        """With the choices that were left open: a pair where there can be one, the certificate where there is none."""
-        if self.weak_form and not triangles:
-            raise InputError(
-                "weak_form: only triangle meshes, and clouds of surfaces in R² and R³, have one; leave it out, and the "
-                "certificate makes the stencil stable instead"
-            )
-        weak = triangles if self.weak_form is None else self.weak_form
-        if (
-            weak
-            and self.held is not None
-            and type(self.held) is not PAIRED.get(str(self.condition))
-        ):
-            raise InputError(
-                f"condition: eigenpairs, heat and solves are of the weak pair, which has {list(PAIRED)} alone and "
-                f"would ignore {self.condition!r}; weak_form=False builds the stencil, which has it"
-            )
-        return replace(
-            self, weak_form=weak, certify=not weak if self.certify is None else self.certify
-        )
-
-    def check(self, num_points: int, ambient_dim: int, dim: int) -> None:
-        """InputError for a choice that is none."""
-        check_options(
-            num_points,
-            ambient_dim,
-            dim,
-            self.order,
-            self.normal_order or 0,
-            self.num_neighbors,
-            projection=(self.projection, [*get_args(Projection)]),
-            weights=(self.weights, [*get_args(WeightsName)]),
-            condition=(self.condition or "neumann", [*CONDITIONS]),
-        )
 
 
 @dataclass(frozen=True)

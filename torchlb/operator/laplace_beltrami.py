@@ -20,6 +20,7 @@ from torchlb.operator.batching import (
     split_buffers,
 )
 from torchlb.operator.inputs import ArrayLike, float_type, warn_of_gradients
+from torchlb.operator.options import Options
 from torchlb.operator.stencil_face import StencilFace
 from torchlb.operator.storage import FIT_FIELDS, REPORT_FIELDS
 from torchlb.operator.weak_face import MatrixName, WeakFace
@@ -117,7 +118,7 @@ class LaplaceBeltrami(StencilFace, WeakFace):
         InputError : for bad input, naming the points and the remedy.
         StencilError : where not even the low-order row of a point can be built.
         """
-        options = build.Options(
+        options = Options(
             order, normal_order, projection, weights, num_neighbors, condition, weak_form, certify
         )
         warn_of_gradients(points, "points")
@@ -161,7 +162,7 @@ class LaplaceBeltrami(StencilFace, WeakFace):
         ------
         InputError : for bad input, such as vertices that belong to no face.
         """
-        options = build.Options(
+        options = Options(
             order, normal_order, projection, weights, num_neighbors, condition, weak_form, certify
         )
         warn_of_gradients(vertices, "vertices")

@@ -8,8 +8,9 @@ from torch.utils.weak import WeakIdKeyDictionary
 
 from torchlb.errors import InputError
 from torchlb.galerkin.medium import Medium
-from torchlb.operator.build import Options, numbered_mesh
+from torchlb.operator.build import numbered_mesh
 from torchlb.operator.laplace_beltrami import LaplaceBeltrami
+from torchlb.operator.options import Options
 from torchlb.stencils.shape import mesh_shape
 
 _MEDIA: Any = WeakIdKeyDictionary()
