@@ -115,7 +115,7 @@ def test_coincident_vertices_of_a_mesh_are_named():
     cut = torch.cat([VERTICES, VERTICES[FACES[0]]])
     faces = FACES.clone()
     faces[0] = torch.arange(100, 103)
-    with pytest.warns(UserWarning, match="6 share a place with another .*merge_vertices"):
+    with pytest.warns(UserWarning, match="6 share a place with another .*clean_mesh"):
         LaplaceBeltrami.from_mesh(cut, faces)
 
 

@@ -220,7 +220,7 @@ def test_what_is_not_finite_is_named_as_that(solve):
     lb = BUILDERS["pair"]()
     f = lb.points[:, 0].clone()
     f[3] = torch.nan
-    with pytest.raises(DiffusionError, match="NaN or infinite"):
+    with pytest.raises(InputError, match=r"NaN or infinity at 1 of .* points \(3\)"):
         solve(lb, f, 0.1)
 
 

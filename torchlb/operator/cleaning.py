@@ -176,16 +176,18 @@ def triangles_of(vertices: Float[Tensor, "N n"], polygons: Int[Tensor, "F c"]) -
     [[[1, 2, 3], [1, 3, 0]]]
     """
     count, size = polygons.shape
-    places = pad(vertices, (0, max(3 - vertices.shape[1], 0)))[:, :3][polygons]
-    offset = places - places[:, :1]
+    places = pad(vertices, (0, max(3 - vertices.shape[1], 0)))[polygons]
+    space = places.shape[-1] == 3  # beyond it no side of a polygon is inside
+    offset = (places - places[:, :1])[..., :3]
     normal = torch.linalg.cross(offset, offset.roll(-1, 1)).sum(1, keepdim=True)
     costs, diagonals = [], []
     for start in range(size):
         ray = (places.roll(-start, 1) - places[:, start, None])[:, 1:]
-        up = (torch.linalg.cross(ray[:, :-1], ray[:, 1:]) * normal).sum(-1)
+        up = (torch.linalg.cross(ray[:, :-1, :3], ray[:, 1:, :3]) * normal).sum(-1)
         length = ray[:, 1:-1].norm(dim=-1)
         diagonals.append(length.amax(1) if size > 3 else length.sum(1))
-        costs.append(torch.where((up > 0).all(1), diagonals[-1], torch.inf))
+        inside = (up > 0).all(1) | (not space)
+        costs.append(torch.where(inside, diagonals[-1], torch.inf))
     cost = torch.stack(costs, 1)
     none = cost.isinf().all(1)
     if size == 4:  # without an area: by the shorter diagonal

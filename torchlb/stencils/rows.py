@@ -18,6 +18,10 @@ from torchlb.fits.weights import MAX_RESIDUAL, Weights
 from torchlb.geometry.numbering import Numbering
 from torchlb.linalg.sparse import from_scipy
 
+STEEPEST = 0.05
+"""Entries of JJᵀ − 1, J the derivatives of the points themselves, above which a fit is steep over its frame: with it
+|∇x_c| ≤ 1.05."""
+
 
 class Reason(IntEnum):
     """Why a row is below the requested order: the last test that it failed there; `text` says it in words."""
@@ -134,15 +138,16 @@ def to_tangent_vectors(
     """EᵀJ⁺, which makes components in the frame E of the gradient from derivatives along the coordinates of a fit.
 
     With weights G of these derivatives J = Gx are tangent vectors of the surface that the fit makes of the points x,
-    and over it ∇f = Jᵀ(JJᵀ)⁻¹Gf = J⁺Gf. Where the frame is tangent to it J = Eᵀ, and the result is 1. Of coordinates
-    ∇ is Eᵀ times a projector, so no longer than 1, however steep the fit is over the frame.
+    and over it ∇f = Jᵀ(JJᵀ)⁻¹Gf = J⁺Gf. Of coordinates ∇ is Eᵀ times a projector, so no longer than 1, however steep
+    the fit is over the frame. Where the frame is tangent to it, to `STEEPEST`, G stays, and ∇ is exact for functions that
+    are linear in the tangent plane.
 
     >>> steep = torch.tensor([[[1.0, 2.0]]])
     >>> to_tangent_vectors(steep, torch.tensor([[[1.0], [0.0]]])).round(decimals=4).tolist()
     [[[0.2]]]
     """
     turn = torch.eye(jacobian.shape[1], dtype=jacobian.dtype).repeat(len(jacobian), 1, 1)
-    askew = (jacobian @ jacobian.mT - turn).abs().amax((1, 2)) > MAX_RESIDUAL
+    askew = (jacobian @ jacobian.mT - turn).abs().amax((1, 2)) > STEEPEST
     # Singular values are those of [1, slope], 1 and more, and 0 across a line on which all points lie.
     inverse = torch.linalg.pinv(jacobian[askew], atol=MAX_RESIDUAL, rtol=0.0)
     turn[askew] = frames[askew].mT @ inverse
