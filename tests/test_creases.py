@@ -79,7 +79,7 @@ def test_so_it_is_of_the_cotangent_and_of_a_cloud():
     """The same on clouds and for the rows of given matrices."""
     vertices, faces = spikes()
     assert longest_gradient(LaplaceBeltrami.from_cotangent(vertices, faces)) <= LONGEST
-    assert longest_gradient(LaplaceBeltrami.from_points(vertices)) <= LONGEST
+    assert longest_gradient(LaplaceBeltrami.from_points(roof(2.2)[0])) <= LONGEST
 
 
 def test_derivatives_over_a_tilted_frame_make_the_gradient():

@@ -18,7 +18,15 @@ from torchlb.geometry.manifold import (
     wound_alike,
 )
 from torchlb.geometry.surface import cloud_surface
-from torchlb.surfaces import Ellipsoid, Hemisphere, Sphere, StarShaped, Torus, UnitDisk
+from torchlb.surfaces import (
+    Ellipsoid,
+    Hemisphere,
+    Sphere,
+    StarShaped,
+    Torus,
+    UnitDisk,
+    smooth_function,
+)
 
 CLOSED = {"sphere": Sphere(), "torus": Torus(), "ellipsoid": Ellipsoid(), "star": StarShaped()}
 
@@ -568,3 +576,17 @@ def test_keys_too_large_to_be_sorted_with_their_places_are_sorted_alike():
     for one, other in zip(_ascending(key, 50), _ascending(key, 2**62), strict=True):
         assert np.array_equal(one, other)
     assert all(len(part) == 0 for part in _ascending(key[:0], 50))
+
+
+def test_values_at_lone_points_are_in_no_other_row():
+    """Δf and ∇f of the surface are those without the points in mid-air, whatever f is there."""
+    points = Torus().points(1000)
+    stray = torch.from_numpy(np.random.default_rng(0).uniform(-2, 2, (5, 3)))
+    f = smooth_function(points)
+    alone, with_stray = (
+        LaplaceBeltrami.from_points(points),
+        LaplaceBeltrami.from_points(torch.cat([points, stray])),
+    )
+    assert with_stray.surface.lone == 5
+    everywhere = torch.cat([f, torch.full((5,), 1e3, dtype=torch.float64)])
+    torch.testing.assert_close(with_stray(everywhere)[:1000], alone(f), rtol=0.0, atol=1e-2)

@@ -117,6 +117,7 @@ class CloudSurface:
     normals : (N, 3), unit, on the side of the faces.
     frames : (N, 3, 2), orthonormal, under the normals; they turn with the points.
     neighbors : (N, K), the nearest points of each, itself first.
+    lone : (N,), points in mid-air, which stand beside others; who is on the surface does not look at them.
     summary : how that was found.
     """
 
@@ -126,6 +127,7 @@ class CloudSurface:
     normals: Float[Tensor, "N 3"]
     frames: Float[Tensor, "N 3 2"]
     neighbors: Int[Tensor, "N K"]
+    lone: Bool[Tensor, " N"]
     summary: SurfaceSummary
 
 
@@ -160,12 +162,12 @@ def cloud_surface(
     figures = len(np.unique(faces)), len(stars), len(done), len(loops), int(pieces.max()) + 1
     touched = _contacts(cloud, faces)
     where = places_of(places, cloud.neighbors, touched)
-    found_of_it = *figures, start.noise, int(touched.sum()), where, start.lone
+    found_of_it = *figures, start.noise, int(touched.sum()), where, int(start.lone.sum())
     summary = SurfaceSummary(count, *found_of_it)
-    parts = (places, faces, stars, cloud.normals, cloud.neighbors)
-    at, triangles, local, normals, near = (torch.from_numpy(part) for part in parts)
+    parts = (places, faces, stars, cloud.normals, cloud.neighbors, start.lone)
+    at, triangles, local, normals, near, lone = (torch.from_numpy(part) for part in parts)
     frames = _upright(start.frames, normals)
-    return CloudSurface(at, triangles, local, normals, frames, near, summary)
+    return CloudSurface(at, triangles, local, normals, frames, near, lone, summary)
 
 
 class _Start(NamedTuple):
@@ -176,7 +178,7 @@ class _Start(NamedTuple):
     two_sided: bool
     frames: Float[Tensor, "N 3 2"]
     noise: float
-    lone: int
+    lone: Bool[np.ndarray, " N"]
 
 
 def _start(
@@ -187,8 +189,7 @@ def _start(
     """Normals, those of the plane if the points are in one, else refined; and candidates from Delaunay's triangles."""
     candidates = nearest_neighbors(points, min(NEAREST, len(points)))
     lone = lone_points(points.numpy(), candidates.numpy())
-    count = int(lone.sum())
-    if count:
+    if lone.any():
         points = torch.from_numpy(put_beside(points.numpy(), lone))
         candidates = nearest_neighbors(points, candidates.shape[1])
     frames, near = cloud_frames(points, candidates, 2, rounds=1), candidates.numpy()
@@ -202,7 +203,7 @@ def _start(
         small = cloud.small(faces)
         every = np.ones(len(small), dtype=bool)
         return _Start(
-            cloud, Candidates(small, small, every, every, up.numpy()), True, frames, 0.0, count
+            cloud, Candidates(small, small, every, every, up.numpy()), True, frames, 0.0, lone
         )
     normals = given
     if normals is None:
@@ -219,7 +220,7 @@ def _start(
         normals = corrected_normals(points, normals, candidates, poles)
     side, two_sided = poles.sides(normals)
     cloud = Cloud(places, normals.numpy(), near, _reaches(places, near), rim)
-    return _Start(cloud, tetrahedra.candidates(cloud, side), two_sided, frames, noise, count)
+    return _Start(cloud, tetrahedra.candidates(cloud, side), two_sided, frames, noise, lone)
 
 
 def _reaches(

@@ -139,8 +139,8 @@ def to_tangent_vectors(
 
     With weights G of these derivatives J = Gx are tangent vectors of the surface that the fit makes of the points x,
     and over it ∇f = Jᵀ(JJᵀ)⁻¹Gf = J⁺Gf. Of coordinates ∇ is Eᵀ times a projector, so no longer than 1, however steep
-    the fit is over the frame. Where the frame is tangent to it, to `STEEPEST`, G stays, and ∇ is exact for functions that
-    are linear in the tangent plane.
+    the fit is over the frame. Where the frame is tangent to it, to `STEEPEST`, G stays, and ∇ is exact for functions
+    that are linear in the tangent plane.
 
     >>> steep = torch.tensor([[[1.0, 2.0]]])
     >>> to_tangent_vectors(steep, torch.tensor([[[1.0], [0.0]]])).round(decimals=4).tolist()

@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 
 import torch
 from jaxtyping import Bool, Float, Int
+from scipy import sparse
 from torch import Tensor
 from tqdm import tqdm
 
@@ -185,13 +186,19 @@ def surface_shape(
 ) -> Shape:
     """A cloud in R² or R³ with a surface through it, whose triangles and normals it starts from.
 
-    The boundary is that of the surface, but for points at local stars; or the mask `boundary`.
+    The boundary is that of the surface, but for points at local stars; or the mask `boundary`. Lone points are in no
+    neighbourhood but their own.
     """
     flat = points.shape[1] == 2
     triangles = torch.cat([surface.faces, surface.stars])
     initial = mesh_frames(points, triangles) if flat else surface.frames
     sides = None if flat else thin_sides(points, surface.normals, surface.neighbors)
-    start = GraphBalls(points, mesh_graph(triangles, len(points)), initial, sides)
+    graph = mesh_graph(triangles, len(points))
+    if surface.lone.any():
+        others = sparse.diags_array((~surface.lone).numpy().astype(graph.dtype))
+        graph = sparse.csr_array(others @ graph @ others)
+        graph.eliminate_zeros()
+    start = GraphBalls(points, graph, initial, sides)
     balls, order, fits = _refined(start, normal_order, num_neighbors, progress, fit_degrees)
     edge = None
     if condition is not None:
