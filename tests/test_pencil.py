@@ -144,6 +144,16 @@ def test_lanczos_goes_on_where_the_space_is_invariant():
     np.testing.assert_allclose(values, np.repeat([1.0, 2.0], [40, 10]))
 
 
+@pytest.mark.parametrize("linear", [False, True])
+@pytest.mark.parametrize("stiff", [1e-6, 1e-3, 1e-1])
+def test_ribbons_have_the_eigenvalues_of_their_length(stiff, linear):
+    """A band of length N and width ε has λ_j = (2πj/N)², far below 1/area: K = ε cycle, M = ε; here M = 1, K = ε²."""
+    matrices = stiff * cycle_matrix(1500), sparse.eye_array(1500).tocsr()
+    basis = solved(*matrices, 21, **({"linear": matrices} if linear else {}))
+    exact = stiff * np.sort(2 - 2 * np.cos(2 * np.pi * np.arange(1500) / 1500))[:21]
+    np.testing.assert_allclose(basis.eigenvalues, exact, rtol=1e-5, atol=1e-12 * stiff)
+
+
 @pytest.mark.parametrize("size", [30, 2500])  # dense, sparse
 def test_a_pair_alone_has_exact_eigenvalues(size):
     matrices = cycle_matrix(size), sparse.eye_array(size).tocsr()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 import torch
@@ -18,6 +19,8 @@ CHECK = 2
 """Blocks between two looks at the residuals."""
 LONGEST = 20
 """Bound on the space, in multiples of what is asked for; it is 2.5 where things are well."""
+NARROW = 0.1
+"""Share of the shift that the last eigenvalue asked for has at least; else 1/(λ + shift) hardly tells them apart."""
 LOOSE = 1e-4
 """Above this tolerance one pass of orthogonalisation is enough, and eigenvectors in float32."""
 
@@ -25,10 +28,40 @@ Inverse = Callable[[Float[np.ndarray, "N C"]], Float[np.ndarray, "N C"]]
 Pairs = tuple[Float[np.ndarray, " k"], Float[np.ndarray, "N k"]]
 
 
+class ShiftTooLarge(Exception):
+    """The shift is far above the eigenvalues asked for, the last of which is `bound` or less."""
+
+    def __init__(self, bound: float) -> None:
+        super().__init__(f"eigenvalues up to {bound:.3g}")
+        self.bound = bound
+
+
 def inverse(matrix: sparse.csr_array) -> Inverse:
     """The product with A⁻¹, by a Cholesky factor."""
     factor = Factor(sparse.csr_array(matrix))
     return lambda b: factor.solve(torch.from_numpy(b)).numpy()
+
+
+def lanczos_of_pair(
+    stiffness: sparse.csr_array,
+    mass_matrix: sparse.csr_array,
+    k: int,
+    shift: float,
+    **settings: Any,
+) -> tuple[Inverse, Pairs]:
+    """A product with (K + shift M)⁻¹, and what `lanczos` finds with it; from the given shift on downwards.
+
+    On a shape as narrow as a ribbon, eigenvalues are those of a curve, far below the inverse of its area. The shift
+    comes down to them there, but not below the rounding of K.
+    """
+    rounding = float(np.finfo(float).eps) * float(stiffness.diagonal().max())
+    least = rounding / float(mass_matrix.diagonal().max())
+    while True:
+        solve = inverse(sparse.csr_array(stiffness + shift * mass_matrix))
+        try:
+            return solve, lanczos(solve, mass_matrix, k, shift=shift, least=least, **settings)
+        except ShiftTooLarge as error:
+            shift = error.bound
 
 
 def lanczos(
@@ -40,32 +73,31 @@ def lanczos(
     tolerance: float,
     more: int = 0,
     null: Float[np.ndarray, " N"] | None = None,
+    least: float = np.inf,
 ) -> Pairs:
     """The k smallest eigenpairs but a null vector, ascending and M-orthonormal, and `more` that are less accurate.
 
-    Krylov space of (K + shift M)⁻¹M from random vectors, fixed ones, orthogonalised in full; no restarts. It is some
-    2.5 (k + more) vectors long.
+    Krylov space of (K + shift M)⁻¹M from random vectors, fixed ones, orthogonalised in full; no restarts.
 
     Parameters
     ----------
-    solve : product with (K + shift M)⁻¹, K positive semidefinite, (N, N).
-    mass_matrix : M, positive definite.
-    shift : small and positive, in the unit of λ.
-    tolerance : bound on the residuals in the M-norm, relative to the eigenvalues 1/(λ + shift); errors of the
-        eigenvalues are of the order of its square.
+    solve, mass_matrix : product with (K + shift M)⁻¹, K positive semidefinite, (N, N); and M, positive definite.
+    shift, least : small and positive, in the unit of λ, and the smallest that is worth trying instead.
+    tolerance : of the residuals in the M-norm, relative to 1/(λ + shift); eigenvalues are off by about its square.
     null : null vector of K, M-normalised, which is left out.
 
     Raises
     ------
-    EigenbasisError : if all N vectors do not suffice, or `LONGEST` times those asked for.
+    ShiftTooLarge : if one of `NARROW` times it serves better, and `least` allows that.
+    EigenbasisError : if N vectors do not suffice, or `LONGEST` times those asked for.
     """
     size, count = len(mass_matrix.diagonal()), k + more
     generator, first = np.random.default_rng(0), int(null is not None)
     basis, dual = (np.empty((min(4 * count + 4 * BLOCK, size), size)) for _ in range(2))  # V, MV
     if null is not None:
         basis[0], dual[0] = null, mass_matrix @ null
-    h, end = np.zeros((first, first)), first
-    z, look = generator.standard_normal((BLOCK, size)), first + 2 * count
+    h, end, look = np.zeros((first, first)), first, first + 2 * count
+    z = generator.standard_normal((BLOCK, size))
     while end + BLOCK <= min(size, LONGEST * (count + BLOCK)):
         coupling = _orthogonalise(z, basis[:end], dual[:end], 1 if tolerance > LOOSE else 2)
         h[:, max(end - BLOCK, first) : end] = coupling.T if end > first else 0.0
@@ -79,6 +111,8 @@ def lanczos(
         if end >= look:
             theta, y = linalg.eigh(np.triu(h[first:, first:]), lower=False)
             theta, y = theta[: -count - 1 : -1], y[:, : -count - 1 : -1]
+            if (bound := max(1 / theta[k - 1] - shift, least)) < NARROW * shift:
+                raise ShiftTooLarge(bound)
             if (np.linalg.norm(r @ y[-BLOCK:, :k], axis=0) <= tolerance * theta[:k]).all():
                 return 1 / theta - shift, _combined(basis[first:end], y, tolerance)
             look = end + CHECK * BLOCK

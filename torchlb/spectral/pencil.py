@@ -23,7 +23,7 @@ from torch import Tensor
 
 from torchlb.errors import EigenbasisError, warn
 from torchlb.linalg.krylov import prefers_krylov
-from torchlb.linalg.lanczos import Inverse, inverse, lanczos
+from torchlb.linalg.lanczos import Inverse, lanczos_of_pair
 from torchlb.linalg.sparse import both_products, multiply, on_one_pattern
 from torchlb.linalg.two_levels import Matrix, absolute_row_sums, main_entries, two_levels
 from torchlb.spectral.eigenbasis import Eigenbasis
@@ -195,12 +195,10 @@ def _pairs(part: _Part, k: int, tolerance: float) -> tuple[np.ndarray, ...]:
         errors, mu = np.zeros(count), part.mass_matrix @ u
     else:
         k1, m1 = part.linear or (part.stiffness, part.mass_matrix)
-        null, shift = _constant(m1) if zero else None, SHIFT / float(m1.sum())
+        null = _constant(m1) if zero else None
         accuracy = EXACT if part.linear is None else START
-        solve = inverse(sparse.csr_array(k1 + shift * m1))
-        values, u = lanczos(
-            solve, m1, k - zero, shift=shift, tolerance=accuracy, more=GUARD, null=null
-        )
+        settings = {"tolerance": accuracy, "more": GUARD, "null": null}
+        solve, (values, u) = lanczos_of_pair(k1, m1, k - zero, SHIFT / float(m1.sum()), **settings)
         if null is not None:
             values, u = np.append(0.0, values), np.column_stack([null.astype(u.dtype), u])
         if part.linear is None:
