@@ -1,5 +1,8 @@
 """Every bad input is refused with what came, where, and what to do."""
 
+import re
+import warnings
+
 import numpy as np
 import pytest
 import torch
@@ -8,7 +11,8 @@ from scipy.spatial import Delaunay
 
 import torchlb
 from torchlb import LaplaceBeltrami, clean_mesh, clean_points
-from torchlb.operator.checks import check_dimension, mended_faces
+from torchlb.geometry.neighbors import nearest_neighbors
+from torchlb.operator.checks import check_dimension, mended_faces, warn_of_near_duplicates
 from torchlb.operator.cleaning import turned_faces
 from torchlb.surfaces import CliffordTorus, Sphere
 
@@ -181,6 +185,50 @@ def test_clean_mesh_is_the_remedy_that_the_error_names():
     assert 7 not in kept.tolist()
     assert torch.equal(vertices, VERTICES[kept])
     assert LaplaceBeltrami.from_mesh(vertices, faces).num_points == 99
+
+
+def _twice(points, kind):
+    generator = torch.Generator().manual_seed(0)
+    shift = torch.randn(len(points), 3, generator=generator, dtype=points.dtype)
+    if kind == "crowd":
+        return torch.cat([points, points[300] + 1e-6 * shift[:40]])
+    cap = points[:, 2] > 0.5
+    apart = {"along": 1e-6 * shift, "off": 1e-3 * shift, "normal": 1e-4 * points}[kind]
+    return torch.cat([points, (points + apart)[cap]])
+
+
+@pytest.mark.parametrize("kind", ["along", "off", "normal", "crowd"])
+@pytest.mark.parametrize("cloud", ["points", "random_points"])
+def test_near_duplicates_are_told_and_the_remedy_brings_the_cloud_back(cloud, kind):
+    points = getattr(Sphere(), cloud)(1000)
+    doubled = _twice(points, kind)
+    neighbors = nearest_neighbors(doubled, 24)
+    with pytest.warns(UserWarning, match="far closer to another than to those around") as told:
+        warn_of_near_duplicates(doubled, neighbors)
+    tolerance = float(re.findall(r"clean_points\(points, (.*)\)", str(told[0].message))[0])
+    merged, kept = clean_points(doubled, tolerance)
+    assert abs(len(merged) - 1000) <= 10  # at random, some of the thousand are as close
+    torch.testing.assert_close(merged, doubled[kept])
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        warn_of_near_duplicates(merged, nearest_neighbors(merged, 24))
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_points_that_chance_brings_together_are_no_near_duplicates(seed):
+    """The closest two of N are at 1/√N of the spacing or so, also where the density changes by 1 : 50."""
+    generator = np.random.default_rng(seed)
+    points = Sphere().random_points(40000, seed=seed)
+    weight = 50 ** ((points[:, 2].numpy() + 1) / 2)
+    uneven = points[generator.choice(40000, 3000, replace=False, p=weight / weight.sum())]
+    noisy = points[:3000] + 0.03 * torch.from_numpy(generator.standard_normal((3000, 3)))
+    for cloud in (points[:3000], uneven, noisy, points[:40]):
+        warn_of_near_duplicates(cloud, nearest_neighbors(cloud, min(24, len(cloud))))
+
+
+def test_a_cloud_scanned_twice_in_part_is_told():
+    with pytest.warns(UserWarning, match="are far closer to another"):
+        LaplaceBeltrami.from_points(_twice(Sphere().points(1000), "normal"))
 
 
 def test_clean_points_is_the_remedy_that_the_error_names():

@@ -32,6 +32,7 @@ from torchlb.operator.checks import (
     check_scale,
     check_spread,
     mended_faces,
+    warn_of_near_duplicates,
 )
 from torchlb.operator.doubts import warn_of_doubts, warn_of_joins
 from torchlb.operator.inputs import ArrayLike, check_points
@@ -183,6 +184,7 @@ def _build_on_surface(
     ambient, where = points.shape[1], None if isinstance(boundary, str) else boundary
     space = pad(points, (0, 3 - ambient))
     surface = cloud_surface(space, normals=settings["normals"], oriented=oriented, boundary=where)
+    warn_of_near_duplicates(points, surface.neighbors)
     settings["normals"] = settings["normals"] if oriented else None
     surface = replace(surface, faces=flipped(surface.points, surface.faces))
     options = options.settled(triangles=len(surface.faces) > 0)

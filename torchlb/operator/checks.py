@@ -8,6 +8,7 @@ from typing import Any
 import torch
 from jaxtyping import Bool, Float, Int
 from scipy.spatial import KDTree
+from scipy.special import pdtrc
 from torch import Tensor
 
 from torchlb.errors import InputError, first_few, warn
@@ -27,6 +28,11 @@ COARSE = 1e-3
 """Step of single precision over the spacing of the points above which Δ is rounding."""
 ON_LINE = 1e-9
 """Spread of a cloud across its longest direction over that along it, below which it is a line."""
+RING, CROWD, CLUSTER = 8, 256, 1e-2
+"""Neighbour whose distance that to the nearest is compared with; the same where so many crowd into one place that those
+are all within a hundredth of what is usual."""
+EXCESS, CHANCE = 10, 1e-6
+"""Near-duplicates are told where points are so many times as many as at random, which happens by such a chance."""
 FLAT = 1e-14
 """Squared sine of the angles of triangles that have no area."""
 
@@ -54,6 +60,37 @@ def check_distinct(points: Float[Tensor, "N n"]) -> None:
             f"{first_few(bad)}); remove duplicates with points, kept = torchlb.clean_points(points)"
         )
     _warn_of_rounding(points, spacing)
+
+
+def warn_of_near_duplicates(points: Float[Tensor, "N n"], neighbors: Int[Tensor, "N K"]) -> None:
+    """A warning that names points of a surface which are closer to another than chance explains, as if scanned twice.
+
+    Of points at random the nearest is closer than t times the distance to the one of number m with the probability
+    1 − (1 − t²)^(m − 1), about (m − 1)t², whatever their density.
+    """
+    last = min(RING, neighbors.shape[1] - 1)
+    distance = (points[neighbors[:, 1:]] - points[:, None]).norm(dim=-1)
+    nearest, wide = distance.amin(1), distance.amax(1)
+    squares = (last - 1) * (nearest / distance[:, last - 1]).square()
+    tight = (wide < CLUSTER * wide.median()).nonzero()[:, 0]
+    if len(tight):  # more than K in one place
+        far = min(CROWD, len(points) - 1)
+        reach, _ = KDTree(points.numpy()).query(points[tight].numpy(), k=far + 1)
+        squares[tight] = (far - 1) * (nearest[tight] / torch.from_numpy(reach)[:, -1]).square()
+    ordered, order = squares.sort()
+    number = torch.arange(1, len(points) + 1)
+    expected = len(points) * ordered
+    chance = pdtrc((number // 2 - 1).clamp_min(0).numpy(), expected.numpy() / 2)
+    excess = number - EXCESS * expected
+    excess[(number < 2) | torch.from_numpy(chance > CHANCE)] = 0
+    if excess.max() > 0:
+        close = order[: int(excess.argmax()) + 1]
+        width = float(f"{1.01 * float(nearest[close].max()):.2e}")
+        warn(
+            f"points: {len(close)} are far closer to another than to those around ({first_few(close.sort().values)}), "
+            "as where a part was scanned twice: such points say nothing that the other does not, and Δf may be wrong "
+            f"by any amount there; merge them with points, kept = torchlb.clean_points(points, {width:g})"
+        )
 
 
 def check_spread(points: Float[Tensor, "N n"]) -> None:

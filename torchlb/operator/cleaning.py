@@ -11,6 +11,7 @@ from scipy.spatial import KDTree
 from torch import Tensor
 from torch.nn.functional import pad
 
+from torchlb.errors import InputError
 from torchlb.geometry.manifold import edges_of, two_orientations
 from torchlb.operator.inputs import ArrayLike, as_tensor, check_corners, check_points
 
@@ -32,12 +33,13 @@ def coincident(
     return distance, other, close.nonzero()[:, 0]
 
 
-def clean_points(points: ArrayLike) -> tuple[Tensor, Tensor]:
-    """Cloud without duplicates: of points in the same place, to rounding, the first stays.
+def clean_points(points: ArrayLike, tolerance: float = 0.0) -> tuple[Tensor, Tensor]:
+    """Cloud without duplicates: of points in the same place, to rounding or within a tolerance, the first stays.
 
     Parameters
     ----------
     points : (N, n), ℓ, finite.
+    tolerance : ℓ; of points that are at most so far from one to the next the first stays. Far below the spacing.
 
     Returns
     -------
@@ -51,7 +53,9 @@ def clean_points(points: ArrayLike) -> tuple[Tensor, Tensor]:
     [0, 1]
     """
     places, points = check_points(points), as_tensor(points)
-    kept = torch.arange(len(points))
+    if not 0 <= tolerance < torch.inf:
+        raise InputError(f"tolerance: expected a length of 0 or more, got {tolerance}")
+    kept = merged(places, tolerance).unique() if tolerance else torch.arange(len(points))
     while len(kept):
         _, other, twins = coincident(places[kept])
         if len(twins) == 0:
