@@ -221,6 +221,7 @@ def test_points_that_chance_brings_together_are_no_near_duplicates(seed):
     points = Sphere().random_points(40000, seed=seed)
     weight = 50 ** ((points[:, 2].numpy() + 1) / 2)
     uneven = points[generator.choice(40000, 3000, replace=False, p=weight / weight.sum())]
+    warnings.simplefilter("error")
     noisy = points[:3000] + 0.03 * torch.from_numpy(generator.standard_normal((3000, 3)))
     for cloud in (points[:3000], uneven, noisy, points[:40]):
         warn_of_near_duplicates(cloud, nearest_neighbors(cloud, min(24, len(cloud))))

@@ -18,6 +18,7 @@ from torchlb.geometry.manifold import (
     wound_alike,
 )
 from torchlb.geometry.surface import cloud_surface
+from torchlb.operator.checks import warn_of_layers
 from torchlb.surfaces import (
     Ellipsoid,
     Hemisphere,
@@ -590,3 +591,43 @@ def test_values_at_lone_points_are_in_no_other_row():
     assert with_stray.surface.lone == 5
     everywhere = torch.cat([f, torch.full((5,), 1e3, dtype=torch.float64)])
     torch.testing.assert_close(with_stray(everywhere)[:1000], alone(f), rtol=0.0, atol=1e-2)
+
+
+def _plate(thickness, bent, seed):
+    """900 points on either side of a plate, even or at random, its thickness in spacings."""
+    generator = np.random.default_rng(seed)
+    x, y = (np.stack(np.meshgrid(np.arange(30), np.arange(30))).reshape(2, -1) + 0.5) / 30
+    sides = [np.stack([x, y], 1)] * 2 if seed == 0 else list(generator.random((2, 900, 2)))
+    flat = np.concatenate(
+        [np.c_[side, np.full(900, z)] for side, z in zip(sides, (0, thickness / 30), strict=True)]
+    )
+    flat[:, 2] += bent * flat[:, 0] ** 2
+    return torch.from_numpy(flat)
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+@pytest.mark.parametrize("thickness", [0.3, 0.8, 1.2])
+def test_a_thin_plate_is_told(thickness, seed):
+    for bent in (0, 0.5):
+        with pytest.warns(UserWarning, match="in two layers about a spacing apart or closer"):
+            warn_of_layers(_plate(thickness, bent, seed))
+
+
+def test_a_thin_shell_is_told_by_the_operator():
+    inner = Sphere().random_points(600, seed=1) * (1 - 0.5 * (4 * np.pi / 600) ** 0.5)
+    with pytest.warns(UserWarning, match="two layers"):
+        LaplaceBeltrami.from_points(torch.cat([Sphere().random_points(600), inner]))
+
+
+@pytest.mark.parametrize("noise", [0, 0.1, 0.3, 0.5])  # of the spacing
+@pytest.mark.parametrize("name", CLOSED)
+def test_noise_is_not_taken_for_two_layers(name, noise):
+    """A symmetric law with one mode has a kurtosis of 9/5 or more, the normal law 3."""
+    warnings.simplefilter("error")
+    for kind in ("points", "random_points"):
+        points = cloud(name, kind)
+        spacing = (4 * np.pi / len(points)) ** 0.5
+        shift = torch.randn(points.shape, generator=torch.Generator().manual_seed(3)).double()
+        warn_of_layers(points + noise * spacing * shift)
+    for gap in (3, 6):
+        warn_of_layers(_plate(gap, 0, 1))

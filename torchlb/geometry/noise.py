@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import numpy as np
 import torch
 from jaxtyping import Float, Int
+from scipy.spatial import KDTree
 from torch import Tensor
 
 from torchlb.fits.polynomials import monomial_columns, num_monomials
@@ -19,6 +21,11 @@ SAMPLE = 2000
 ROUNDING = 1e-6
 """Residuals below this share of a neighbourhood's radius are none."""
 RIDGE = 1e-12
+AROUND = 40
+"""Points around each whose heights are looked at for two layers."""
+UNIMODAL, LAYERS = 1.6, 0.1
+"""Kurtosis of the residuals of quadratics below which they are of two layers: it is 1 for two values, 9/5 and more for
+whatever has one mode and is symmetric, 3 for a normal law; and their least size, over the spacing."""
 
 
 def denoised(
@@ -50,6 +57,27 @@ def denoised(
         moved[part] += torch.where(known, offset, 0.0)[:, None] * normals[part]
         squares.append((left / (counts - num_monomials(2, 2)))[known])
     return moved, float(torch.cat(squares).median().sqrt())
+
+
+def in_two_layers(points: Float[np.ndarray, "N 3"]) -> tuple[Int[np.ndarray, " M"], int]:
+    """Of a sample of points those around which points lie in two layers, a spacing apart or closer; and its size.
+
+    Noise has one mode: heights over the surface in its midst are the most frequent. Of two layers these are the rarest,
+    and the kurtosis of what quadratics through the nearest points leave tells them apart. Nothing is said of fewer
+    than twice as many points.
+    """
+    some = np.arange(0, len(points), -(-len(points) // SAMPLE))
+    if len(points) < 2 * AROUND:
+        return some[:0], len(some)
+    distance, index = (np.asarray(part) for part in KDTree(points).query(points[some], k=AROUND))
+    offset = points[index] - points[index].mean(1, keepdims=True)
+    axes = np.linalg.eigh(offset.transpose(0, 2, 1) @ offset)[1]
+    height, v, u = np.moveaxis(offset @ axes / distance[:, -1:, None], -1, 0)
+    basis = np.linalg.qr(np.stack([np.ones_like(u), u, v, u * u, u * v, v * v], -1))[0]
+    height -= (basis @ (basis.transpose(0, 2, 1) @ height[..., None]))[..., 0]
+    square = np.square(height).mean(1)
+    layered = (height**4).mean(1) < UNIMODAL * square**2
+    return some[layered & (square > LAYERS**2 * np.pi / AROUND)], len(some)
 
 
 def _residuals(

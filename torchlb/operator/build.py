@@ -32,6 +32,7 @@ from torchlb.operator.checks import (
     check_scale,
     check_spread,
     mended_faces,
+    warn_of_layers,
     warn_of_near_duplicates,
 )
 from torchlb.operator.doubts import warn_of_doubts, warn_of_joins
@@ -185,6 +186,8 @@ def _build_on_surface(
     space = pad(points, (0, 3 - ambient))
     surface = cloud_surface(space, normals=settings["normals"], oriented=oriented, boundary=where)
     warn_of_near_duplicates(points, surface.neighbors)
+    if ambient == 3:
+        warn_of_layers(points)
     settings["normals"] = settings["normals"] if oriented else None
     surface = replace(surface, faces=flipped(surface.points, surface.faces))
     options = options.settled(triangles=len(surface.faces) > 0)

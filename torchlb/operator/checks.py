@@ -13,6 +13,7 @@ from torch import Tensor
 
 from torchlb.errors import InputError, first_few, warn
 from torchlb.fits.polynomials import num_monomials
+from torchlb.geometry.noise import in_two_layers
 from torchlb.operator.cleaning import (
     are_quads,
     coincident,
@@ -33,6 +34,8 @@ RING, CROWD, CLUSTER = 8, 256, 1e-2
 are all within a hundredth of what is usual."""
 EXCESS, CHANCE = 10, 1e-6
 """Near-duplicates are told where points are so many times as many as at random, which happens by such a chance."""
+LAYERED = 0.1
+"""Share of a cloud in two layers from which on a warning names it: 0.4 and more on plates, 0.001 on noisy shapes."""
 FLAT = 1e-14
 """Squared sine of the angles of triangles that have no area."""
 
@@ -90,6 +93,18 @@ def warn_of_near_duplicates(points: Float[Tensor, "N n"], neighbors: Int[Tensor,
             f"points: {len(close)} are far closer to another than to those around ({first_few(close.sort().values)}), "
             "as where a part was scanned twice: such points say nothing that the other does not, and Δf may be wrong "
             f"by any amount there; merge them with points, kept = torchlb.clean_points(points, {width:g})"
+        )
+
+
+def warn_of_layers(points: Float[Tensor, "N 3"]) -> None:
+    """A warning where much of a cloud is two layers so close that they may be taken for one sheet with noise."""
+    layered, looked_at = in_two_layers(points.numpy())
+    if len(layered) > LAYERED * looked_at:
+        warn(
+            f"points: around {len(layered) / looked_at:.0%} of them ({first_few(torch.from_numpy(layered))}) they lie "
+            "in two layers about a spacing apart or closer, as on a thin plate sampled on both sides; the surface may "
+            "be one sheet there, with half of the area. Add points until they are closer than it is thick, keep one "
+            "side alone, or give the mesh if there is one"
         )
 
 
