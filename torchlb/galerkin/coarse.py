@@ -12,13 +12,15 @@ from torch import Tensor
 from torchlb.galerkin.delaunay import Cover, delaunay_cover
 from torchlb.galerkin.elements import EDGES
 from torchlb.galerkin.nodes import Nodes
+from torchlb.galerkin.rim import KINK
 from torchlb.geometry.manifold import edges_of
 from torchlb.geometry.vectors import at
+from torchlb.geometry.vertex_fits import IN_ROWS, VertexFits
 
 LYING = cos(radians(120))
 """Cosine of the angle across from a boundary edge, below which its triangle lies along the boundary."""
 CREASED = cos(radians(60))
-"""Cosine between the normals of two triangles, below which their edge is one of the shape's."""
+"""Cosine between the normals of two triangles, below which their edge is one of the shape's; `KINK` where fits fail."""
 SPARSE = 3
 """Vertices on edges of the shape, or without a fit, for each other one, over which there is nothing inside."""
 NO_AREA = 1e-5
@@ -51,11 +53,11 @@ def with_area(points: Float[Tensor, "N n"], faces: Int[Tensor, "F 3"]) -> Bool[T
 def coarse_triangles(
     points: Float[Tensor, "N n"],
     nodes: Nodes,
-    fitted: Bool[Tensor, " N"],
+    fits: VertexFits,
     free: Bool[Tensor, " E"],
 ) -> Bool[Tensor, " F"]:
     """Those that lie along the free boundary, and those around which all is edges of the shape or has no fit."""
-    return lying_triangles(points, nodes, free) | _without_inside(points, nodes, fitted)
+    return lying_triangles(points, nodes, free) | _without_inside(points, nodes, fits)
 
 
 def lying_triangles(
@@ -75,23 +77,40 @@ def lying_triangles(
         met[nodes.edge[new].flatten()] = True
 
 
-def _without_inside(points: Tensor, nodes: Nodes, fitted: Bool[Tensor, " N"]) -> Bool[Tensor, " F"]:
+def _without_inside(points: Tensor, nodes: Nodes, fits: VertexFits) -> Bool[Tensor, " F"]:
     """Triangles without a fit at any corner, or around each of whose corners nearly all vertices lie on edges."""
-    bound = ~fitted
+    lone = fits.degree == 0
+    bound = lone.clone()
     if points.shape[1] == 3:
-        corners = at(points, nodes.faces)
-        normal = torch.linalg.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-        normal = torch.nn.functional.normalize(normal, eps=torch.finfo(normal.dtype).tiny)
-        total = points.new_zeros(len(nodes.edges), 3)
-        total.index_add_(0, nodes.edge.flatten(), normal.repeat_interleave(3, 0))
-        # |m + n|² = 2 + 2 m·n of two units
-        creased = (nodes.uses == 2) & (total.square().sum(1) < 2 + 2 * CREASED)
-        bound[nodes.edges[creased].flatten()] = True
-    weight = torch.where(bound, 1, -SPARSE)
-    around = weight.clone()
+        turn, pairs = _cosines(points, nodes), nodes.edges
+        bound[pairs[turn < CREASED].flatten()] = True
+        kinked = torch.zeros_like(bound)
+        kinked[pairs[turn < KINK].flatten()] = True
+        bound |= kinked & (fits.surface.reason == IN_ROWS)
+    rim = torch.zeros_like(bound)
+    rim[nodes.edges[nodes.uses != 2].flatten()] = True
+    bound |= rim & (_around(nodes, (~bound & ~rim).long()) == 0)
+    around = _around(nodes, torch.where(bound, 1, -SPARSE))
+    return (around > 0)[nodes.faces].all(1) | lone[nodes.faces].all(1)
+
+
+def _cosines(points: Float[Tensor, "N 3"], nodes: Nodes) -> Float[Tensor, " E"]:
+    """Of the angle between the normals of the two triangles at an edge; 1 where there are not two."""
+    corners = at(points, nodes.faces)
+    normal = torch.linalg.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    normal = torch.nn.functional.normalize(normal, eps=torch.finfo(normal.dtype).tiny)
+    total = points.new_zeros(len(nodes.edges), 3)
+    total.index_add_(0, nodes.edge.flatten(), normal.repeat_interleave(3, 0))
+    # |m + n|² = 2 + 2 m·n of two units
+    return torch.where(nodes.uses == 2, total.square().sum(1) / 2 - 1, 1.0)
+
+
+def _around(nodes: Nodes, values: Int[Tensor, " N"]) -> Int[Tensor, " N"]:
+    """Sums over each vertex and its neighbours."""
+    total = values.clone()
     for one, other in nodes.edges.T, nodes.edges.T.flip(0):
-        around.index_add_(0, one, weight[other])
-    return (around > 0)[nodes.faces].all(1) | ~fitted[nodes.faces].any(1)
+        total.index_add_(0, one, values[other])
+    return total
 
 
 def cover_of(

@@ -94,7 +94,7 @@ def curve(
     free = nodes.uses == 1
     if held is not None:
         free &= ~held[nodes.edges].all(1)
-    coarse = coarse_triangles(points, nodes, fits.degree > 0, free)
+    coarse = coarse_triangles(points, nodes, fits, free)
     curved[nodes.edge[coarse].flatten()] = False
     places, curved, bent, g, lengths = _flattened(points, nodes, (flat, standing), curved, whole)
     cover = cover_of(nodes, lengths, coarse, free)

@@ -26,6 +26,8 @@ REASONS = (
     "neighbours too close to a line or conic",
     "points do not resolve the surface",
 )
+IN_ROWS = 2
+"""Place in `REASONS` of too few rows of neighbours."""
 LEAST = 1.5
 """Neighbours per polynomial without which a fit is not tried."""
 
@@ -113,7 +115,7 @@ class Graphs:
         good = regular & (fit.misfit(heights) <= MAX_MISFIT.get(fit.degree, FAITHFUL))
         vacant = self.degree[vertices] < fit.degree
         if fit.degree == self.highest:
-            reason = torch.where(good, 0, torch.where(regular, 3, 2))
+            reason = torch.where(good, 0, torch.where(regular, 3, IN_ROWS))
             self.reason[vertices] = torch.where(vacant, reason, self.reason[vertices])
         new = good & vacant
         kept, terms = vertices[new], fit.coefficients.shape[1]
