@@ -112,16 +112,50 @@ def test_sheared_triangles_in_a_plane_are_flipped(shear):
     np.testing.assert_allclose(*found, rtol=5e-3)
 
 
+def flat_ring(inner, sections):
+    """Two circles with as many vertices on each and none between."""
+    angle = 2 * np.pi * np.arange(sections) / sections
+    circle = np.stack([np.cos(angle), np.sin(angle)], 1)
+    points = np.concatenate([inner * circle, circle])
+    faces = Delaunay(points).simplices
+    return in_the_plane(points, faces[(faces >= sections).any(1)])
+
+
+def flat_plate():
+    """A rectangle with two round holes, all vertices on the boundary."""
+    angle = 2 * np.pi * np.arange(24) / 24
+    holes, corners = np.array([[1, 1, 0.4], [2.2, 0.8, 0.3]]), [[0, 0], [3, 0], [3, 2], [0, 2]]
+    circles = [[x + r * np.cos(angle), y + r * np.sin(angle)] for x, y, r in holes]
+    points = np.concatenate([np.swapaxes(circles, 1, 2).reshape(-1, 2), corners])
+    faces = Delaunay(points).simplices
+    hole = faces // 24  # 2 for the corners
+    return in_the_plane(points, faces[(hole != hole[:, :1]).any(1) | (hole[:, 0] == 2)])
+
+
+PULLEY = [[0.2, 0], [1, 0], [1, 0.1], [0.75, 0.3], [1, 0.5], [1, 0.6], [0.2, 0.6], [0.2, 0]]
+
+
 def part(name):
+    if name in FLAT:
+        return [t.numpy() for t in FLAT[name]()]
     shape = {
         "annulus": lambda: trimesh.creation.annulus(0.5, 1, 1, sections=48),
         "cylinder": lambda: trimesh.creation.cylinder(1, 2, sections=64),
+        "pulley": lambda: trimesh.creation.revolve(PULLEY, sections=40),
     }[name]()
     return np.array(shape.vertices), np.array(shape.faces)
 
 
+FLAT = {
+    "ring": lambda: flat_ring(0.5, 48),
+    "narrow ring": lambda: flat_ring(0.8, 64),
+    "plate": flat_plate,
+}
+PARTS = ["annulus", "cylinder", "pulley", *FLAT]
+
+
 @pytest.mark.filterwarnings("ignore")
-@pytest.mark.parametrize("name", ["annulus", "cylinder"])
+@pytest.mark.parametrize("name", PARTS)
 def test_parts_without_vertices_inside_are_as_good_as_by_the_cotangent(name):
     """Median of λ_1 to λ_11 against robust_laplacian's on the refined part: at most 1.2 of the better of both peers."""
     vertices, faces = part(name)
@@ -141,6 +175,30 @@ def test_parts_without_vertices_inside_are_as_good_as_by_the_cotangent(name):
     values = [basis.eigenvalues.numpy()[1:] for basis in found] + [robust(vertices, faces)]
     ours, *peers = (np.median(np.abs(v / exact - 1)) for v in values)
     assert ours < 1.2 * min(peers)
+
+
+@pytest.mark.parametrize("name", FLAT)
+def test_flat_parts_have_the_area_of_their_polygons(name):
+    """Nothing of them is curved, along the boundary either."""
+    vertices, faces = part(name)
+    area = trimesh.Trimesh(vertices, faces, process=False).area
+    lb = LaplaceBeltrami.from_mesh(vertices, faces, certify=False)
+    np.testing.assert_allclose(float(lb.mass.sum()), area, rtol=1e-9)
+
+
+@pytest.mark.parametrize(("rows", "height", "limit"), [(3, 0.05, 3e-3), (4, 0.3, 3e-3)])
+def test_few_rows_of_vertices_are_enough_for_fits(rows, height, limit):
+    """λ = π²(i² + (j/h)²) of a strip with one or two rows inside; triangles at its corners have no vertex inside."""
+    x, y = np.meshgrid(np.linspace(0, 1, 24), np.linspace(0, height, rows))
+    i = np.arange(24 * rows).reshape(rows, 24)
+    a, b, c, d = (part.ravel() for part in (i[:-1, :-1], i[:-1, 1:], i[1:, 1:], i[1:, :-1]))
+    faces = np.concatenate([np.stack([a, b, d], 1), np.stack([b, c, d], 1)])
+    mesh = in_the_plane(np.stack([x.ravel(), y.ravel()], 1), faces)
+    exact = np.sort(
+        [(np.pi * i) ** 2 + (np.pi * j / height) ** 2 for i in range(12) for j in range(5)]
+    )
+    found = LaplaceBeltrami.from_mesh(*mesh, certify=False).eigenbasis(12).eigenvalues.numpy()
+    assert np.median(np.abs(found / np.maximum(exact[:12], 1e-9) - 1)[1:]) < limit
 
 
 def test_the_delaunay_cover_is_that_of_robust_laplacian():
