@@ -31,8 +31,6 @@ ROWS = 2**13
 """Rows of a product at a time."""
 ROOM = 2**20
 """Entries of a product at a time, where it is compiled."""
-LUMPED = 0.8
-"""Share of lumped mass in that of flat triangles."""
 SMALLEST = 0.1
 """Share of its linear mass that the mass of a vertex has at least."""
 
@@ -178,20 +176,13 @@ def _linear(lengths: Tensor, faces: Tensor, count: int) -> sparse.csr_array:
 def flat_pair(mesh: CurvedMesh, count: int) -> sparse.csr_array:
     """K + iM of the flat triangles: linear elements on a Delaunay triangulation of them, each half of its two copies.
 
-    Their mass is mostly lumped, to the mixed Voronoi areas of Meyer et al. (2003). The leading errors of lumped and
-    consistent mass have opposite signs, and cancel in the mean of both where solutions are resolved; on long triangles
-    the stiffness is too large besides, which lumped mass makes good.
+    Their mass is lumped, to thirds of the triangles, as robust_laplacian's.
     """
     faces, lengths, _ = mesh.cover
     element, metric = triangle(1), flat_metric(lengths)
     blocks = element_matrices(metric[:, None].expand(-1, len(element.weights), 3), element)
-    area = area_element(metric)[:, None] / 2
-    xx, xy, yy = metric.unbind(1)
-    dot = torch.stack([xy, xx - xy, yy - xy], 1)  # of the two sides at each corner
-    others = dot.roll(1, 1) * dot.roll(-1, 1) / (16 * area)
-    lumped = area / 4 + torch.minimum(others.clamp_min(0), area / 4)
-    blocks.imag.mul_(1 - LUMPED)
-    blocks.imag[:, ::4] += LUMPED * lumped
+    blocks.imag.zero_()
+    blocks.imag[:, ::4] = area_element(metric)[:, None] / 6
     return summed(blocks / 2, faces, count)
 
 
