@@ -10,6 +10,7 @@ import trimesh
 
 from builders import stencil_of_cloud
 from torchlb import InputError, LaplaceBeltrami
+from torchlb.geometry import doubtful
 from torchlb.geometry.manifold import (
     _ascending,
     boundary_loops,
@@ -221,6 +222,34 @@ def test_handles_through_a_thin_wall_are_told(seed):
         lb = LaplaceBeltrami.from_points(points, order=1)
     told = any("may join what only touches" in str(warning.message) for warning in caught)
     assert told or euler(lb.faces.numpy()) == 2
+
+
+def test_energy_in_doubt_is_the_share_of_a_strip(monkeypatch):
+    """Modes cos(kπx) of a strip; of k² ∫ sin²(kπx) the part from a to b has b − a − (sin 2kπb − sin 2kπa)/2kπ."""
+    start, end = 0.45, 0.55
+    x = torch.linspace(0, 1, 161).double()
+    points = torch.cartesian_prod(x, x[:10], torch.zeros(1).double())
+
+    def within(surface, faces):
+        middle = surface.points.numpy()[faces, 0].mean(1)
+        return (middle > start) & (middle < end)
+
+    monkeypatch.setattr(doubtful, "in_doubt", within)
+    share, _ = doubtful.energy_in_doubt(cloud_surface(points))
+    turn = 2 * np.pi * np.arange(1, 11)
+    right = end - start - (np.sin(turn * end) - np.sin(turn * start)) / turn
+    assert share == pytest.approx(right.max(), rel=0.1)
+
+
+@pytest.mark.parametrize("seed", range(2))
+def test_noise_on_a_box_that_leaves_its_eigenvalues_is_not_warned_of(seed):
+    """Edges across creases are steep where there is noise; λ_1 of 1 × 1.4 × 2 stays, and nothing is said."""
+    box = trimesh.creation.box((1, 1.4, 2))
+    points, face = trimesh.sample.sample_surface(box, 2000, seed=seed)
+    height = 0.2 * (box.area / 2000) ** 0.5 * np.random.default_rng(seed).normal(size=(2000, 1))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", UserWarning)
+        LaplaceBeltrami.from_points(points + height * box.face_normals[face], order=1)
 
 
 @pytest.mark.parametrize("shape", [Sphere(), Torus(), Hemisphere()])

@@ -1,4 +1,4 @@
-"""Triangles through a cloud that may join what is apart, or wall up what is open; and what they do to its spectrum.
+"""Triangles through a cloud that may join what is apart, or wall up what is open; and what its first modes owe them.
 
 Evidence is local and independent of the triangles: a point that its own sheet surrounds has no edge along its normal,
 and no edge is much longer than the points around it are apart. What it is worth is another matter: on a random cloud a
@@ -6,6 +6,8 @@ few triangles are always in doubt, and most change nothing.
 """
 
 from __future__ import annotations
+
+from typing import Any
 
 import numpy as np
 import torch
@@ -33,10 +35,9 @@ the smaller one."""
 PIECE = 24
 """Pieces of fewer points that only triangles in doubt join to others are in doubt themselves."""
 FAINT = 1e-3
-"""What triangles in doubt are weighed by to see what they do, and their mass by its square: they neither conduct nor
-hold, nor have slow modes of their own."""
+"""What triangles in doubt are weighed by where aggregates are made: they hardly conduct, and no diagonal is 0."""
 COARSE, PAIRS = 800, 11
-"""Size of the space in which that is seen; eigenvalues that are compared, 0 among them."""
+"""Size of the space in which modes are computed; how many, the constant among them."""
 WEAK = 1e-3
 """Entries, over √(d_i d_j), that no aggregate of that space reaches across."""
 
@@ -88,13 +89,11 @@ def in_doubt(surface: CloudSurface, faces: Faces) -> Bool[np.ndarray, " F"]:
     return np.asarray(doubtful)
 
 
-def spectral_change(surface: CloudSurface) -> tuple[float, Bool[np.ndarray, " N"]]:
-    """By how much one of the first eigenvalues changes over another without triangles in doubt; and their points.
+def energy_in_doubt(surface: CloudSurface) -> tuple[float, Bool[np.ndarray, " N"]]:
+    """The largest share that triangles in doubt have of the energy ∫|∇φ|² of one of the first modes; and their points.
 
-    Scattered holes lower all of them alike; where something is joined or closed, some change and others do not.
-
-    Linear elements on all triangles and without these, both in the coarse space of smoothed aggregation (Vaněk, Mandel,
-    Brezina 1996) for the latter, in which nothing is aggregated across what is in doubt.
+    To first order the eigenvalue would be lower by this share if they did not conduct, the eigenfunction in between
+    held fast: a bridge holds nearly all the energy of a mode that it alone bounds, scattered triangles little of any.
     """
     points, parts = surface.points.numpy(), (surface.faces.numpy(), surface.stars.numpy())
     faces = np.concatenate(parts)
@@ -103,29 +102,27 @@ def spectral_change(surface: CloudSurface) -> tuple[float, Bool[np.ndarray, " N"
     if not doubtful.any():
         return 0.0, marked
     marked[faces[doubtful]] = True
-    values = _coarse_eigenvalues(points, faces, weight, doubtful)
-    ratio = values[0, 1:] / values[1, 1:]
-    return float(ratio.max() / ratio.min() - 1), marked
+    stiffness, mass = _elements(points, faces, weight)
+    sound, _ = _elements(points, faces, np.where(doubtful, FAINT, 1.0) * weight)
+    used = mass > 0  # in no face at all are none
+    stiffness, sound = (sparse.csr_matrix(part[used][:, used]) for part in (stiffness, sound))
+    basis = _coarse_space(sound)
+    whole, sound, mass = (
+        (basis.T @ part @ basis).toarray() for part in (stiffness, sound, sparse.diags(mass[used]))
+    )
+    values, modes = eigh(whole, mass, subset_by_index=[0, min(PAIRS, len(whole)) - 1])
+    moving = values > 1e-9 * values.max()
+    values, modes = values[moving], modes[:, moving]
+    share = 1 - (modes * (sound @ modes)).sum(0) / values
+    return float(share.max(initial=0.0)), marked
 
 
-def _coarse_eigenvalues(
-    points: Float[np.ndarray, "N 3"],
-    faces: Faces,
-    weight: Float[np.ndarray, " F"],
-    doubtful: Bool[np.ndarray, " F"],
-) -> Float[np.ndarray, "2 k"]:
-    """The first eigenvalues with the doubtful faces, and with these as faint as `FAINT`, in one coarse space."""
+def _coarse_space(sound: sparse.csr_matrix) -> Any:
+    """Smoothed aggregates (Vaněk, Mandel, Brezina 1996), none of which reach across what is in doubt."""
     import pyamg
 
-    whole, mass = _elements(points, faces, weight, weight)
-    scale = np.where(doubtful, FAINT, 1.0)
-    faint, less = _elements(points, faces, scale * weight, scale**2 * weight)
-    used = less > 0  # in no face at all are none
-    whole, faint = (sparse.csr_matrix(matrix[used][:, used]) for matrix in (whole, faint))
-    mass, less = mass[used], less[used]
-    shift = sparse.diags(1e-6 * faint.diagonal())
     hierarchy = pyamg.smoothed_aggregation_solver(
-        faint + shift,
+        sound + sparse.diags(1e-6 * sound.diagonal()),
         strength=("symmetric", {"theta": WEAK}),  # pyright: ignore[reportArgumentType]
         symmetry="symmetric",
         smooth=("jacobi", {"weighting": "local"}),
@@ -133,23 +130,16 @@ def _coarse_eigenvalues(
         max_coarse=COARSE,
         coarse_solver="splu",
     )
-    basis = sparse.identity(len(mass), format="csr")
+    basis = sparse.identity(len(sound.diagonal()), format="csr")
     for level in hierarchy.levels[:-1]:
         basis = basis @ level.P
-    values = []
-    for stiffness, masses in ((whole, mass), (faint, less)):
-        small = [(basis.T @ part @ basis).toarray() for part in (stiffness, sparse.diags(masses))]
-        last = min(PAIRS, len(small[0])) - 1
-        values.append(eigh(*small, eigvals_only=True, subset_by_index=[0, last]))
-    found = np.array(values)
-    return np.maximum(found, 1e-9 * found.max())
+    return basis
 
 
 def _elements(
     points: Float[np.ndarray, "N 3"],
     faces: Faces,
     weight: Float[np.ndarray, " F"],
-    density: Float[np.ndarray, " F"],
 ) -> tuple[sparse.csr_array, Float[np.ndarray, " N"]]:
     """Stiffness of linear elements and their lumped mass; flat triangles as if a little higher."""
     count = len(points)
@@ -159,4 +149,4 @@ def _elements(
     entry = np.einsum("fkx,flx->fkl", side, side) * (weight / (4 * area))[:, None, None]
     row, col = faces.repeat(3, axis=1).ravel(), np.tile(faces, 3).ravel()
     stiffness = sparse.coo_array((entry.ravel(), (row, col)), shape=(count, count)).tocsr()
-    return stiffness, np.bincount(faces.ravel(), (area * density).repeat(3) / 3, count)
+    return stiffness, np.bincount(faces.ravel(), (area * weight).repeat(3) / 3, count)
