@@ -224,7 +224,7 @@ def test_handles_through_a_thin_wall_are_told(seed):
     assert told or euler(lb.faces.numpy()) == 2
 
 
-def test_energy_in_doubt_is_the_share_of_a_strip(monkeypatch):
+def test_change_by_the_middle_of_a_strip_is_its_share_of_energy(monkeypatch):
     """Modes cos(kπx) of a strip; of k² ∫ sin²(kπx) the part from a to b has b − a − (sin 2kπb − sin 2kπa)/2kπ."""
     start, end = 0.45, 0.55
     x = torch.linspace(0, 1, 161).double()
@@ -235,10 +235,10 @@ def test_energy_in_doubt_is_the_share_of_a_strip(monkeypatch):
         return (middle > start) & (middle < end)
 
     monkeypatch.setattr(doubtful, "in_doubt", within)
-    share, _ = doubtful.energy_in_doubt(cloud_surface(points))
+    change, _ = doubtful.spectral_change(cloud_surface(points))
     turn = 2 * np.pi * np.arange(1, 11)
-    right = end - start - (np.sin(turn * end) - np.sin(turn * start)) / turn
-    assert share == pytest.approx(right.max(), rel=0.1)
+    rest = 1 - (end - start) + (np.sin(turn * end) - np.sin(turn * start)) / turn
+    assert change == pytest.approx(1 - rest.min() / rest.max(), rel=0.1)
 
 
 @pytest.mark.parametrize("seed", range(2))

@@ -89,11 +89,11 @@ def in_doubt(surface: CloudSurface, faces: Faces) -> Bool[np.ndarray, " F"]:
     return np.asarray(doubtful)
 
 
-def energy_in_doubt(surface: CloudSurface) -> tuple[float, Bool[np.ndarray, " N"]]:
-    """The largest share that triangles in doubt have of the energy ∫|∇φ|² of one of the first modes; and their points.
+def spectral_change(surface: CloudSurface) -> tuple[float, Bool[np.ndarray, " N"]]:
+    """By how much triangles in doubt raise one of the first eigenvalues over another, to first order; and their points.
 
-    To first order the eigenvalue would be lower by this share if they did not conduct, the eigenfunction in between
-    held fast: a bridge holds nearly all the energy of a mode that it alone bounds, scattered triangles little of any.
+    An eigenvalue would be lower by their share of the energy ∫|∇φ|² of its mode if they did not conduct: scattered
+    triangles have as much of every mode; a bridge has nearly all of a mode that it alone bounds.
     """
     points, parts = surface.points.numpy(), (surface.faces.numpy(), surface.stars.numpy())
     faces = np.concatenate(parts)
@@ -113,8 +113,8 @@ def energy_in_doubt(surface: CloudSurface) -> tuple[float, Bool[np.ndarray, " N"
     values, modes = eigh(whole, mass, subset_by_index=[0, min(PAIRS, len(whole)) - 1])
     moving = values > 1e-9 * values.max()
     values, modes = values[moving], modes[:, moving]
-    share = 1 - (modes * (sound @ modes)).sum(0) / values
-    return float(share.max(initial=0.0)), marked
+    rest = (modes * (sound @ modes)).sum(0) / values
+    return float(1 - rest.min() / rest.max()) if len(rest) else 0.0, marked
 
 
 def _coarse_space(sound: sparse.csr_matrix) -> Any:
