@@ -14,7 +14,7 @@ from scipy.spatial import Delaunay
 from torchlb import LaplaceBeltrami
 from torchlb.galerkin.assembly import element_matrices, flat_metric, summed
 from torchlb.galerkin.delaunay import delaunay_cover
-from torchlb.galerkin.elements import triangle
+from torchlb.galerkin.elements import simplex
 from torchlb.galerkin.nodes import lagrange_nodes
 from torchlb.nn.conduction import conducting
 from torchlb.operator.medium import medium_of
@@ -205,10 +205,11 @@ def test_the_delaunay_cover_is_that_of_robust_laplacian():
     """Half of the linear elements on it: the stiffness of Sharp and Crane's tufted cover."""
     vertices, faces = random_square(200)
     nodes = lagrange_nodes(faces, len(vertices), 2)
-    lengths = (vertices[faces].roll(-1, 1) - vertices[faces]).norm(dim=2)
-    cover = delaunay_cover(faces, lengths, nodes.edge, torch.zeros(len(nodes.edges)).bool())
-    metric = flat_metric(cover.lengths)[:, None].expand(-1, len(triangle(1).weights), 3)
-    ours = summed(element_matrices(metric, triangle(1)), cover.faces, len(vertices)) / 2
+    corners = vertices[nodes.cells]
+    lengths = (corners.roll(-1, 1) - corners).norm(dim=2)
+    cover = delaunay_cover(nodes.cells, lengths, nodes.edge, torch.zeros(len(nodes.edges)).bool())
+    metric = flat_metric(cover.lengths)[:, None].expand(-1, len(simplex(2, 1).weights), 3)
+    ours = summed(element_matrices(metric, simplex(2, 1)), cover.faces, len(vertices)) / 2
     stiffness, mass = robust_laplacian.mesh_laplacian(vertices.numpy(), faces.numpy(), 0.0)
     assert abs(ours.real - stiffness).max() < 1e-9 * abs(stiffness).max()
     np.testing.assert_allclose(ours.imag.sum(axis=1), mass.diagonal(), atol=1e-9)

@@ -505,10 +505,10 @@ def test_swapped_arguments_are_named(unchecked):
 
 
 def test_boundary_data_on_curves_and_solids_get_true_advice():
-    """No mesh of triangles is a solid."""
+    """As clouds, which have no pair."""
     arc = torch.linspace(0, 1, 30, dtype=torch.float64)[:, None] * torch.tensor([1.0, 0.0])
-    edges = torch.arange(29)[:, None] + torch.arange(2)
-    lb = LaplaceBeltrami.from_mesh(arc, edges, order=1, condition="dirichlet")
+    ends = (arc[:, 0] == 0) | (arc[:, 0] == 1)
+    lb = LaplaceBeltrami.from_points(arc, dim=1, order=1, boundary=ends, condition="dirichlet")
     with pytest.raises(
         ValueError, match=r"only a weak pair .*dimension 1 in R\^2.*by a system of the stencil"
     ):

@@ -1,4 +1,7 @@
-"""Stiffness and mass of finite elements from the metric at their Gauss points."""
+"""Stiffness and mass of finite elements from the metric at their Gauss points, in every dimension d = 1, 2, 3.
+
+A symmetric (d, d) matrix is kept as its upper triangle, row by row.
+"""
 
 from __future__ import annotations
 
@@ -7,7 +10,7 @@ from jaxtyping import Complex, Float, Int, Shaped
 from scipy import sparse
 from torch import Tensor
 
-from torchlb.galerkin.elements import Element
+from torchlb.galerkin.elements import Element, subsets
 
 CHUNK = 2**14
 """Elements at a time: some 100 MB."""
@@ -15,51 +18,94 @@ CHUNK = 2**14
 
 def metric(
     places: Float[Tensor, "NX D"], elements: Int[Tensor, "T n"], shape: Element
-) -> Float[Tensor, "T Q 3"]:
-    """G = JᵀJ at the Gauss points of elements with nodes at `places`, as (g_ξξ, g_ξη, g_ηη), ℓ²."""
-    slopes = torch.cat([*shape.gradients.unbind(-1)]).T.contiguous()  # (n, 2Q)
-    xx = xy = yy = places.new_zeros(())
+) -> Float[Tensor, "T Q S"]:
+    """G = JᵀJ at the Gauss points of elements with nodes at `places`, its upper triangle, ℓ²."""
+    dim = shape.dim
+    if dim == 0:
+        return places.new_zeros(len(elements), len(shape.weights), 0)
+    slopes = torch.cat([*shape.gradients.unbind(-1)]).T.contiguous()  # (n, d Q)
+    entries = [places.new_zeros(())] * (dim * (dim + 1) // 2)
     for coordinate in places.T:
-        x, y = (coordinate[elements] @ slopes).chunk(2, 1)
-        xx, xy, yy = xx + x * x, xy + x * y, yy + y * y
-    return torch.stack([xx, xy, yy], -1)
+        along = (coordinate[elements] @ slopes).chunk(dim, 1)
+        products = [x * y for a, x in enumerate(along) for y in along[a:]]
+        entries = [entry + part for entry, part in zip(entries, products, strict=True)]
+    return torch.stack(entries, -1)
 
 
-def flat_metric(lengths: Float[Tensor, "T 3"]) -> Float[Tensor, "T 3"]:
-    """The same of flat triangles from the lengths of their edges, in the order of `EDGES`, ℓ.
+def flat_metric(lengths: Float[Tensor, "T e"]) -> Float[Tensor, "T S"]:
+    """The same of flat simplices from the lengths of their edges, in the order of `subsets`, ℓ.
 
-    >>> flat_metric(torch.tensor([[1.0, 2.0**0.5, 1.0]])).round(decimals=6).abs().tolist()
+    >>> flat_metric(torch.tensor([[1.0, 1.0, 2.0**0.5]])).round(decimals=6).abs().tolist()
     [[1.0, 0.0, 1.0]]
     """
-    a, b, c = lengths.square().unbind(-1)
-    return torch.stack([a, (a + c - b) / 2, c], dim=-1)
+    dim = {1: 1, 3: 2, 6: 3}[lengths.shape[-1]]
+    square = dict(zip(subsets(dim, 2), lengths.square().unbind(-1), strict=True))
+    entries = [
+        square[0, a] if a == b else (square[0, a] + square[0, b] - square[a, b]) / 2
+        for a in range(1, dim + 1)
+        for b in range(a, dim + 1)
+    ]
+    return torch.stack(entries, dim=-1)
 
 
-def area_element(g: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch"]:
-    """√det G, ℓ²; zero where rounding makes the determinant negative."""
-    return (g[..., 0] * g[..., 2] - g[..., 1].square()).clamp_min(0).sqrt()
+def cofactors(g: Float[Tensor, "*batch S"]) -> Float[Tensor, "*batch S"]:
+    """det(G) G⁻¹, the upper triangle.
+
+    >>> cofactors(torch.tensor([2.0, 0.5, 3.0])).tolist()
+    [3.0, -0.5, 2.0]
+    """
+    if g.shape[-1] == 1:
+        return torch.ones_like(g)
+    if g.shape[-1] == 3:
+        xx, xy, yy = g.unbind(-1)
+        return torch.stack([yy, -xy, xx], -1)
+    xx, xy, xz, yy, yz, zz = g.unbind(-1)
+    return torch.stack(
+        [
+            yy * zz - yz * yz,
+            xz * yz - xy * zz,
+            xy * yz - xz * yy,
+            xx * zz - xz * xz,
+            xy * xz - xx * yz,
+            xx * yy - xy * xy,
+        ],
+        -1,
+    )
+
+
+def area_element(g: Float[Tensor, "*batch S"]) -> Float[Tensor, "*batch"]:
+    """√det G, ℓ^d; zero where rounding makes the determinant negative."""
+    if g.shape[-1] == 0:
+        return g.new_ones(g.shape[:-1])
+    if g.shape[-1] == 1:
+        return g[..., 0].sqrt()
+    first = {3: [0, 1], 6: [0, 1, 2]}[g.shape[-1]]
+    return (g[..., first] * cofactors(g)[..., first]).sum(-1).clamp_min(0).sqrt()
 
 
 def element_matrices(
-    g: Float[Tensor, "T Q 3"], shape: Element, conductivity: Float[Tensor, "T Q"] | None = None
+    g: Float[Tensor, "T Q S"], shape: Element, conductivity: Float[Tensor, "T Q"] | None = None
 ) -> Complex[Tensor, "T n_times_n"]:
-    """K + iM of each element, both symmetric: ∫ κ∇φ_i·∇φ_j, without a unit, and ∫ φ_i φ_j, ℓ²; κ = 1 unless given.
+    """K + iM of each element, both symmetric: ∫ κ∇φ_i·∇φ_j, ℓ^{d−2}, and ∫ φ_i φ_j, ℓ^d; κ = 1 unless given.
 
     Two real matrices on one pattern, so that they are summed, and later multiplied, at once.
     """
-    x, y = shape.gradients.unbind(-1)  # (Q, n)
-    cross = x[:, :, None] * y[:, None, :]
-    products = [y[:, :, None] * y[:, None], -(cross + cross.mT), x[:, :, None] * x[:, None]]
+    slopes = shape.gradients.unbind(-1)  # (Q, n) each
+    products = []
+    for a, x in enumerate(slopes):
+        for y in slopes[a:]:
+            cross = x[:, :, None] * y[:, None, :]
+            products.append(cross if x is y else cross + cross.mT)
     gradients = torch.stack(products, 1).flatten(0, 1).flatten(1)
     squares = _squares(shape)
     blocks = torch.empty(len(g), squares.shape[1], dtype=torch.complex128)
     for first in range(0, len(g), CHUNK):
         part = slice(first, first + CHUNK)
         root = area_element(g[part])
-        adjugate = shape.weights[:, None] * g[part] / root[..., None]
+        inverse = shape.weights[:, None] * cofactors(g[part]) / root[..., None]
         if conductivity is not None:
-            adjugate = conductivity[part, :, None] * adjugate
-        stiffness = adjugate.flatten(1) @ gradients
+            inverse = conductivity[part, :, None] * inverse
+        stiffness = inverse.flatten(1) @ gradients
         blocks[part] = torch.complex(stiffness, (shape.weights * root) @ squares)
     return blocks
 

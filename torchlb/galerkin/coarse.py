@@ -9,8 +9,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from torchlb.galerkin.delaunay import Cover, delaunay_cover
-from torchlb.galerkin.elements import EDGES
+from torchlb.galerkin.delaunay import EDGES, Cover, delaunay_cover
 from torchlb.galerkin.nodes import Nodes
 from torchlb.galerkin.rim import KINK
 from torchlb.geometry.manifold import edges_of
@@ -64,11 +63,11 @@ def lying_triangles(
     points: Float[Tensor, "N n"], nodes: Nodes, free: Bool[Tensor, " E"]
 ) -> Bool[Tensor, " F"]:
     """Triangles with an obtuse angle across from a free edge of the boundary, or from an edge of such a triangle."""
-    corners = at(points, nodes.faces)
+    corners = at(points, nodes.cells)
     apex = corners.roll(-2, 1)  # across from the sides of `EDGES`
     one, other = corners - apex, corners.roll(-1, 1) - apex
     obtuse = (one * other).sum(2) < LYING * one.norm(dim=2) * other.norm(dim=2)
-    met, lying = free.clone(), torch.zeros(len(nodes.faces), dtype=torch.bool)
+    met, lying = free.clone(), torch.zeros(len(nodes.cells), dtype=torch.bool)
     while True:
         new = (met[nodes.edge] & obtuse).any(1) & ~lying
         if not new.any():
@@ -88,10 +87,10 @@ def _without_inside(points: Tensor, nodes: Nodes, fits: VertexFits) -> Bool[Tens
         kinked[pairs[turn < KINK].flatten()] = True
         bound |= kinked & (fits.surface.reason == IN_ROWS)
     rim = torch.zeros_like(bound)
-    rim[nodes.edges[nodes.uses != 2].flatten()] = True
+    rim[nodes.edges[nodes.sides[2].uses != 2].flatten()] = True
     bound |= rim & (_around(nodes, (~bound & ~rim).long()) == 0)
     around = _around(nodes, torch.where(bound, 1, -SPARSE))
-    return (around > 0)[nodes.faces].all(1) | lone[nodes.faces].all(1)
+    return (around > 0)[nodes.cells].all(1) | lone[nodes.cells].all(1)
 
 
 def _cosines(points: Float[Tensor, "N 3"], nodes: Nodes) -> Float[Tensor, " E"]:
@@ -102,7 +101,7 @@ def _cosines(points: Float[Tensor, "N 3"], nodes: Nodes) -> Float[Tensor, " E"]:
     total = points.new_zeros(len(nodes.edges), 3)
     total.index_add_(0, nodes.edge.flatten(), normal.repeat_interleave(3, 0))
     # |m + n|² = 2 + 2 m·n of two units
-    return torch.where(nodes.uses == 2, total.square().sum(1) / 2 - 1, 1.0)
+    return torch.where(nodes.sides[2].uses == 2, total.square().sum(1) / 2 - 1, 1.0)
 
 
 def _around(nodes: Nodes, values: Int[Tensor, " N"]) -> Int[Tensor, " N"]:
@@ -117,9 +116,9 @@ def cover_of(
     nodes: Nodes, lengths: Float[Tensor, "F 3"], coarse: Tensor, free: Bool[Tensor, " E"]
 ) -> Cover:
     """The Delaunay triangulation of the coarse triangles and their mirror image, glued along the free boundary."""
-    fixed = (nodes.uses == 1) & ~free
+    fixed = (nodes.sides[2].uses == 1) & ~free
     fixed[nodes.edge[~coarse].flatten()] = True
-    return delaunay_cover(nodes.faces[coarse], lengths[coarse], nodes.edge[coarse], fixed)
+    return delaunay_cover(nodes.cells[coarse], lengths[coarse], nodes.edge[coarse], fixed)
 
 
 def boundary_shares(

@@ -1,8 +1,11 @@
-"""Where the nodes of curved triangles stand, and which edges are curved at all (`method.md`, section 9)."""
+"""Where the nodes of curved cells stand, and which edges are curved at all (`method.md`, section 9).
+
+Curves along the boundary, mollified lengths and normals are of triangles alone; all else is of any dimension.
+"""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -12,9 +15,8 @@ from torchlb.fits.polynomials import monomials
 from torchlb.galerkin.assembly import CHUNK, area_element, flat_metric, metric
 from torchlb.galerkin.coarse import coarse_triangles, cover_of
 from torchlb.galerkin.delaunay import Cover
-from torchlb.galerkin.elements import EDGES, lattice, triangle
+from torchlb.galerkin.elements import simplex
 from torchlb.galerkin.nodes import Nodes
-from torchlb.galerkin.rim import RimCurves, rim_curves
 from torchlb.geometry.frames import vertex_normals
 from torchlb.geometry.stars import pieces_of
 from torchlb.geometry.vectors import at
@@ -22,12 +24,13 @@ from torchlb.geometry.vertex_fits import VertexFits
 
 ROUNDS = 2
 """Of moving the nodes to the graphs of their vertices."""
-RIM = {2: 6, 3: 6, 4: 8}
-"""Vertices that a curve along the boundary goes through, by the degree of the elements."""
 AGREE, STEEP = 0.075, 0.3
 """Of an edge's length: how far a graph may be from the mean of a node's, and the node from the edge."""
 FLAT = 1e-3
 """Height of a triangle over its longest edge, below which it is flat."""
+NO_VOLUME, POINT = 1e-6, 1e-30
+"""Volume of a tetrahedron over the cube of its longest edge, that rounding may make of none; and the size that it has
+then, over that edge."""
 STRETCH = 3.0
 """Largest ratio of the curved area element and the flat one, or of the flat one and the curved one."""
 SLACK = 1e-5
@@ -44,61 +47,87 @@ class Ends:
 
 
 @dataclass(frozen=True)
+class BoundaryNodes:
+    """Nodes whose place and value follow from the boundary alone, so that what vanishes there vanishes on all of it.
+
+    Attributes
+    ----------
+    displacement
+        (X, n), ℓ: of every node from its flat place, by the boundary.
+    nodes
+        (A,), those along the boundary.
+    entries
+        (node, vertex, weight) of the values of these nodes, by vertices of the boundary.
+    """
+
+    displacement: Float[Tensor, "X n"]
+    nodes: Int[Tensor, " A"]
+    entries: tuple[Int[Tensor, " E"], Int[Tensor, " E"], Float[Tensor, " E"]]
+
+
+@dataclass(frozen=True)
 class CurvedMesh:
     """Where the nodes stand.
 
     Attributes
     ----------
-    nodes : the numbering.
-    places : (N + X, n), ℓ.
-    curved : (E,), which edges are.
-    bent : (X,), which nodes stand on the surface instead of on a flat triangle.
-    lengths : (F, 3), mollified.
-    coarse : (F,), which triangles are flat for the reasons of `coarse_triangles`; and what stands for them.
-    rim : numbers of the boundary edges; and the curves over them.
+    nodes
+        The numbering.
+    places
+        (N + X, n), ℓ.
+    curved
+        (E,), which edges are.
+    bent
+        (X,), which nodes stand on the surface instead of on a flat cell.
+    lengths
+        (F, e) of the edges, mollified, ℓ.
+    coarse, cover
+        (F,), which triangles are flat for the reasons of `coarse_triangles`; and what stands for them.
+    boundary
+        What is known of the nodes along the boundary.
     """
 
     nodes: Nodes
     places: Float[Tensor, "NX n"]
     curved: Bool[Tensor, " E"]
     bent: Bool[Tensor, " X"]
-    lengths: Float[Tensor, "F 3"]
+    lengths: Float[Tensor, "F e"]
     coarse: Bool[Tensor, " F"]
-    cover: Cover
-    rim: Int[Tensor, " G"]
-    curves: RimCurves
+    cover: Cover | None
+    boundary: BoundaryNodes
 
 
 def curve(
     points: Float[Tensor, "N n"],
     fits: VertexFits,
     nodes: Nodes,
+    boundary: BoundaryNodes,
     held: Bool[Tensor, " N"] | None = None,
-) -> tuple[CurvedMesh, Float[Tensor, "F Q 3"]]:
+) -> tuple[CurvedMesh, Float[Tensor, "F Q S"]]:
     """Stand the nodes on the graphs of their vertices where these agree, and flatten what they would distort.
 
-    With it comes the metric at the Gauss points, of flat triangles from mollified lengths. `held` are vertices with a
-    Dirichlet condition: boundary edges between them are no mirrors.
+    With it comes the metric at the Gauss points, of flat triangles from mollified lengths. Nodes along the boundary of
+    triangles stay on its curves. `held` are vertices with a Dirichlet condition: boundary edges between them are no
+    mirrors.
     """
-    rim = (nodes.uses == 1).nonzero()[:, 0]
-    curves = rim_curves(points, nodes.edges[rim], RIM[nodes.degree])
     flat = torch.einsum("xv,xvn->xn", nodes.shares, at(points, nodes.corners))
-    start = flat + _rim_displacement(points, nodes, rim, curves)
+    start = flat + boundary.displacement
     standing, sound = _moved(points, fits, nodes, start)
-    outside = torch.zeros(len(nodes.faces), dtype=torch.bool)
-    of_rim = _by_node(nodes, nodes.uses == 1, outside)
-    standing = torch.where(of_rim[:, None], start, standing)
+    if nodes.dim == 2:
+        standing[boundary.nodes] = start[boundary.nodes]
     ratio = (start - flat).norm(dim=1) / _sizes(points, nodes)
-    curved, whole = _by_edge(nodes, sound & (ratio <= STEEP))
-    curved &= ~_opposed(points, nodes) & (nodes.uses <= 2)
-    free = nodes.uses == 1
-    if held is not None:
-        free &= ~held[nodes.edges].all(1)
-    coarse = coarse_triangles(points, nodes, fits, free)
-    curved[nodes.edge[coarse].flatten()] = False
+    curved, *whole = nodes.by_side(sound & (ratio <= STEEP))
+    uses = nodes.sides[2].uses
+    coarse, free = torch.zeros(len(nodes.cells), dtype=torch.bool), uses == 1
+    if nodes.dim == 2:
+        curved &= ~_opposed(points, nodes) & (uses <= 2)
+        if held is not None:
+            free &= ~held[nodes.edges].all(1)
+        coarse = coarse_triangles(points, nodes, fits, free)
+        curved[nodes.edge[coarse].flatten()] = False
     places, curved, bent, g, lengths = _flattened(points, nodes, (flat, standing), curved, whole)
-    cover = cover_of(nodes, lengths, coarse, free)
-    return CurvedMesh(nodes, places, curved, bent, lengths, coarse, cover, rim, curves), g
+    cover = cover_of(nodes, lengths, coarse, free) if nodes.dim == 2 else None
+    return CurvedMesh(nodes, places, curved, bent, lengths, coarse, cover, boundary), g
 
 
 def _opposed(points: Tensor, nodes: Nodes) -> Bool[Tensor, " E"]:
@@ -115,58 +144,9 @@ def node_ends(nodes: Nodes) -> Ends:
 
 
 def _sizes(points: Tensor, nodes: Nodes) -> Float[Tensor, " X"]:
-    """Of every node the length of its edge, or the longest of its face."""
+    """Of every node the length of its edge, or the longest of its triangle or cell."""
     length = (points[nodes.edges[:, 0]] - points[nodes.edges[:, 1]]).norm(dim=1)
-    return torch.cat([nodes.on_edges(length), nodes.inside(length[nodes.edge].amax(1))])
-
-
-def _by_node(nodes: Nodes, of_edge: Tensor, of_face: Tensor) -> Tensor:
-    """Values of edges and faces, at their nodes."""
-    return torch.cat([nodes.on_edges(of_edge), nodes.inside(of_face)])
-
-
-def _by_edge(nodes: Nodes, good: Bool[Tensor, " X"]) -> tuple[Tensor, Tensor]:
-    """Edges all of whose nodes are good, and the nodes inside faces that are."""
-    split = len(nodes.edges) * (nodes.degree - 1)
-    return good[:split].view(len(nodes.edges), -1).all(1), good[split:]
-
-
-def _rim_displacement(
-    points: Tensor, nodes: Nodes, rim: Int[Tensor, " G"], curves: RimCurves
-) -> Float[Tensor, "X n"]:
-    """From the flat nodes to the boundary's curves; inside of a triangle by (b_i + b_j)² of the edge's (i, j).
-
-    A quadratic displacement b_i b_j of the edge is so continued by itself.
-    """
-    result = torch.zeros_like(points[:1]).repeat(len(nodes.shares), 1)
-    if len(rim) == 0:
-        return result
-    inner, on_edge = lattice(nodes.degree)[3 * nodes.degree :], nodes.degree - 1
-    steps = torch.arange(1, nodes.degree).to(points) / nodes.degree
-    ends = points[nodes.edges[rim]]
-
-    def bulge(edges: Tensor, share: Tensor) -> Tensor:
-        weights = replace(curves, **{k: v[edges] for k, v in vars(curves).items()}).weights(share)
-        chord = ends[edges, None, 0] + share[..., None] * (ends[edges, 1] - ends[edges, 0])[:, None]
-        return (weights[..., None] * points[curves.index[edges]][:, None]).sum(2) - chord
-
-    every = torch.arange(len(rim))
-    place = rim[:, None] * on_edge + torch.arange(on_edge)
-    result[place] = bulge(every, steps.expand(len(rim), -1))
-    number = torch.full((len(nodes.edges),), -1)
-    number[rim] = every
-    for side, (i, j) in enumerate(EDGES):
-        face = (number[nodes.edge[:, side]] >= 0).nonzero()[:, 0]
-        if len(face) == 0 or len(inner) == 0:
-            continue
-        both = inner[:, i] + inner[:, j]
-        share = (inner[:, j] / both).expand(len(face), -1)
-        turned = nodes.faces[face, i] > nodes.faces[face, j]
-        share = torch.where(turned[:, None], 1 - share, share)
-        moved = both.square()[:, None] * bulge(number[nodes.edge[face, side]], share)
-        place = len(nodes.edges) * on_edge + face[:, None] * len(inner) + torch.arange(len(inner))
-        result[place] += moved
-    return result
+    return nodes.at_nodes(length, *(length[side.edges].amax(1) for side in nodes.beyond))
 
 
 def _moved(
@@ -213,33 +193,46 @@ def mollified(sides: Float[Tensor, "F 3"], faces: Int[Tensor, "F 3"]) -> Float[T
     return sides + lack[piece, None]
 
 
+def shrunk(sides: Float[Tensor, "F 6"]) -> Float[Tensor, "F 6"]:
+    """Lengths of edges, those of tetrahedra without volume next to nothing, so that they count for nothing.
+
+    Delaunay tetrahedra of a grid have such slivers, four points of a square; what is around them fills the solid.
+    """
+    longest = sides.amax(1)
+    none = area_element(flat_metric(sides)) <= NO_VOLUME * longest**3
+    return torch.where(none[:, None], POINT * longest[:, None], sides)
+
+
 def _flattened(
     points: Float[Tensor, "N n"],
     nodes: Nodes,
     stand: tuple[Float[Tensor, "X n"], Float[Tensor, "X n"]],
     curved: Bool[Tensor, " E"],
-    whole: Bool[Tensor, " I"],
+    whole: list[Bool[Tensor, " _"]],
 ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
-    """Places, curved edges, bent nodes, metric, lengths: edges around distorted triangles are flat, until none is.
+    """Places, curved edges, bent nodes, metric, lengths: edges around distorted cells are flat, until none is.
 
-    `stand` is where nodes are on flat triangles and on the surface; `whole`, which of those inside faces may be there.
+    `stand` is where nodes are on flat cells and on the surface; `whole`, which triangles and cells may have theirs
+    there.
     """
-    corners = at(points, nodes.faces)
-    sides = (corners.roll(-1, dims=1) - corners).norm(dim=2)
-    lengths = mollified(sides, nodes.faces)
-    plane, shape = flat_metric(lengths), triangle(nodes.degree)
+    lengths = sides = (points[nodes.edges[:, 0]] - points[nodes.edges[:, 1]]).norm(dim=1)[
+        nodes.edge
+    ]
+    if nodes.dim == 2:
+        lengths = mollified(sides, nodes.cells)
+    elif nodes.dim == 3:
+        lengths = shrunk(sides)
+    plane, shape = flat_metric(lengths), simplex(nodes.dim, nodes.degree)
     area = area_element(plane)
     curved = curved.clone()
-    curved[nodes.edge[area < FLAT * sides.amax(1).square()].flatten()] = False
-    inside = len(lattice(nodes.degree)) - 3 * nodes.degree
+    curved[nodes.edge[area < FLAT * sides.amax(1) ** nodes.dim].flatten()] = False
     g = plane[:, None].repeat(1, len(shape.weights), 1)
-    new = torch.ones(len(nodes.faces), dtype=torch.bool)  # triangles whose nodes have moved
+    new = torch.ones(len(nodes.cells), dtype=torch.bool)  # cells whose nodes have moved
     while True:
-        kept = curved[nodes.edge]
-        smooth = kept.all(1) & whole.view(len(nodes.faces), inside).all(1)
-        bent = _by_node(nodes, curved, smooth)
+        smooth = [w & curved[s.edges].all(1) for w, s in zip(whole, nodes.beyond, strict=True)]
+        bent = nodes.at_nodes(curved, *smooth)
         places = torch.cat([points, torch.where(bent[:, None], stand[1], stand[0])])
-        some = kept.any(1)
+        some = curved[nodes.edge].any(1)
         g[new & ~some] = plane[new & ~some, None]
         before, curved = curved, curved.clone()
         for part in (new & some).nonzero()[:, 0].split(CHUNK):

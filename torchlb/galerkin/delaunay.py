@@ -13,8 +13,8 @@ from jaxtyping import Bool, Float, Int
 from scipy import sparse
 from torch import Tensor
 
-from torchlb.galerkin.elements import EDGES
-
+EDGES = ((0, 1), (1, 2), (2, 0))
+"""Ends of the sides of a triangle, in turn, in the order of `subsets`."""
 DELAUNAY = 1e-6
 """How far the cotangents across from an edge may sum to less than zero, so that rounding flips nothing."""
 

@@ -1,20 +1,20 @@
-"""Lagrange elements on the reference triangle and the reference segment."""
+"""Lagrange elements on the reference simplex of any dimension.
+
+The corners of a cell ascend, so that neighbours agree on the order of the nodes that they share.
+"""
 
 from __future__ import annotations
 
 from functools import cache
+from itertools import combinations, product
 from typing import NamedTuple
 
-import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from scipy.special import roots_jacobi
 from torch import Tensor
 
 from torchlb.fits.polynomials import monomial_derivatives, monomials
-
-EDGES = ((0, 1), (1, 2), (2, 0))
-"""Corners of the edges of a triangle, in the order of their nodes."""
 
 
 class Element(NamedTuple):
@@ -22,69 +22,112 @@ class Element(NamedTuple):
 
     Attributes
     ----------
-    weights : (Q,), their sum is the size of the reference simplex, ½ or 1.
-    values : (Q, n), φ_i.
-    gradients : (Q, n, d), in the reference coordinates: the barycentrics of the corners after the first.
+    weights
+        (Q,), their sum is the size of the reference simplex, 1/d!.
+    values
+        (Q, n), φ_i.
+    gradients
+        (Q, n, d), in the reference coordinates: the barycentrics of the corners after the first.
     """
 
     weights: Float[Tensor, " Q"]
     values: Float[Tensor, "Q n"]
     gradients: Float[Tensor, "Q n d"]
 
+    @property
+    def dim(self) -> int:
+        """Dimension d."""
+        return self.gradients.shape[2]
+
 
 @cache
-def lattice(degree: int) -> Float[Tensor, "n 3"]:
-    """Barycentrics of the nodes: the corners, those of each edge from its first corner on, those inside.
+def subsets(dim: int, size: int) -> tuple[tuple[int, ...], ...]:
+    """Corners of the sub-simplices with `size` corners of a d-simplex, in the order of their nodes.
 
-    >>> lattice(2)[3:].tolist()
+    The edges of a triangle go round it.
+
+    >>> subsets(2, 2)
+    ((0, 1), (1, 2), (0, 2))
+    """
+    every = combinations(range(dim + 1), size)
+    return tuple(sorted(every, key=lambda corners: (corners[-1] - corners[0], corners)))
+
+
+@cache
+def inner(size: int, degree: int) -> Float[Tensor, "n size"]:
+    """Barycentrics of the nodes inside a simplex of `size` corners.
+
+    >>> inner(2, 3).round(decimals=4).tolist()
+    [[0.6667, 0.3333], [0.3333, 0.6667]]
+    """
+    rows = [
+        [degree - sum(rest), *reversed(rest)]
+        for rest in product(range(1, degree), repeat=size - 1)
+        if sum(rest) < degree
+    ]
+    return torch.tensor(rows, dtype=torch.float64).view(-1, size) / degree
+
+
+@cache
+def lattice(dim: int, degree: int) -> Float[Tensor, "n corners"]:
+    """Barycentrics of the nodes: the corners, those inside each edge, inside each triangle, and so on.
+
+    >>> lattice(2, 2)[3:].tolist()
     [[0.5, 0.5, 0.0], [0.0, 0.5, 0.5], [0.5, 0.0, 0.5]]
     """
-    unit = torch.eye(3, dtype=torch.float64)
-    steps = torch.arange(1, degree, dtype=torch.float64)[:, None] / degree
-    edges = [(1 - steps) * unit[i] + steps * unit[j] for i, j in EDGES]
-    inside = [
-        [(degree - i - j) / degree, i / degree, j / degree]
-        for j in range(1, degree)
-        for i in range(1, degree - j)
-    ]
-    return torch.cat([unit, *edges, torch.tensor(inside, dtype=torch.float64).view(-1, 3)])
+    rows = [torch.eye(dim + 1, dtype=torch.float64)]
+    for size in range(2, dim + 2):
+        for corners in subsets(dim, size):
+            part = torch.zeros(len(inner(size, degree)), dim + 1, dtype=torch.float64)
+            part[:, list(corners)] = inner(size, degree)
+            rows.append(part)
+    return torch.cat(rows)
 
 
 @cache
-def triangle(degree: int) -> Element:
-    """The element of degree r ≥ 1 with its nodes on `lattice`.
+def facet_nodes(dim: int, degree: int) -> Int[Tensor, "facets n"]:
+    """Places in `lattice` of the nodes of each facet, in the order of the lattice of one dimension less.
 
-    Its rule is the collapsed product rule of (r + 1)² points, turned to each corner, so that their order is irrelevant.
+    >>> facet_nodes(2, 2).tolist()
+    [[0, 1, 3], [1, 2, 4], [0, 2, 5]]
     """
-    x, wx = np.polynomial.legendre.leggauss(degree + 1)
-    y, wy = roots_jacobi(
-        degree + 1, 1, 0
-    )  # weight 1 − y, the width of the triangle at η = (1 + y)/2
-    x, y = np.meshgrid((1 + x) / 2, (1 + y) / 2, indexing="ij")
-    points = torch.from_numpy(np.stack([x * (1 - y), y], axis=-1).reshape(-1, 2))
-    shares = torch.cat([1 - points.sum(1, keepdim=True), points], 1)
-    points = torch.cat([shares.roll(corner, 1)[:, 1:] for corner in range(3)])
-    weights = torch.from_numpy(np.outer(wx, wy).reshape(-1) / 24).repeat(3)
-    return _element(points, weights, lattice(degree)[:, 1:], degree)
+    nodes, own, places = lattice(dim, degree), lattice(dim - 1, degree), []
+    for corners in subsets(dim, dim):
+        embedded = torch.zeros(len(own), dim + 1, dtype=torch.float64)
+        embedded[:, list(corners)] = own
+        places.append((embedded[:, None] == nodes).all(2).nonzero()[:, 1])
+    return torch.stack(places)
 
 
 @cache
-def segment(degree: int) -> Element:
-    """The element of degree r ≥ 1 on [0, 1]; its nodes are the two ends, then those between, in order."""
-    x, wx = np.polynomial.legendre.leggauss(degree + 1)
-    points = torch.from_numpy((1 + x) / 2)[:, None]
-    steps = torch.arange(1, degree, dtype=torch.float64) / degree
-    nodes = torch.cat([torch.tensor([0.0, 1.0], dtype=torch.float64), steps])[:, None]
-    return _element(points, torch.from_numpy(wx / 2), nodes, degree)
+def simplex(dim: int, degree: int) -> Element:
+    """The element of dimension d and degree r ≥ 1 with its nodes on `lattice`.
 
-
-def _element(points: Tensor, weights: Tensor, nodes: Tensor, degree: int) -> Element:
+    Its rule is the collapsed product rule of (r + 1)^d points; on triangles it is turned to each corner,
+    so that the order of these is irrelevant.
+    """
+    rules = [roots_jacobi(degree + 1, k, 0) for k in range(dim)]  # weight (1 − y)^k, y in [−1, 1]
+    axes = [torch.from_numpy((1 + x) / 2) for x, _ in rules]
+    factors = [torch.from_numpy(w / 2 ** (k + 1)) for k, (_, w) in enumerate(rules)]
+    points, weights = torch.zeros(1, 0, dtype=torch.float64), torch.ones(1, dtype=torch.float64)
+    for axis, factor in zip(axes, factors, strict=True):  # a cone over the simplex so far
+        slices = (1 - axis)[:, None, None] * points
+        apex = axis[:, None, None].expand(-1, len(points), 1)
+        points = torch.cat([slices, apex], 2).flatten(0, 1)
+        weights = torch.outer(factor, weights).flatten()
+    if dim == 2:
+        shares = torch.cat([1 - points.sum(1, keepdim=True), points], 1)
+        points = torch.cat([shares.roll(corner, 1)[:, 1:] for corner in range(dim + 1)])
+        weights = weights.repeat(dim + 1) / (dim + 1)
+    nodes = lattice(dim, degree)[:, 1:]
     inverse = torch.linalg.inv(_powers(nodes, degree))
-    slopes = monomial_derivatives(points, degree)
-    slopes = torch.cat([torch.zeros_like(slopes[:, :1]), slopes], dim=1)
+    slopes = points.new_zeros(len(points), len(nodes), dim)
+    if dim:
+        slopes[:, 1:] = monomial_derivatives(points, degree)
     gradients = torch.einsum("qmd,mn->qnd", slopes, inverse)
     return Element(weights, _powers(points, degree) @ inverse, gradients)
 
 
 def _powers(points: Float[Tensor, "Q d"], degree: int) -> Float[Tensor, "Q M"]:
-    return torch.cat([torch.ones_like(points[:, :1]), monomials(points, degree)], dim=1)
+    ones = points.new_ones(len(points), 1)
+    return torch.cat([ones, monomials(points, degree)], dim=1) if points.shape[1] else ones

@@ -11,7 +11,6 @@ from math import cos, radians
 import torch
 from torch import Tensor
 
-from torchlb.galerkin.elements import EDGES
 from torchlb.geometry.frames import vertex_normals
 from torchlb.geometry.vectors import dot
 
@@ -96,7 +95,7 @@ def _flips(
         around = _touching(faces, faces[around])
     faces, bad = faces[around], torch.searchsorted(around, bad)
     count = len(faces)
-    half = torch.cat([faces[:, list(edge)] for edge in EDGES])  # h is of face h mod F
+    half = torch.cat([faces[:, [k, (k + 1) % 3]] for k in range(3)])  # h is of face h mod F
     opposite = torch.cat([faces[:, 2], faces[:, 0], faces[:, 1]])
     keys = _keys(half[:, 0], half[:, 1], size)
     unique, edge, uses = torch.unique(keys, return_inverse=True, return_counts=True)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from itertools import combinations_with_replacement
 from typing import Any
 
 import numpy as np
@@ -11,9 +12,17 @@ from jaxtyping import Bool, Float, Int
 from scipy import sparse
 from torch import Tensor
 
-from torchlb.galerkin.assembly import CHUNK, area_element, element_matrices, flat_metric, summed
+from torchlb.galerkin.assembly import (
+    CHUNK,
+    area_element,
+    cofactors,
+    element_matrices,
+    flat_metric,
+    summed,
+)
+from torchlb.galerkin.boundary import boundary_nodes
 from torchlb.galerkin.curving import curve
-from torchlb.galerkin.elements import Element, lattice, triangle
+from torchlb.galerkin.elements import Element, lattice, simplex, subsets
 from torchlb.galerkin.nodes import lagrange_nodes
 from torchlb.galerkin.pair import upper_product
 from torchlb.galerkin.prolongation import prolongation
@@ -28,21 +37,21 @@ class Medium:
 
     Attributes
     ----------
-    faces : (T, 3), triangles.
-    lengths : (T, 3), of their edges, ℓ, in the order of `EDGES`.
+    faces : (T, d + 1), simplices.
+    lengths : (T, e), of their edges, ℓ, in the order of `subsets`.
     prolongation : P, (N + X, N), from the vertices to the nodes.
     nodes : (T, n), of each element.
-    metric : (T, Q, 3), at its Gauss points.
+    metric : (T, Q, S), at its Gauss points.
     element : its shape functions there.
     shares : (T, F), how much of each face of the mesh is in an element; rows sum to one, or to a half where two copies
         of a triangle stand for it.
     """
 
-    faces: Int[Tensor, "T 3"]
-    lengths: Float[Tensor, "T 3"]
+    faces: Int[Tensor, "T corners"]
+    lengths: Float[Tensor, "T e"]
     prolongation: Any
     nodes: Int[Tensor, "T n"]
-    metric: Float[Tensor, "T Q 3"]
+    metric: Float[Tensor, "T Q S"]
     element: Element
     shares: Any
 
@@ -50,29 +59,33 @@ class Medium:
     def curved(
         cls,
         points: Float[Tensor, "N n"],
-        faces: Int[Tensor, "F 3"],
+        faces: Int[Tensor, "F corners"],
         fits: VertexFits,
         degree: int,
         held: Bool[Tensor, " N"] | None = None,
     ) -> Medium:
         """That of `mesh_pair` with elements of degree r ≥ 2; those of the cover have linear nodes of their own."""
-        mesh, metric = curve(points, fits, lagrange_nodes(faces, len(points), degree), held)
+        nodes = lagrange_nodes(faces, len(points), degree)
+        boundary = boundary_nodes(points, nodes, fits.degrees, held)
+        mesh, metric = curve(points, fits, nodes, boundary, held)
         p: Any = prolongation(points, fits, mesh)
-        element, inner = triangle(degree), lattice(degree)[3:]
-        fit, cover = ~mesh.coarse, mesh.cover
-        own = torch.arange(len(cover.faces) * len(inner)).view(-1, len(inner))
-        weights = inner.repeat(len(cover.faces), 1).flatten().numpy()
-        where = own.flatten().repeat_interleave(3), cover.faces.repeat_interleave(len(inner), 0)
+        element, cover = simplex(nodes.dim, degree), mesh.cover
+        same: Any = sparse.eye_array(len(faces), format="csr")
+        if cover is None:
+            return cls(nodes.cells, mesh.lengths, p, nodes.elements, metric, element, same)
+        fit, within = ~mesh.coarse, lattice(2, degree)[3:]
+        own = torch.arange(len(cover.faces) * len(within)).view(-1, len(within))
+        weights = within.repeat(len(cover.faces), 1).flatten().numpy()
+        where = own.flatten().repeat_interleave(3), cover.faces.repeat_interleave(len(within), 0)
         where = where[0].numpy(), where[1].flatten().numpy()
         linear = sparse.csr_array((weights, where), shape=(own.numel(), len(points)))
-        flat = flat_metric(cover.lengths)[:, None].expand(-1, len(element.weights), 3)
-        same: Any = sparse.eye_array(len(faces), format="csr")
+        flat = flat_metric(cover.lengths)[:, None].expand(-1, len(element.weights), -1)
         shares = same[fit.numpy()], cover.mixed() @ same[mesh.coarse.numpy()] / 2
         return cls(
-            torch.cat([faces[fit], cover.faces]),
+            torch.cat([nodes.cells[fit], cover.faces]),
             torch.cat([mesh.lengths[fit], cover.lengths]),
             sparse.csr_array(sparse.vstack([p, linear])),
-            torch.cat([mesh.nodes.elements[fit], torch.cat([cover.faces, p.shape[0] + own], 1)]),
+            torch.cat([nodes.elements[fit], torch.cat([cover.faces, p.shape[0] + own], 1)]),
             torch.cat([metric[fit], flat]),
             element,
             sparse.csr_array(sparse.vstack(shares)),
@@ -84,10 +97,11 @@ class Medium:
         return self.shares.shape[1]
 
     @classmethod
-    def linear(cls, points: Float[Tensor, "N n"], faces: Int[Tensor, "F 3"]) -> Medium:
+    def linear(cls, points: Float[Tensor, "N n"], faces: Int[Tensor, "F corners"]) -> Medium:
         """That of linear elements, whose stiffness for κ = 1 is the cotangent's."""
-        lengths = (points[faces[:, [1, 2, 0]]] - points[faces]).norm(dim=2)
-        element = triangle(1)
+        ends = points[faces[:, [list(pair) for pair in subsets(2, 2)]]]
+        lengths = (ends[:, :, 1] - ends[:, :, 0]).norm(dim=2)
+        element = simplex(2, 1)
         metric = flat_metric(lengths)[:, None].expand(-1, len(element.weights), 3)
         same: Any = sparse.eye_array(len(points), format="csr")
         shares: Any = sparse.eye_array(len(faces), format="csr")
@@ -126,9 +140,12 @@ class Medium:
 
     def coarse_stiffness(self, conductivity: Float[Tensor, "T Q"]) -> sparse.csr_array:
         """K₁(κ) of linear elements on flat triangles, with the mean of κ on each: it preconditions."""
-        shape, share = triangle(1), self.element.weights / self.element.weights.sum()
+        shape, share = (
+            simplex(self.element.dim, 1),
+            self.element.weights / self.element.weights.sum(),
+        )
         mean = (conductivity @ share)[:, None].expand(-1, len(shape.weights))
-        metric = flat_metric(self.lengths)[:, None].expand(-1, len(shape.weights), 3)
+        metric = flat_metric(self.lengths)[:, None].expand(-1, len(shape.weights), -1)
         blocks = element_matrices(metric, shape, mean).real
         return summed(blocks, self.faces, self.prolongation.shape[1])
 
@@ -138,11 +155,15 @@ class Medium:
         found = []
         for part in torch.arange(len(self.nodes)).split(max(CHUNK // w.shape[1], 1)):
             g, nodes = self.metric[part], self.nodes[part]
-            (a, b), (c, d) = (
+            one, two = (
                 torch.einsum("qnd,tnc->dtqc", self.element.gradients, x[nodes]) for x in at_nodes
             )
-            products = [b * d, -(a * d + b * c), a * c]
-            total = sum(m * x.sum(-1) for m, x in zip(g.unbind(-1), products, strict=True))
+            pairs = combinations_with_replacement(range(self.element.dim), 2)
+            products = [
+                one[a] * two[b] if a == b else one[a] * two[b] + one[b] * two[a] for a, b in pairs
+            ]
+            parts = zip(cofactors(g).unbind(-1), products, strict=True)
+            total = sum(m * x.sum(-1) for m, x in parts)
             found.append(self.element.weights * total / area_element(g))
         return torch.cat(found)
 

@@ -1,75 +1,168 @@
-"""The Lagrange nodes of a mesh: their numbers, and where they stand on its flat triangles."""
+"""The Lagrange nodes of a complex of simplices: their numbers, and where they stand on its flat cells."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from torchlb.galerkin.elements import EDGES, lattice
-from torchlb.geometry.manifold import edges_of
+from torchlb.galerkin.elements import facet_nodes, inner, subsets
+
+
+@dataclass(frozen=True)
+class Sides:
+    """The sub-simplices of one size of a complex, each once.
+
+    Attributes
+    ----------
+    corners
+        (S, s), ascending.
+    of
+        (F, c), those of each cell, in the order of `subsets`.
+    edges
+        (S, e), the edges of each.
+    uses
+        (S,), how many cells each belongs to.
+    nodes
+        Number of nodes inside each.
+    """
+
+    corners: Int[Tensor, "S s"]
+    of: Int[Tensor, "F c"]
+    edges: Int[Tensor, "S e"]
+    uses: Int[Tensor, " S"]
+    nodes: int
 
 
 @dataclass(frozen=True)
 class Nodes:
-    """Nodes of degree r: the vertices, r − 1 on every edge from its lower vertex on, those inside the faces.
+    """Nodes of degree r: the vertices, then those inside each edge, inside each triangle, and so on.
 
     Attributes
     ----------
-    degree : r.
-    faces : (F, 3).  edges : (E, 2), lower vertex first.
-    edge : (F, 3), the edges of the faces, in the order of `EDGES`.
-    uses : (E,), number of faces at each edge.
-    corners, shares : (X, 3), vertices and barycentrics of each node beyond the vertices; an edge's third share is 0.
-    elements : (F, n), nodes of each face in the order of `lattice`.
+    degree
+        r.
+    faces
+        (F, d + 1), the cells as they are wound.
+    cells
+        (F, d + 1), the corners of each cell, ascending.
+    sides
+        The edges, triangles, … with nodes, by the number of their corners; and the facets.
+    corners, shares
+        (X, d + 1), vertices and barycentrics of each node beyond the vertices.
+    elements
+        (F, n), nodes of each cell in the order of `lattice`.
     """
 
     degree: int
-    faces: Int[Tensor, "F 3"]
-    edges: Int[Tensor, "E 2"]
-    edge: Int[Tensor, "F 3"]
-    uses: Int[Tensor, " E"]
-    corners: Int[Tensor, "X 3"]
-    shares: Float[Tensor, "X 3"]
+    faces: Int[Tensor, "F corners"]
+    cells: Int[Tensor, "F corners"]
+    sides: dict[int, Sides]
+    corners: Int[Tensor, "X corners"]
+    shares: Float[Tensor, "X corners"]
     elements: Int[Tensor, "F n"]
 
-    def on_edges(self, values: Tensor) -> Tensor:
-        """Of every node on an edge, in order, the value of its edge."""
-        return values.repeat_interleave(self.degree - 1, 0)
+    @property
+    def dim(self) -> int:
+        """Dimension d of the cells."""
+        return self.cells.shape[1] - 1
 
-    def inside(self, values: Tensor) -> Tensor:
-        """Of every node inside a face, in order, the value of its face."""
-        return values.repeat_interleave(len(lattice(self.degree)) - 3 * self.degree, 0)
+    @property
+    def edges(self) -> Int[Tensor, "E 2"]:
+        """The edges, lower vertex first."""
+        return self.sides[2].corners
+
+    @property
+    def edge(self) -> Int[Tensor, "F e"]:
+        """The edges of each cell."""
+        return self.sides[2].of
+
+    @property
+    def beyond(self) -> list[Sides]:
+        """The triangles, and the cells."""
+        return [self.sides[size] for size in range(3, self.dim + 2)]
+
+    def at_nodes(self, *values: Tensor) -> Tensor:
+        """Values of the edges, of the triangles, …, at the nodes inside them, in their order."""
+        parts = zip(values, range(2, self.dim + 2), strict=True)
+        return torch.cat([x.repeat_interleave(self.sides[s].nodes, 0) for x, s in parts])
+
+    def by_side(self, values: Bool[Tensor, " X"]) -> list[Bool[Tensor, " _"]]:
+        """Whether a flag holds at all nodes inside of an edge, of a triangle, and so on."""
+        sides = [self.sides[size] for size in range(2, self.dim + 2)]
+        parts = values.split([len(side.uses) * side.nodes for side in sides])
+        return [x.view(len(s.uses), s.nodes).all(1) for s, x in zip(sides, parts, strict=True)]
+
+    def boundary(self) -> tuple[Int[Tensor, " G"], Int[Tensor, "G n"]]:
+        """The facets that belong to one cell only: that cell, and their nodes in the order of `lattice`."""
+        facets = self.sides[self.dim]
+        cell, place = (facets.uses[facets.of] == 1).nonzero(as_tuple=True)
+        local = facet_nodes(self.dim, self.degree)[place]
+        return cell, self.elements[cell].gather(1, local)
 
 
-def lagrange_nodes(faces: Int[Tensor, "F 3"], num_points: int, degree: int) -> Nodes:
-    """The nodes of degree r ≥ 2 on a mesh of any topology.
+def lagrange_nodes(cells: Int[Tensor, "F corners"], num_points: int, degree: int) -> Nodes:
+    """The nodes of degree r on a complex of any topology.
 
     >>> lagrange_nodes(torch.tensor([[0, 1, 2], [1, 3, 2]]), 4, 2).elements.tolist()
-    [[0, 1, 2, 4, 6, 5], [1, 3, 2, 7, 8, 6]]
+    [[0, 1, 2, 4, 6, 5], [1, 2, 3, 6, 8, 7]]
     """
-    found = edges_of(faces.numpy(), num_points)
-    keys, of, uses = (torch.from_numpy(part) for part in (found.keys, found.of, found.uses))
-    edges = torch.stack([keys // num_points, keys % num_points], 1)
-    edge = of.view(-1, 3).roll(1, 1)  # those across corners 2, 0, 1
-    on_edge = degree - 1
-    steps = torch.arange(1, degree, dtype=torch.float64) / degree
-    shares = torch.stack([1 - steps, steps, 0 * steps], 1).repeat(len(edges), 1)
-    corners = torch.cat([edges, edges[:, :1]], 1).repeat_interleave(on_edge, 0)
-    inner = lattice(degree)[3 * degree :]
-    numbers = num_points + edge[:, :, None] * on_edge + torch.arange(on_edge)
-    turned = torch.stack([faces[:, i] > faces[:, j] for i, j in EDGES], 1)
-    numbers = torch.where(turned[..., None], numbers.flip(-1), numbers)
-    first = num_points + len(edges) * on_edge + torch.arange(len(faces))[:, None] * len(inner)
+    faces, cells = cells, cells.sort(1).values
+    corners_of_cell = cells.shape[1]
+    dim, count = corners_of_cell - 1, num_points
+    sides = {1: _vertices(cells, num_points)} if dim == 1 else {}
+    corners, shares, elements = [], [], [cells]
+    for size in range(2, corners_of_cell + 1):
+        side = sides[size] = _sides(cells, num_points, size, degree, sides.get(2))
+        if side.nodes == 0:
+            continue
+        number = count + side.of[..., None] * side.nodes + torch.arange(side.nodes)
+        elements.append(number.flatten(1))
+        padding = side.corners[:, :1].expand(-1, corners_of_cell - size)
+        corners.append(torch.cat([side.corners, padding], 1).repeat_interleave(side.nodes, 0))
+        share = torch.nn.functional.pad(inner(size, degree), (0, corners_of_cell - size))
+        shares.append(share.repeat(len(side.uses), 1))
+        count += len(side.uses) * side.nodes
     return Nodes(
         degree,
         faces,
-        edges,
-        edge,
-        uses,
-        torch.cat([corners, faces.repeat_interleave(len(inner), 0)]),
-        torch.cat([shares, inner.repeat(len(faces), 1)]),
-        torch.cat([faces, numbers.flatten(1), first + torch.arange(len(inner))], 1),
+        cells,
+        sides,
+        torch.cat([cells[:0], *corners]),
+        torch.cat([inner(corners_of_cell, 1), *shares]),
+        torch.cat(elements, 1),
     )
+
+
+def _vertices(cells: Int[Tensor, "F corners"], num_points: int) -> Sides:
+    every = torch.arange(num_points)[:, None]
+    uses = torch.bincount(cells.flatten(), minlength=num_points)
+    return Sides(every, cells, every[:, :0], uses, 0)
+
+
+def _sides(
+    cells: Int[Tensor, "F corners"], num_points: int, size: int, degree: int, edges: Sides | None
+) -> Sides:
+    """The sub-simplices with `size` corners, in the order of their corners; the cells themselves as they are."""
+    dim, nodes = cells.shape[1] - 1, len(inner(size, degree))
+    if size == dim + 1:
+        corners, of = cells, torch.arange(len(cells))[:, None]
+        uses = torch.ones(len(cells), dtype=torch.int64)
+    else:
+        every = torch.stack([cells[:, list(subset)] for subset in subsets(dim, size)], 1)
+        key = every[..., 0]
+        for column in every[..., 1:].unbind(-1):
+            key = key * num_points + column
+        key, of, uses = torch.unique(key, return_inverse=True, return_counts=True)
+        columns = [key // num_points**power % num_points for power in reversed(range(size))]
+        corners = torch.stack(columns, 1)
+    if edges is None:
+        return Sides(corners, of, torch.arange(len(corners))[:, None], uses, nodes)
+    places = {pair: place for place, pair in enumerate(subsets(dim, 2))}
+    own = corners.new_zeros(len(corners), size * (size - 1) // 2)
+    for column, subset in zip(of.T, subsets(dim, size), strict=True):
+        pairs = [places[subset[i], subset[j]] for i, j in subsets(size - 1, 2)]
+        own[column] = edges.of[:, pairs]
+    return Sides(corners, of, own, uses, nodes)

@@ -17,11 +17,13 @@ from torchlb.galerkin.assembly import (
     assemble_mass,
     element_matrices,
     flat_metric,
+    metric,
     summed,
 )
+from torchlb.galerkin.boundary import boundary_nodes
 from torchlb.galerkin.coarse import boundary_shares
 from torchlb.galerkin.curving import CurvedMesh, curve, mollified
-from torchlb.galerkin.elements import segment, triangle
+from torchlb.galerkin.elements import simplex, subsets
 from torchlb.galerkin.nodes import lagrange_nodes
 from torchlb.galerkin.prolongation import prolongation
 from torchlb.geometry.numbering import Numbering
@@ -82,32 +84,35 @@ ELEMENTS = {1: (2, (2,)), 2: (2, (2,)), 3: (2, (3, 2)), 4: (3, (4, 2)), 5: (4, (
 
 def mesh_pair(
     points: Float[Tensor, "N n"],
-    faces: Int[Tensor, "F 3"],
+    faces: Int[Tensor, "F corners"],
     fits: VertexFits,
     degree: int,
     stars: Int[Tensor, "S 3"] | None = None,
     numbering: Numbering | None = None,
     held: Bool[Tensor, " N"] | None = None,
 ) -> WeakPair:
-    """The pair of a triangle mesh, from the fits of its vertices, with elements of degree r ≥ 2.
+    """The pair of a mesh of d-simplices, from the fits of its vertices, with elements of degree r ≥ 2.
 
     Symmetric, K1 = 0, K ≥ 0, M > 0 whatever the fits are: rows of P sum to one, and it has full column rank. A third of
-    the flat triangles `stars` is added. The matrices have the user's numbers where there is a numbering. What is large
-    is let go as soon as it was used.
+    the flat triangles `stars` is added. The matrices have the user's numbers where there is a numbering. `held` marks
+    where a Dirichlet condition holds. What is large is let go as soon as it was used.
     """
     count = len(points)
-    mesh, metric = curve(points, fits, lagrange_nodes(faces, count, degree), held)
+    nodes = lagrange_nodes(faces, count, degree)
+    boundary = boundary_nodes(points, nodes, fits.degrees, held)
+    mesh, g = curve(points, fits, nodes, boundary, held)
+    del nodes, boundary
     del fits.surface.heights
-    flat = flat_pair(mesh, count)
-    of_fits = ~mesh.coarse
-    linear = _linear(mesh.lengths[of_fits], faces[of_fits], count) + flat
+    flat, of_fits = flat_pair(mesh, count), ~mesh.coarse
+    linear = _linear(mesh.lengths[of_fits], mesh.nodes.cells[of_fits], count)
     p = prolongation(points, fits, mesh)
-    blocks = element_matrices(metric[of_fits], triangle(degree))
-    del metric
+    blocks = element_matrices(g[of_fits], simplex(mesh.nodes.dim, degree))
+    del g
     elements = summed(blocks, mesh.nodes.elements[of_fits], len(mesh.places))
     del blocks
-    mass = positive_mass(p, _row_sums(elements), mesh, linear - flat) + _row_sums(flat)
-    rim = None if len(mesh.rim) == 0 else _rim_mass(points, mesh, p)
+    mass = positive_mass(p, _row_sums(elements), mesh, linear) + _row_sums(flat)
+    linear = linear + flat
+    rim = _boundary_mass(points, mesh, p)
     ends = mesh.nodes.edges, mesh.nodes.edges[mesh.curved]
     edges = [torch.bincount(e.flatten(), minlength=count) for e in ends]
     del mesh
@@ -167,28 +172,34 @@ def _upper_rows(
     return length, part.indices[upper], part.data[upper]
 
 
-def _linear(lengths: Tensor, faces: Tensor, count: int) -> sparse.csr_array:
-    """Linear elements on flat triangles."""
-    flat = flat_metric(lengths)[:, None].expand(-1, len(triangle(1).weights), 3)
-    return summed(element_matrices(flat, triangle(1)), faces, count)
+def _linear(
+    lengths: Float[Tensor, "F e"], cells: Int[Tensor, "F corners"], count: int
+) -> sparse.csr_array:
+    """Linear elements on flat simplices."""
+    shape = simplex(cells.shape[1] - 1, 1)
+    flat = flat_metric(lengths)[:, None].expand(-1, len(shape.weights), -1)
+    return summed(element_matrices(flat, shape), cells, count)
 
 
 def flat_pair(mesh: CurvedMesh, count: int) -> sparse.csr_array:
-    """K + iM of the flat triangles: linear elements on a Delaunay triangulation of them, each half of its two copies.
+    """K + iM of the coarse triangles: linear elements on a Delaunay triangulation of them, each half of its two copies.
 
     Their mass is lumped, to thirds of the triangles, as robust_laplacian's.
     """
+    if mesh.cover is None:
+        return sparse.csr_array((count, count), dtype=complex)
     faces, lengths, _ = mesh.cover
-    element, metric = triangle(1), flat_metric(lengths)
-    blocks = element_matrices(metric[:, None].expand(-1, len(element.weights), 3), element)
+    element, g = simplex(2, 1), flat_metric(lengths)
+    blocks = element_matrices(g[:, None].expand(-1, len(element.weights), -1), element)
     blocks.imag.zero_()
-    blocks.imag[:, ::4] = area_element(metric)[:, None] / 6
+    blocks.imag[:, ::4] = area_element(g)[:, None] / 6
     return summed(blocks / 2, faces, count)
 
 
 def _star_pair(points: Tensor, stars: Int[Tensor, "S 3"]) -> sparse.csr_array:
     """A third of the linear elements on local stars: each triangle is in those of its three corners."""
-    lengths = (points[stars[:, [1, 2, 0]]] - points[stars]).norm(dim=2)
+    ends = points[stars[:, [list(pair) for pair in subsets(2, 2)]]]
+    lengths = (ends[:, :, 1] - ends[:, :, 0]).norm(dim=2)
     return _linear(mollified(lengths, stars), stars, len(points)) / 3
 
 
@@ -226,20 +237,19 @@ def _row_sums(pair: Any) -> Float[np.ndarray, " N"]:
     return sums.imag.copy()
 
 
-def _rim_mass(points: Tensor, mesh: CurvedMesh, p: Any) -> Any:
-    """∫ φ_i φ_j along the boundary, lumped at coarse triangles."""
-    nodes, shape = mesh.nodes, segment(mesh.nodes.degree)
-    on_edge = nodes.degree - 1
-    first = len(mesh.places) - len(nodes.shares)
-    lying = torch.zeros_like(mesh.curved)
-    lying[nodes.edge[mesh.coarse].flatten()] = True
-    rim = mesh.rim[~lying[mesh.rim]]
-    between = first + rim[:, None] * on_edge + torch.arange(on_edge)
-    elements = torch.cat([nodes.edges[rim], between], 1)
-    speed = torch.einsum("qnd,gnc->gqc", shape.gradients, mesh.places[elements]).norm(dim=2)
-    of_curves = assemble_mass(speed, elements, shape, len(mesh.places))
-    shares = boundary_shares(points, nodes.edges[mesh.rim[lying[mesh.rim]]], mesh.cover)
-    return p.T @ (of_curves @ p) + sparse.diags_array(shares.numpy(), format="csr")
+def _boundary_mass(points: Tensor, mesh: CurvedMesh, p: Any) -> Any:
+    """∫ φ_i φ_j along the boundary, 1 at the end of a curve, lumped at coarse triangles; None for a closed shape."""
+    nodes, shape = mesh.nodes, simplex(mesh.nodes.dim - 1, mesh.nodes.degree)
+    cell, elements = nodes.boundary()
+    if len(cell) == 0:
+        return None
+    coarse = mesh.coarse[cell]
+    size = area_element(metric(mesh.places, elements[~coarse], shape))
+    result = p.T @ (assemble_mass(size, elements[~coarse], shape, len(mesh.places)) @ p)
+    if mesh.cover is not None:
+        shares = boundary_shares(points, elements[coarse, :2], mesh.cover)
+        result = result + sparse.diags_array(shares.numpy(), format="csr")
+    return result
 
 
 def stored(upper: Any, rim: Any = None, numbering: Numbering | None = None) -> SparsePair:

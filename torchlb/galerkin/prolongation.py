@@ -48,8 +48,14 @@ def _without_fits(
 ) -> tuple[Tensor, Tensor, Tensor, Bool[Tensor, " E"]]:
     """(row, column, value) of the vertices, of flat nodes and of those along the boundary; and which ends are left."""
     vertices = torch.arange(len(points))
-    of_rim, flat, by_fit = _rim_entries(mesh), ~mesh.bent[ends.node], mesh.bent.clone()
-    by_fit[of_rim[0]] = False
+    node, vertex, weight = mesh.boundary.entries
+    bent = mesh.bent[node]
+    of_rim, flat, by_fit = (
+        (node[bent], vertex[bent], weight[bent]),
+        ~mesh.bent[ends.node],
+        mesh.bent.clone(),
+    )
+    by_fit[node] = False
     entries = [(vertices, vertices, points.new_ones(len(vertices)))]
     for node, vertex, weight in (of_rim, (ends.node[flat], ends.vertex[flat], ends.share[flat])):
         entries.append((len(vertices) + node, vertex, weight))
@@ -106,14 +112,3 @@ def _of_fits(
             slot = torch.arange(int(uses[part].max()))
             own = order[(start[block.vertices[part], None] + slot).clamp_max(len(order) - 1)]
             yield block, part, torch.where(slot < uses[part, None], own, -1)
-
-
-def _rim_entries(mesh: CurvedMesh) -> tuple[Tensor, Tensor, Tensor]:
-    """(node, vertex, weight) of the bent nodes along the boundary."""
-    nodes, on_edge = mesh.nodes, mesh.nodes.degree - 1
-    steps = torch.arange(1, nodes.degree, dtype=mesh.places.dtype) / nodes.degree
-    weights = mesh.curves.weights(steps.expand(len(mesh.rim), -1))  # (G, r − 1, S)
-    node = (mesh.rim[:, None] * on_edge + torch.arange(on_edge))[..., None].expand_as(weights)
-    vertex = mesh.curves.index[:, None].expand_as(weights)
-    used = mesh.curves.valid[:, None] & mesh.bent[node]
-    return node[used], vertex[used], weights[used]

@@ -33,6 +33,8 @@ OPEN_ANGLE, NEAREST = 2.3, 32
 """Radians of the tangent plane without any of so many nearest points that make a point of a cloud a boundary point.
 Of 16, two in a hundred random points leave as much open, of 32 none in a thousand."""
 
+SHARP = cos(radians(30))
+"""The same, of two sides that turn by 60°: the boundary itself has a crease there."""
 SMOOTH = cos(radians(20))
 """Where the mean of the outer normals around a boundary vertex is shorter there is a crease: two that are 40° apart."""
 
@@ -106,6 +108,14 @@ def boundary_of_mesh(
     outward, size = _outward_sums(vertices, sides, opposite)
     crease = outward.norm(dim=1) < SMOOTH * size
     return _with_conormals(frames, mask, tangents, outward[members], crease[members])
+
+
+def boundary_creases(
+    vertices: Float[Tensor, "N n"], cells: Int[Tensor, "F v"]
+) -> Bool[Tensor, " N"]:
+    """Vertices where the boundary of a mesh turns by 60° and more: at the edges and corners of a cube."""
+    outward, size = _outward_sums(vertices, *_open_sides(cells))
+    return outward.norm(dim=1) < SHARP * size
 
 
 def boundary_of_cloud(

@@ -184,6 +184,11 @@ class GraphBalls:
         self._planes = planes_of(frames)
         self._kept: list[_Level] = []
 
+    @property
+    def dim(self) -> int:
+        """Dimension d of the tangent planes."""
+        return self.frames.shape[-1]
+
     def with_frames(
         self, frames: Float[Tensor, "N n d"], sides: Float[Tensor, "N n"] | None
     ) -> GraphBalls:

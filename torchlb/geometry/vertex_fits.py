@@ -100,7 +100,9 @@ class Graphs:
     def __init__(self, balls: GraphBalls, degree: int) -> None:
         points, self.highest = balls.points, degree
         self.degree = torch.zeros(len(points), dtype=torch.int64)
-        self.heights = points.new_zeros(len(points), num_monomials(2, degree) - 1, points.shape[1])
+        self.heights = points.new_zeros(
+            len(points), num_monomials(balls.dim, degree) - 1, points.shape[1]
+        )
         self.radius = points.new_ones(len(points))
         self.reason = torch.ones_like(self.degree)
 
@@ -138,6 +140,7 @@ class VertexFits:
 
     Attributes
     ----------
+    degrees : m, best first.
     surface : the graphs that the nodes stand on.
     frames : (N, n, d).
     degree : (N,), m of each fit; 0 where none passed, which leaves the vertex flat.
@@ -149,7 +152,7 @@ class VertexFits:
     def __init__(
         self, balls: GraphBalls, degrees: tuple[int, ...], surface_degree: int = 0
     ) -> None:
-        self._balls, self._degrees = balls, degrees
+        self._balls, self.degrees = balls, degrees
         self.surface = Graphs(balls, max(surface_degree, degrees[0]))
         self.frames = balls.frames
         self._jet, self.reach = (1, 0.5) if degrees[0] <= 3 else (degrees[0], 1.0)
@@ -175,7 +178,7 @@ class VertexFits:
         heights: Float[Tensor, "B neighbors n"],
     ) -> None:
         """Neighbourhoods that are there anyway: the nearest are tried first, by the same fit if it is that."""
-        first = list_candidates(2, self._degrees)[0]
+        first = list_candidates(self._balls.dim, self.degrees)[0]
         if index.shape[1] < first.size:
             return
         self._tried[vertices] = 1
@@ -186,15 +189,16 @@ class VertexFits:
 
     def complete(self) -> VertexFits:
         """The same; vertices without a fit have tried the degrees, with more neighbours in turn, or with all of few."""
-        for degree in self._degrees:
-            sizes = list_candidates(2, [degree])
+        for degree in self.degrees:
+            sizes = list_candidates(self._balls.dim, [degree])
             for vertices in (self.degree == 0).nonzero()[:, 0].split(AT_ONCE):
-                start = self._tried[vertices] if degree == self._degrees[0] else None
+                start = self._tried[vertices] if degree == self.degrees[0] else None
                 search = Search(self._balls, vertices, sizes, start)
                 for _, rows, index in search:
                     search.settle(rows[self._try(vertices[rows], index, degree)])
                 vertices = vertices[self.degree[vertices] == 0]
-                least, few = 1 + ceil(LEAST * (num_monomials(2, degree) - 1)), sizes[0].size
+                terms = num_monomials(self._balls.dim, degree) - 1
+                least, few = 1 + ceil(LEAST * terms), sizes[0].size
                 index, count = self._balls(vertices, few)
                 some = (count >= least) & (count < few)
                 keep = torch.arange(1, few) < count[some, None]
@@ -230,7 +234,7 @@ class VertexFits:
     ) -> Bool[Tensor, " B"]:
         """Keep the fits that pass; which do."""
         jet = min(fit.degree, self._jet)
-        terms = num_monomials(2, jet) - 1
+        terms = num_monomials(self._balls.dim, jet) - 1
         kept = replace(
             fit,
             coefficients=fit.coefficients[:, :terms],

@@ -58,6 +58,11 @@ class Conducting:
         return self.lb.num_points
 
     @property
+    def dim(self) -> int:
+        """Dimension d."""
+        return self.lb.dim
+
+    @property
     def shape(self) -> tuple[int, int]:
         """(N, N)."""
         return self.lb.shape

@@ -37,7 +37,7 @@ from torchlb.stability.null_vector import has_outflow
 KEPT = 8
 """Factors that are kept for each operator."""
 SINGULAR = 1e-6
-"""Share of M₁ over the area that makes K₁ definite; constants, which it moves alone, are split off."""
+"""Share of M₁ over the squared size that makes K₁ definite; constants, which it moves alone, are split off."""
 SPACING = 4.0
 """Between the times of shared factors: M + tK and its factor's matrix then differ by its root at most."""
 SHORT, LONG = 0.1, 10.0
@@ -135,6 +135,7 @@ class PairSystem:
     """K, and M + tK for every t, of a weak pair."""
 
     def __init__(self, lb: Operator) -> None:
+        self.dim = lb.dim
         self.stiffness, self.mass = self.parts = [v.detach() for v in lb.weak_values[:2]]
         self.units = [values.abs().max().double() for values in self.parts]
         self.pattern = lb.weak_crow.int(), lb.weak_col.int()
@@ -273,7 +274,7 @@ class PairSystem:
     def _factored(self, t: float | None) -> Factor:
         first, second = self.linear
         if t is None:
-            scale = (SINGULAR / self.area).sqrt().expand_as(self.one)[:, 0]
+            scale = (SINGULAR * self.area ** (-2 / self.dim)).sqrt().expand_as(self.one)[:, 0]
             scale = sparse.diags_array(scale.cpu().numpy())
             matrix = first + scale @ second @ scale
         else:

@@ -145,7 +145,7 @@ def build_cloud(
         if on_surface:
             built = _build_on_surface(here, options, where, settings, numbering, oriented)
         else:
-            options = options.settled(triangles=False)
+            options = options.settled(cells=False)
             shape = cloud_shape(here, d, options.q, boundary=where, **settings)
             built = _finished(shape, "points", options, REMEDY.format(d), progress)
         if options.condition == "dirichlet" and built.on_boundary is None:
@@ -190,7 +190,7 @@ def _build_on_surface(
         warn_of_layers(points)
     settings["normals"] = settings["normals"] if oriented else None
     surface = replace(surface, faces=flipped(surface.points, surface.faces))
-    options = options.settled(triangles=len(surface.faces) > 0)
+    options = options.settled(cells=len(surface.faces) > 0)
     degree, degrees = options.elements
     places = surface.points[:, :ambient]
     shape = surface_shape(
@@ -220,7 +220,7 @@ def numbered_mesh(
     if flip and corners.shape[1] == 3:
         kept = with_area(here, corners)
         corners, order = corners[kept], order[kept]
-    if flip and points.shape[1] <= 3:
+    if flip and corners.shape[1] == 3 and points.shape[1] <= 3:
         corners = flipped(pad(here, (0, 3 - here.shape[1])), corners)
     return numbering, here, corners, order
 
@@ -239,7 +239,7 @@ def build_mesh(
     corners = check_faces(faces, len(vertices))
     options.check(len(vertices), vertices.shape[1], corners.shape[1] - 1)
     corners = given = mended_faces(vertices, corners)
-    options = options.settled(corners.shape[1] == 3)
+    options = options.settled(cells=True)
     degree, degrees = options.elements
     if isinstance(boundary, str) and boundary in CONDITIONS:
         raise InputError(
@@ -304,7 +304,7 @@ def build_cotangent(vertices: ArrayLike, faces: ArrayLike) -> AssembledOperator:
 def _warn_of_long_triangles(vertices: Float[Tensor, "N n"], faces: Int[Tensor, "F 3"]) -> None:
     """A warning where much of the boundary is that of triangles that lie along it."""
     nodes = lagrange_nodes(faces, len(vertices), 2)
-    rim = nodes.uses == 1
+    rim = nodes.sides[2].uses == 1
     of = torch.zeros_like(rim)
     of[nodes.edge[lying_triangles(vertices, nodes, rim)].flatten()] = True
     length = (vertices[nodes.edges[:, 0]] - vertices[nodes.edges[:, 1]]).norm(dim=1)

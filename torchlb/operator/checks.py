@@ -13,6 +13,7 @@ from torch import Tensor
 
 from torchlb.errors import InputError, first_few, warn
 from torchlb.fits.polynomials import num_monomials
+from torchlb.galerkin.curving import NO_VOLUME
 from torchlb.geometry.noise import in_two_layers
 from torchlb.operator.cleaning import (
     are_quads,
@@ -185,6 +186,16 @@ def mended_faces(vertices: Float[Tensor, "N n"], faces: Int[Tensor, "F v"]) -> I
             raise InputError(
                 f"faces: {len(none)} segments ({first_few(none)}) have no length, their ends share a place; make one "
                 "vertex of the two with vertices, faces, kept = torchlb.clean_mesh(vertices, faces, merge=True)"
+            )
+    if faces.shape[1] == 4:
+        edges = vertices[faces[:, 1:]] - vertices[faces[:, :1]]
+        longest = (vertices[faces[:, None]] - vertices[faces[:, :, None]]).norm(dim=-1).amax((1, 2))
+        flat = torch.linalg.svdvals(edges)[:, :3].prod(1) <= NO_VOLUME * longest**3
+        if flat.any():
+            none = flat.nonzero()[:, 0]
+            warn(
+                f"faces: {len(none)} tetrahedra have no volume ({first_few(none)}) and count for nothing; that is "
+                "right of slivers between others, as Delaunay's of a grid"
             )
     first = first_of_each(faces)
     if not first.all():

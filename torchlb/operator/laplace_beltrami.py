@@ -107,7 +107,7 @@ class LaplaceBeltrami(StencilFace, WeakFace):
             least a tenth of that to the farthest of the row. None uses no datum. That, and a boundary that is not
             declared, leaves stencils there one-sided; hardly one passes, and the low-order rows in their place have
             ∂_ν f = 0 at first order: Δx at the boundary of a disk is of size 1/h then, not 0.
-        weak_form : whether to build the weak pair (K, M); by default where there can be one: on triangle meshes and on
+        weak_form : whether to build the weak pair (K, M); by default where there can be one: on meshes and on
             clouds of surfaces in R² and R³, by the surface through them (`lb.faces`, `method.md`, section 12).
         certify : whether rows of the stencil are lowered until the certificate of stability holds, whose π is then the
             mass; by default where there is no weak pair. With neither of them the operator may blow up under diffusion.
@@ -151,7 +151,7 @@ class LaplaceBeltrami(StencilFace, WeakFace):
         ----------
         vertices : (N, n) tensor or array, length ℓ.
         faces : (F, 3) indices. Any triangle mesh: several components, non-manifold edges, zero-area triangles.
-            Also (F, 2) polylines and (F, 4) tetrahedra, for manifolds of dimension 1 and 3.
+            Also (F, 2) polylines and (F, 4) tetrahedra, for manifolds of dimension 1 and 3 in Rⁿ.
         boundary : (N,) mask of the part of the boundary where the condition holds; the rest has none. By default, or
             for "detect", all the boundary that the faces have, if any.
         order, normal_order, projection, weights, num_neighbors, condition, weak_form, certify, progress : as for

@@ -41,14 +41,14 @@ class Options:
         """Degree of the elements and degrees of the fits of the weak pair, where there is to be one."""
         return ELEMENTS[min(self.order, max(ELEMENTS))] if self.weak_form else (0, ())
 
-    def settled(self, triangles: bool) -> Options:
+    def settled(self, cells: bool) -> Options:
         """With the choices that were left open: a pair where there can be one, the certificate where there is none."""
-        if self.weak_form and not triangles:
+        if self.weak_form and not cells:
             raise InputError(
-                "weak_form: only triangle meshes, and clouds of surfaces in R² and R³, have one; leave it out, and the "
+                "weak_form: only meshes, and clouds of surfaces in R² and R³, have one; leave it out, and the "
                 "certificate makes the stencil stable instead"
             )
-        weak = triangles if self.weak_form is None else self.weak_form
+        weak = cells if self.weak_form is None else self.weak_form
         if (
             weak
             and self.held is not None

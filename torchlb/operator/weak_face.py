@@ -26,8 +26,8 @@ from torchlb.stencils.conditions import CONDITIONS
 
 MatrixName = Literal["laplacian", "stiffness", "mass", "boundary_mass"]
 NO_PAIR = (
-    "{}: this operator has no weak pair, which triangle meshes and clouds of surfaces in R² or R³ have unless built "
-    "with weak_form=False, and curves and solids have not; the stencil is lb.matrix"
+    "{}: this operator has no weak pair, which meshes and clouds of surfaces in R² or R³ have unless built with "
+    "weak_form=False, and clouds of curves and solids have not; the stencil is lb.matrix"
 )
 
 
@@ -36,7 +36,7 @@ class WeakFace(OperatorStorage):
 
     @property
     def has_weak_form(self) -> bool:
-        """Whether there is a weak pair: on triangle meshes and clouds of surfaces, but for weak_form=False."""
+        """Whether there is a weak pair: on meshes and clouds of surfaces, unless built with weak_form=False."""
         return self.weak_crow.shape[0] > 0
 
     @property
@@ -171,6 +171,7 @@ class WeakFace(OperatorStorage):
                     mass[block, block],
                     self.mass[block].detach().cpu().double(),
                     k,
+                    dim=self.dim,
                     linear=None if near is None else (near[0], near[1]),
                     fixed=None if fixed is None or not fixed[block].any() else fixed[block],
                     tolerance=tolerance,

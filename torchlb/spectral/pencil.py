@@ -36,7 +36,7 @@ DENSE, SHARE = 600, 6
 GUARD = 16
 """Vectors carried beyond those wanted: they keep λ away from the rest of the spectrum."""
 SHIFT = 10.0
-"""Of the factor, over the area of a component: about half of its first eigenvalue, were it a disk."""
+"""Of the factor, over the size of a component: about half of its first eigenvalue, were it a disk, and the whole."""
 START, EXACT = 3e-3, 1e-8
 """Residuals of Lanczos for the linear pair, whose distance from (K, M) is of that order, and for a pair alone."""
 REDUCTION, STEPS, SWEEPS = 1e-3, 24, 20
@@ -71,6 +71,7 @@ def pencil_eigenbasis(
     mass: Float[Tensor, " N"],
     k: int,
     *,
+    dim: int = 2,
     linear: Pair | None = None,
     fixed: Bool[np.ndarray, " N"] | None = None,
     tolerance: float | None = None,
@@ -81,6 +82,7 @@ def pencil_eigenbasis(
     ----------
     stiffness, mass_matrix : K, positive semidefinite with K1 = 0, and M, positive definite, (N, N).
     mass : diagonal mass, stored with the basis.
+    dim : d, from which the unit of a length follows: K is in ℓ^{d−2}, M in ℓ^d.
     linear : K₁ and M₁ of the same points, spectrally close, with fewer entries. None if (K, M) are that themselves:
         the eigenvalues are then exact to 1e-12 or so.
     fixed : points where functions vanish (Dirichlet).
@@ -104,15 +106,15 @@ def pencil_eigenbasis(
             "eigenbasis: the mass matrix is not positive; a shape so small that areas are zero in float32 has to be "
             "scaled, or kept in float64"
         )
-    # A unit of areas with which float32 holds the masses, and nothing is rounded.
-    unit = 4.0 ** round(float(np.log2(matrices[1].sum())) / 2)
-    matrices[1] = matrices[1] / unit
-    if linear is not None:
-        linear = linear[0], linear[1] / unit
-    near = None if linear is None else (_narrow(linear[0]), _narrow(linear[1]))
-    whole = matrices[0], matrices[1]
+    # A unit of length with which float32 holds the entries, and nothing is rounded.
+    length = 2.0 ** round(float(np.log2(matrices[1].sum())) / dim)
+    units = length ** (dim - 2), length**dim
+    whole = matrices[0] / units[0], matrices[1] / units[1]
+    near = (
+        None if linear is None else (_narrow(linear[0]) / units[0], _narrow(linear[1]) / units[1])
+    )
     component, pattern = _components(whole, near)
-    areas = np.bincount(component, matrices[1].sum(axis=1))
+    areas = np.bincount(component, whole[1].sum(axis=1))
     areas[component[held]] = 0.0
     zeros = min(int((areas > 0).sum()), k)
     if linear is None:
@@ -122,7 +124,7 @@ def pencil_eigenbasis(
     parts = _parts(whole, near, held, component, pattern) if zeros < k else []
     found = [_pairs(part, k, tolerance) for part in parts]
     null = constants(component, areas, zeros)
-    return _merged(parts, found, (null, whole[1] @ null), mass, k, tolerance, unit)
+    return _merged(parts, found, (null, whole[1] @ null), mass, k, tolerance, (length**2, units[1]))
 
 
 def _components(whole: Pair, near: Pair | None) -> tuple[np.ndarray, Sparse]:
@@ -364,7 +366,7 @@ def _merged(
     mass: Tensor,
     k: int,
     tolerance: float,
-    unit: float,
+    units: tuple[float, float],
 ) -> Eigenbasis:
     """After Φ and MΦ of constants what else the components have, ascending, in units of `mass`."""
     zeros = null[0].shape[1]
@@ -383,10 +385,11 @@ def _merged(
         for whole, columns in zip((phi, left), vectors, strict=True):
             whole[part.points[:, None], here] = columns.take(mine[here], 1)
         at += len(own)
+    square, unit = units  # of 1/λ, and of M
     signs = np.where(-phi.min(0) > phi.max(0), -1.0, 1.0)  # the largest entry is positive
     phi *= signs / unit**0.5
     left *= signs * unit**0.5
-    arrays = (values / unit, phi, left, errors)
+    arrays = (values / square, phi, left, errors)
     eigenvalues, eigenvectors, left, errors = (torch.from_numpy(x) for x in arrays)
     mass = mass.detach().cpu().double()
     return Eigenbasis(
