@@ -35,7 +35,7 @@ def metric(
 def flat_metric(lengths: Float[Tensor, "T e"]) -> Float[Tensor, "T S"]:
     """The same of flat simplices from the lengths of their edges, in the order of `subsets`, ℓ.
 
-    >>> flat_metric(torch.tensor([[1.0, 1.0, 2.0**0.5]])).round(decimals=6).abs().tolist()
+    >>> flat_metric(torch.tensor([[1.0, 2.0**0.5, 1.0]])).round(decimals=6).abs().tolist()
     [[1.0, 0.0, 1.0]]
     """
     dim = {1: 1, 3: 2, 6: 3}[lengths.shape[-1]]
