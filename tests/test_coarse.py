@@ -214,3 +214,21 @@ def test_the_delaunay_cover_is_that_of_robust_laplacian():
     assert abs(ours.real - stiffness).max() < 1e-9 * abs(stiffness).max()
     np.testing.assert_allclose(ours.imag.sum(axis=1), mass.diagonal(), atol=1e-9)
     np.testing.assert_allclose(cover.mixed().sum(axis=1), 1)
+
+
+def test_boundary_edges_without_length():
+    """Sixty vertices of a grid in one place, some of them on its boundary: all matrices are finite."""
+    n = 14
+    points = np.stack(np.meshgrid(np.arange(n), np.arange(n), [0.0], indexing="ij"), -1).reshape(
+        -1, 3
+    )
+    i = np.arange(n * n).reshape(n, n)
+    a, b, c, d = (x.ravel() for x in (i[:-1, :-1], i[1:, :-1], i[1:, 1:], i[:-1, 1:]))
+    faces = np.concatenate([np.stack([a, b, c], 1), np.stack([a, c, d], 1)])
+    some = np.random.default_rng(0).choice(n * n, 60, replace=False)
+    points[some] = points[some[0]]
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        lb = LaplaceBeltrami.from_mesh(points, faces)
+    assert lb.weak_values.isfinite().all()
+    assert lb.boundary_mass.values().sum() > 0

@@ -130,7 +130,7 @@ def boundary_shares(
     vertex has its share there, and the ends have less.
     """
     start, along = points[ends[:, 0]], points[ends[:, 1]] - points[ends[:, 0]]
-    square = along.square().sum(1)
+    square = along.square().sum(1).clamp_min(torch.finfo(along.dtype).tiny)
     own = torch.stack([cover.faces[:, i] == cover.faces[:, j] for i, j in EDGES], 1)
     vertex, half = cover.faces[own], cover.lengths[own] / 2
     edge = [torch.arange(len(ends)).repeat(2)]
