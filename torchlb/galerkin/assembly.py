@@ -79,8 +79,9 @@ def area_element(g: Float[Tensor, "*batch S"]) -> Float[Tensor, "*batch"]:
         return g.new_ones(g.shape[:-1])
     if g.shape[-1] == 1:
         return g[..., 0].sqrt()
-    first = {3: [0, 1], 6: [0, 1, 2]}[g.shape[-1]]
-    return (g[..., first] * cofactors(g)[..., first]).sum(-1).clamp_min(0).sqrt()
+    if g.shape[-1] == 3:
+        return (g[..., 0] * g[..., 2] - g[..., 1].square()).clamp_min(0).sqrt()
+    return (g[..., :3] * cofactors(g)[..., :3]).sum(-1).clamp_min(0).sqrt()
 
 
 def element_matrices(

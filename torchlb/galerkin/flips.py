@@ -33,7 +33,7 @@ def flipped(vertices: Tensor, faces: Tensor) -> Tensor:
     gone, size = faces.new_zeros(0), len(vertices)
     while True:
         poor = (alignment < ALIGNED) | (quality < GOOD)
-        bad = (poor | (quality < FAIR)).nonzero()[:, 0]
+        bad = (poor | ((quality < FAIR) & (alignment > LEVEL))).nonzero()[:, 0]
         pairs = _flips(faces, bad, gone, size) if len(bad) else None
         if pairs is None:
             return faces
