@@ -33,10 +33,10 @@ OPEN_ANGLE, NEAREST = 2.3, 32
 """Radians of the tangent plane without any of so many nearest points that make a point of a cloud a boundary point.
 Of 16, two in a hundred random points leave as much open, of 32 none in a thousand."""
 
-SHARP = cos(radians(30))
-"""The same, of two sides that turn by 60°: the boundary itself has a crease there."""
 SMOOTH = cos(radians(20))
 """Where the mean of the outer normals around a boundary vertex is shorter there is a crease: two that are 40° apart."""
+SHARP = cos(radians(30))
+"""The same of two that are 60° apart, from where on the surface of a solid is flat along it."""
 
 
 @dataclass(frozen=True)

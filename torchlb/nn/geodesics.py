@@ -25,7 +25,6 @@ TOLERANCE = 1e-6
 """Of the sweeps, in mean edge lengths."""
 FROM_MESH = ("mesh", "cotangent")
 """Sources of operators whose faces are all there is."""
-TINY = 1e-300
 Side = Float[np.ndarray, " T"]
 Triangles = tuple[np.ndarray, np.ndarray, np.ndarray]
 
