@@ -17,7 +17,7 @@ from torchlb.galerkin.rim import rim_curves
 from torchlb.geometry.boundary import boundary_faces
 from torchlb.geometry.frames import complete_frames, vertex_normals
 from torchlb.geometry.neighbors import GraphBalls, mesh_graph
-from torchlb.geometry.vertex_fits import VertexFits
+from torchlb.geometry.fit_search import VertexFits
 from torchlb.surfaces import CliffordTorus, Hemisphere, Sphere, Torus, UnitDisk, deserno_points
 
 

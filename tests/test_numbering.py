@@ -10,7 +10,7 @@ from torchlb.errors import InputError, first_few, renumbered
 from torchlb.geometry.frames import mesh_frames
 from torchlb.geometry.neighbors import GraphBalls, mesh_graph
 from torchlb.geometry.numbering import Numbering
-from torchlb.geometry.vertex_fits import VertexFits
+from torchlb.geometry.fit_search import VertexFits
 from torchlb.linalg.sparse import to_scipy
 from torchlb.stencils.rows import matrix_rows
 from torchlb.surfaces import Hemisphere, Sphere, UnitDisk

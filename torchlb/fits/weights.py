@@ -9,7 +9,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from torchlb.fits.least_squares import left_inverse
@@ -41,6 +41,7 @@ class Weights:
         finite, without full rank.
     residual : (B,): largest violation of the moment equations, in units of the largest right-hand side.
     height_residual : (B,): what a polynomial leaves of the heights over the distances; 0 where no heights were given.
+    slope : (B,), degree of the fit of the gradient where that is another one, else 0.
     """
 
     gradient: Float[Tensor, "B K d"]
@@ -49,6 +50,7 @@ class Weights:
     condition: Float[Tensor, " B"]
     residual: Float[Tensor, " B"]
     height_residual: Float[Tensor, " B"]
+    slope: Int[Tensor, " B"]
 
     def __getitem__(self, rows: Tensor) -> Weights:
         """The given stencils (a mask, or positions in any order)."""
@@ -102,6 +104,7 @@ def finish(
         condition=condition,
         residual=residual,
         height_residual=height_residual,
+        slope=torch.zeros_like(radius, dtype=torch.int64),
     )
 
 
@@ -116,7 +119,7 @@ def height_residual(
 
     The scatter is per degree of freedom, so their number does not matter.
     """
-    left = root[..., None] * _left_by_fit(values, coefficients, heights)
+    left = root[..., None] * _left_by_fit(values, coefficients @ heights, heights)
     freedom = max(values.shape[1] - values.shape[2], 1) / values.shape[1]
     square = coords.norm(dim=-1).square() + heights.norm(dim=-1).square()
     distance = (root.square() * square).sum(1)
@@ -125,12 +128,11 @@ def height_residual(
 
 def _left_by_fit(
     values: Float[Tensor, "B neighbors M"],
-    coefficients: Float[Tensor, "B M neighbors"],
+    graph: Float[Tensor, "B M n"],
     heights: Float[Tensor, "B neighbors n"],
 ) -> Float[Tensor, "B neighbors n"]:
     # a few long rows, in half of the time of a few long columns
-    rows = heights.mT @ coefficients.mT @ values.mT
-    return heights - rows.mT
+    return heights - (graph.mT @ values.mT).mT
 
 
 def scaled_system(
@@ -173,9 +175,11 @@ class CenteredFit:
         rows = cardinal(self.coefficients, places / self.radius[:, None, None], self.degree)
         return rows.abs().sum(-1).amax(1)
 
-    def misfit(self, heights: Float[Tensor, "B neighbors n"]) -> Float[Tensor, " B"]:
-        """Largest weighted distance of the heights from their fit, over ρ."""
-        left = _left_by_fit(self.values, self.coefficients, heights)
+    def misfit(
+        self, heights: Float[Tensor, "B neighbors n"], graph: Float[Tensor, "B M n"]
+    ) -> Float[Tensor, " B"]:
+        """Largest weighted distance of the heights from the polynomials `graph` that were fitted to them, over ρ."""
+        left = _left_by_fit(self.values, graph, heights)
         return (self.root * left.norm(dim=-1)).amax(1) / self.radius
 
 

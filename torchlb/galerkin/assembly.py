@@ -10,7 +10,7 @@ from jaxtyping import Complex, Float, Int, Shaped
 from scipy import sparse
 from torch import Tensor
 
-from torchlb.galerkin.elements import Element, subsets
+from torchlb.galerkin.elements import Element, simplex, subsets
 
 CHUNK = 2**14
 """Elements at a time: some 100 MB."""
@@ -120,6 +120,26 @@ def assemble_mass(
 
 def _squares(shape: Element) -> Float[Tensor, "Q n_times_n"]:
     return (shape.values[:, :, None] * shape.values[:, None, :]).flatten(1)
+
+
+def linear_elements(
+    lengths: Float[Tensor, "T e"],
+    cells: Int[Tensor, "T corners"],
+    num_points: int,
+    conductivity: Float[Tensor, " T"] | None = None,
+    *,
+    lumped: bool = False,
+) -> sparse.csr_array:
+    """K + iM of linear elements on flat simplices with these edges; M lumped to equal shares of the corners if asked."""
+    shape, g = simplex(cells.shape[1] - 1, 1), flat_metric(lengths)
+    points = len(shape.weights)
+    kappa = None if conductivity is None else conductivity[:, None].expand(-1, points)
+    blocks = element_matrices(g[:, None].expand(-1, points, -1), shape, kappa)
+    if lumped:
+        corners = cells.shape[1]
+        blocks.imag.zero_()
+        blocks.imag[:, :: corners + 1] = (area_element(g) * shape.weights.sum() / corners)[:, None]
+    return summed(blocks, cells, num_points)
 
 
 def summed(

@@ -6,23 +6,29 @@ that of triangles by polynomials over arc length.
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
-from scipy import sparse
 from torch import Tensor
 
-from torchlb.galerkin.curving import BoundaryNodes, curve
+from torchlb.galerkin.curving import (
+    BoundaryNodes,
+    BoundaryNodesPlan,
+    CurvingPlan,
+    curve,
+    flat_places,
+)
 from torchlb.galerkin.elements import inner, subsets
 from torchlb.galerkin.nodes import Nodes, lagrange_nodes
 from torchlb.galerkin.prolongation import prolongation
-from torchlb.galerkin.rim import RimCurves, rim_curves
+from torchlb.galerkin.rim import RimPlan, rim_plan
 from torchlb.geometry.boundary import boundary_creases
+from torchlb.geometry.fit_search import FitSearch
 from torchlb.geometry.frames import mesh_frames
+from torchlb.geometry.local_fits import FitPlan, LocalFits
 from torchlb.geometry.neighbors import GraphBalls, mesh_graph
-from torchlb.geometry.vertex_fits import VertexFits
 
 WIDTH = {2: 6, 3: 6, 4: 8}
 """Vertices that a curve along the boundary goes through, by the degree of the elements."""
@@ -33,8 +39,8 @@ def boundary_nodes(
     nodes: Nodes,
     degrees: tuple[int, ...],
     held: Bool[Tensor, " N"] | None = None,
-) -> BoundaryNodes:
-    """What the boundary says of the nodes.
+) -> BoundaryNodesPlan:
+    """What the boundary decides of the nodes.
 
     Parameters
     ----------
@@ -46,100 +52,155 @@ def boundary_nodes(
     """
     outer = (nodes.sides[nodes.dim].uses == 1).nonzero()[:, 0]
     if nodes.dim == 1 or len(outer) == 0:
-        return _none(points, nodes)
+        return WithoutBoundary(len(nodes.shares))
     if nodes.dim == 2:
-        return _on_curves(points, nodes, outer)
+        return OnCurves(nodes, outer, rim_plan(points, nodes.edges[outer], WIDTH[nodes.degree]))
     faithful = tuple(degree for degree in degrees if degree > 2) or (3,)  # creases stay flat
-    return _on_surface(points, nodes, faithful, held)
+    return OnSurface.of(points, nodes, faithful, held)
 
 
-def _none(points: Tensor, nodes: Nodes) -> BoundaryNodes:
-    index = nodes.cells.new_zeros(0)
-    still = points.new_zeros(len(nodes.shares), points.shape[1])
-    return BoundaryNodes(still, index, (index, index, points.new_zeros(0)))
+@dataclass(frozen=True)
+class WithoutBoundary:
+    """Nothing, of so many nodes."""
+
+    count: int
+
+    def at(self, points: Float[Tensor, "N n"]) -> BoundaryNodes:
+        """All stand still."""
+        index = torch.zeros(0, dtype=torch.int64)
+        still = points.new_zeros(self.count, points.shape[1])
+        return BoundaryNodes(still, index, (index, index, points.new_zeros(0)))
 
 
-def _on_curves(points: Tensor, nodes: Nodes, rim: Int[Tensor, " G"]) -> BoundaryNodes:
-    """On polynomials through the boundary's vertices; displacements continue inside by (b_i + b_j)² of the edge (i, j).
+@dataclass(frozen=True)
+class OnCurves:
+    """Nodes on polynomials through the boundary's vertices.
 
-    A quadratic displacement b_i b_j of the edge is so continued by itself.
+    Displacements continue inside by (b_i + b_j)² of the edge (i, j); a quadratic one b_i b_j does so by itself.
+
+    Attributes
+    ----------
+    nodes
+        Of the triangles.
+    rim
+        (G,), the edges along the boundary.
+    curves
+        Through which vertices.
     """
-    curves = rim_curves(points, nodes.edges[rim], WIDTH[nodes.degree])
-    within, on_edge = inner(3, nodes.degree), nodes.degree - 1
-    steps = inner(2, nodes.degree)[:, 1].to(points).expand(len(rim), -1)
-    ends = points[nodes.edges[rim]]
 
-    def bulge(edges: Tensor, share: Tensor) -> Tensor:
-        weights = replace(curves, **{k: v[edges] for k, v in vars(curves).items()}).weights(share)
-        chord = ends[edges, None, 0] + share[..., None] * (ends[edges, 1] - ends[edges, 0])[:, None]
-        return (weights[..., None] * points[curves.index[edges]][:, None]).sum(2) - chord
+    nodes: Nodes
+    rim: Int[Tensor, " G"]
+    curves: RimPlan
 
-    every = torch.arange(len(rim))
-    place = rim[:, None] * on_edge + torch.arange(on_edge)
-    moved = _none(points, nodes).displacement
-    moved[place] = bulge(every, steps)
-    number = torch.full((len(nodes.edges),), -1)
-    number[rim] = every
-    for side, (i, j) in enumerate(subsets(2, 2)):
-        face = (number[nodes.edge[:, side]] >= 0).nonzero()[:, 0]
-        if len(face) == 0 or len(within) == 0:
-            continue
-        both = within[:, i] + within[:, j]
-        share = (within[:, j] / both).expand(len(face), -1)
-        part = both.square()[:, None] * bulge(number[nodes.edge[face, side]], share)
-        inside = len(nodes.edges) * on_edge + face[:, None] * len(within)
-        moved[inside + torch.arange(len(within))] += part
-    return BoundaryNodes(moved, place.flatten(), _curve_entries(curves, steps, place))
+    def at(self, points: Float[Tensor, "N n"]) -> BoundaryNodes:
+        """Their places and values."""
+        nodes, rim, curves = self.nodes, self.rim, self.curves.at(points)
+        within, on_edge = inner(3, nodes.degree), nodes.degree - 1
+        steps = inner(2, nodes.degree)[:, 1].to(points).expand(len(rim), -1)
+        ends = points[nodes.edges[rim]]
+
+        def bulge(edges: Tensor, share: Tensor) -> Tensor:
+            weights = curves.over(edges).weights(share)
+            chord = ends[edges, 1] - ends[edges, 0]
+            chord = ends[edges, None, 0] + share[..., None] * chord[:, None]
+            return (weights[..., None] * points[curves.index[edges]][:, None]).sum(2) - chord
+
+        every = torch.arange(len(rim))
+        place = rim[:, None] * on_edge + torch.arange(on_edge)
+        moved = points.new_zeros(len(nodes.shares), points.shape[1])
+        moved[place] = bulge(every, steps)
+        number = torch.full((len(nodes.edges),), -1)
+        number[rim] = every
+        for side, (i, j) in enumerate(subsets(2, 2)):
+            face = (number[nodes.edge[:, side]] >= 0).nonzero()[:, 0]
+            if len(face) == 0 or len(within) == 0:
+                continue
+            both = within[:, i] + within[:, j]
+            share = (within[:, j] / both).expand(len(face), -1)
+            part = both.square()[:, None] * bulge(number[nodes.edge[face, side]], share)
+            inside = len(nodes.edges) * on_edge + face[:, None] * len(within)
+            moved[inside + torch.arange(len(within))] += part
+        weights = curves.weights(steps)  # (G, r − 1, S)
+        used = curves.valid[:, None].expand_as(weights)
+        node, vertex = place[..., None].expand_as(weights), curves.index[:, None].expand_as(weights)
+        return BoundaryNodes(moved, place.flatten(), (node[used], vertex[used], weights[used]))
 
 
-def _curve_entries(
-    curves: RimCurves, steps: Float[Tensor, "G q"], place: Int[Tensor, "G q"]
-) -> tuple[Tensor, Tensor, Tensor]:
-    """(node, vertex, weight) along the curves."""
-    weights = curves.weights(steps)  # (G, r − 1, S)
-    used = curves.valid[:, None].expand_as(weights)
-    node = place[..., None].expand_as(weights)
-    vertex = curves.index[:, None].expand_as(weights)
-    return node[used], vertex[used], weights[used]
+@dataclass(frozen=True)
+class OnSurface:
+    """Nodes on the surface through the boundary's vertices, with the fits of functions on it where values are held.
 
+    Attributes
+    ----------
+    nodes
+        Of the tetrahedra.
+    vertices
+        (b,), those of the boundary, which the numbers of the surface refer to.
+    cells
+        (G, 3), the boundary's triangles, wound so that they face out.
+    fits, curving
+        What is decided about that surface.
+    here
+        (x,), of the nodes of the surface beyond its vertices, their places among those of the solid.
+    inside
+        (x,), which of them follow from values of the boundary alone.
+    """
 
-def _on_surface(
-    points: Tensor,
-    nodes: Nodes,
-    degrees: tuple[int, ...],
-    held: Bool[Tensor, " N"] | None,
-) -> BoundaryNodes:
-    """On the surface through the boundary's vertices, with the fits of functions on it where it is fixed."""
-    facets, on_edge = nodes.sides[3], nodes.degree - 1
-    cell, place = (facets.uses[facets.of] == 1).nonzero(as_tuple=True)
-    outer = facets.of[cell, place]
-    corners = facets.corners[outer]
-    vertices, cells = torch.unique(
-        _facing_out(points, corners, nodes.cells[cell]), return_inverse=True
-    )
-    places, count = points[vertices], len(vertices)
-    balls = GraphBalls(places, mesh_graph(cells, count), mesh_frames(places, cells))
-    fits = VertexFits(balls, degrees).complete()
-    fits.degree[boundary_creases(points, nodes.cells)[vertices]] = 0
-    own = lagrange_nodes(cells, count, nodes.degree)
-    surface, _ = curve(places, fits, own, _none(places, own))
-    flat = torch.einsum("xv,xvn->xn", own.shares, places[own.corners])
-    keys = (ends[:, 0] * len(points) + ends[:, 1] for ends in (nodes.edges, vertices[own.edges]))
-    edge = torch.searchsorted(*keys)
-    within = len(nodes.edges) * on_edge + outer[:, None] * facets.nodes + torch.arange(facets.nodes)
-    here = torch.cat(
-        [(edge[:, None] * on_edge + torch.arange(on_edge)).flatten(), within.flatten()]
-    )
-    moved = _none(points, nodes).displacement
-    moved[here] = surface.places[count:] - flat
-    if held is None:
-        return replace(_none(points, nodes), displacement=moved)
-    inside = held[vertices[own.corners]].all(1)
-    p = sparse.coo_array(prolongation(places, fits, surface)[count:])
-    node, vertex = (torch.from_numpy(part.astype(np.int64)) for part in p.coords)
-    kept = inside[node]
-    entries = here[node[kept]], vertices[vertex[kept]], torch.from_numpy(p.data)[kept]
-    return BoundaryNodes(moved, here[inside], entries)
+    nodes: Nodes
+    vertices: Int[Tensor, " b"]
+    cells: Int[Tensor, "G 3"]
+    fits: FitPlan
+    curving: CurvingPlan
+    here: Int[Tensor, " x"]
+    inside: Bool[Tensor, " x"]
+
+    @classmethod
+    def of(
+        cls,
+        points: Float[Tensor, "N 3"],
+        nodes: Nodes,
+        degrees: tuple[int, ...],
+        held: Bool[Tensor, " N"] | None,
+    ) -> OnSurface:
+        """Decide: the fits are of these degrees."""
+        facets, on_edge = nodes.sides[3], nodes.degree - 1
+        cell, place = (facets.uses[facets.of] == 1).nonzero(as_tuple=True)
+        outer = facets.of[cell, place]
+        outside = _facing_out(points, facets.corners[outer], nodes.cells[cell])
+        vertices, cells = torch.unique(outside, return_inverse=True)
+        places, count = points[vertices], len(vertices)
+        balls = GraphBalls(places, mesh_graph(cells, count), mesh_frames(places, cells))
+        plan, fits = FitSearch(balls, 0, degrees).finish()
+        plan = plan.flattened(boundary_creases(points, nodes.cells)[vertices])
+        own = lagrange_nodes(cells, count, nodes.degree)
+        curving, _ = curve(places, plan, fits, own, WithoutBoundary(len(own.shares)))
+        keys = (e[:, 0] * len(points) + e[:, 1] for e in (nodes.edges, vertices[own.edges]))
+        edge = torch.searchsorted(*keys)
+        within = outer[:, None] * facets.nodes + torch.arange(facets.nodes)
+        within = len(nodes.edges) * on_edge + within
+        on = edge[:, None] * on_edge + torch.arange(on_edge)
+        inside = torch.zeros(len(own.shares), dtype=torch.bool)
+        if held is not None:
+            inside = held[vertices[own.corners]].all(1)
+        here = torch.cat([on.flatten(), within.flatten()])
+        return cls(nodes, vertices, cells, plan, curving, here, inside)
+
+    def at(self, points: Float[Tensor, "N n"]) -> BoundaryNodes:
+        """Their places and values."""
+        places, own = points[self.vertices], self.curving.nodes
+        fits = LocalFits.at(self.fits, places, mesh_frames(places, self.cells))
+        surface = self.curving.at(places, self.fits, fits)
+        moved = points.new_zeros(len(self.nodes.shares), points.shape[1])
+        moved[self.here] = surface.places[len(places) :] - flat_places(places, own)
+        still = WithoutBoundary(len(moved)).at(points)
+        if not self.inside.any():
+            return replace(still, displacement=moved)
+        p = prolongation(self.fits, fits, self.curving, surface)[len(places) :]
+        node, vertex = (torch.from_numpy(part.astype(np.int64)) for part in p.tocoo().coords)
+        kept = self.inside[node]
+        weights = torch.from_numpy(p.tocoo().data)[kept]
+        entries = self.here[node[kept]], self.vertices[vertex[kept]], weights
+        return BoundaryNodes(moved, self.here[self.inside], entries)
 
 
 def _facing_out(

@@ -9,12 +9,13 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from torchlb.galerkin.delaunay import EDGES, Cover, delaunay_cover
+from torchlb.galerkin.delaunay import EDGES, Cover
 from torchlb.galerkin.nodes import Nodes
 from torchlb.galerkin.rim import KINK
+from torchlb.geometry.fit_search import IN_ROWS
+from torchlb.geometry.local_fits import FitPlan
 from torchlb.geometry.manifold import edges_of
 from torchlb.geometry.vectors import at
-from torchlb.geometry.vertex_fits import IN_ROWS, VertexFits
 
 LYING = cos(radians(120))
 """Cosine of the angle across from a boundary edge, below which its triangle lies along the boundary."""
@@ -52,7 +53,7 @@ def with_area(points: Float[Tensor, "N n"], faces: Int[Tensor, "F 3"]) -> Bool[T
 def coarse_triangles(
     points: Float[Tensor, "N n"],
     nodes: Nodes,
-    fits: VertexFits,
+    fits: FitPlan,
     free: Bool[Tensor, " E"],
 ) -> Bool[Tensor, " F"]:
     """Those that lie along the free boundary, and those around which all is edges of the shape or has no fit."""
@@ -76,7 +77,7 @@ def lying_triangles(
         met[nodes.edge[new].flatten()] = True
 
 
-def _without_inside(points: Tensor, nodes: Nodes, fits: VertexFits) -> Bool[Tensor, " F"]:
+def _without_inside(points: Tensor, nodes: Nodes, fits: FitPlan) -> Bool[Tensor, " F"]:
     """Triangles without a fit at any corner, or around each of whose corners nearly all vertices lie on edges."""
     lone = fits.degree == 0
     bound = lone.clone()
@@ -85,7 +86,7 @@ def _without_inside(points: Tensor, nodes: Nodes, fits: VertexFits) -> Bool[Tens
         bound[pairs[turn < CREASED].flatten()] = True
         kinked = torch.zeros_like(bound)
         kinked[pairs[turn < KINK].flatten()] = True
-        bound |= kinked & (fits.surface.reason == IN_ROWS)
+        bound |= kinked & (fits.reason == IN_ROWS)
     rim = torch.zeros_like(bound)
     rim[nodes.edges[nodes.sides[2].uses != 2].flatten()] = True
     bound |= rim & (_around(nodes, (~bound & ~rim).long()) == 0)
@@ -110,15 +111,6 @@ def _around(nodes: Nodes, values: Int[Tensor, " N"]) -> Int[Tensor, " N"]:
     for one, other in nodes.edges.T, nodes.edges.T.flip(0):
         total.index_add_(0, one, values[other])
     return total
-
-
-def cover_of(
-    nodes: Nodes, lengths: Float[Tensor, "F 3"], coarse: Tensor, free: Bool[Tensor, " E"]
-) -> Cover:
-    """The Delaunay triangulation of the coarse triangles and their mirror image, glued along the free boundary."""
-    fixed = (nodes.sides[2].uses == 1) & ~free
-    fixed[nodes.edge[~coarse].flatten()] = True
-    return delaunay_cover(nodes.cells[coarse], lengths[coarse], nodes.edge[coarse], fixed)
 
 
 def boundary_shares(

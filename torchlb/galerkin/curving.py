@@ -6,6 +6,7 @@ Curves along the boundary, mollified lengths and normals are of triangles alone;
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Protocol
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -13,14 +14,13 @@ from torch import Tensor
 
 from torchlb.fits.polynomials import monomials
 from torchlb.galerkin.assembly import CHUNK, area_element, flat_metric, metric
-from torchlb.galerkin.coarse import coarse_triangles, cover_of
-from torchlb.galerkin.delaunay import Cover
+from torchlb.galerkin.coarse import coarse_triangles
+from torchlb.galerkin.delaunay import Cover, delaunay_cover, mollified
 from torchlb.galerkin.elements import simplex
 from torchlb.galerkin.nodes import Nodes
 from torchlb.geometry.frames import vertex_normals
-from torchlb.geometry.stars import pieces_of
+from torchlb.geometry.local_fits import FitPlan, LocalFits
 from torchlb.geometry.vectors import at
-from torchlb.geometry.vertex_fits import VertexFits
 
 ROUNDS = 2
 """Of moving the nodes to the graphs of their vertices."""
@@ -33,8 +33,6 @@ NO_VOLUME, POINT = 1e-6, 1e-30
 then, over that edge."""
 STRETCH = 3.0
 """Largest ratio of the curved area element and the flat one, or of the flat one and the curved one."""
-SLACK = 1e-5
-"""Of the mean length: what two edges of a triangle are to be longer than the third, by mollification."""
 
 
 @dataclass(frozen=True)
@@ -65,69 +63,135 @@ class BoundaryNodes:
     entries: tuple[Int[Tensor, " E"], Int[Tensor, " E"], Float[Tensor, " E"]]
 
 
+class BoundaryNodesPlan(Protocol):
+    """What is decided about the nodes along the boundary."""
+
+    def at(self, points: Float[Tensor, "N n"]) -> BoundaryNodes:
+        """What follows at these points."""
+        ...
+
+
+@dataclass(frozen=True)
+class CurvingPlan:
+    """What is decided about the cells.
+
+    Attributes
+    ----------
+    nodes
+        The numbering.
+    boundary
+        The nodes along the boundary.
+    curved
+        (E,), which edges are.
+    bent
+        (X,), which nodes stand on the surface instead of on a flat cell.
+    coarse, fixed
+        (F,), which triangles are flat for the reasons of `coarse_triangles`; and (E,), which of their edges are no
+        mirrors of the cover that stands for them.
+    flips
+        Those that make that cover Delaunay.
+    """
+
+    nodes: Nodes
+    boundary: BoundaryNodesPlan
+    curved: Bool[Tensor, " E"]
+    bent: Bool[Tensor, " X"]
+    coarse: Bool[Tensor, " F"]
+    fixed: Bool[Tensor, " E"]
+    flips: list[Int[Tensor, " C"]]
+
+    def at(self, points: Float[Tensor, "N n"], plan: FitPlan, fits: LocalFits) -> CurvedMesh:
+        """The cells at these points."""
+        nodes, boundary = self.nodes, self.boundary.at(points)
+        flat = flat_places(points, nodes)
+        standing, _ = _moved(points, plan, fits, nodes, _start(flat, boundary), boundary)
+        places = torch.cat([points, torch.where(self.bent[:, None], standing, flat)])
+        lengths, some = _sound_lengths(points, nodes), self.curved[nodes.edge].any(1)
+        shape = simplex(nodes.dim, nodes.degree)
+        g = flat_metric(lengths)[:, None].repeat(1, len(shape.weights), 1)
+        for part in some.nonzero()[:, 0].split(CHUNK):
+            g[part] = metric(places, nodes.elements[part], shape)
+        cover = self.cover(lengths, self.flips)
+        return CurvedMesh(places, g, lengths, cover, boundary)
+
+    def cover(self, lengths: Float[Tensor, "F 3"], flips: list[Tensor] | None) -> Cover | None:
+        """The Delaunay triangulation of the coarse triangles and their mirror image, glued along the free boundary."""
+        coarse, nodes = self.coarse, self.nodes
+        if not coarse.any():
+            return None
+        edge = nodes.edge[coarse]
+        return delaunay_cover(nodes.cells[coarse], lengths[coarse], edge, self.fixed, flips)
+
+
 @dataclass(frozen=True)
 class CurvedMesh:
     """Where the nodes stand.
 
     Attributes
     ----------
-    nodes
-        The numbering.
     places
         (N + X, n), ℓ.
-    curved
-        (E,), which edges are.
-    bent
-        (X,), which nodes stand on the surface instead of on a flat cell.
+    metric
+        (F, Q, S), at the Gauss points of each cell, of flat triangles from mollified lengths.
     lengths
         (F, e) of the edges, mollified, ℓ.
-    coarse, cover
-        (F,), which triangles are flat for the reasons of `coarse_triangles`; and what stands for them.
+    cover
+        What stands for the coarse triangles; None if there are none.
     boundary
         What is known of the nodes along the boundary.
     """
 
-    nodes: Nodes
     places: Float[Tensor, "NX n"]
-    curved: Bool[Tensor, " E"]
-    bent: Bool[Tensor, " X"]
+    metric: Float[Tensor, "F Q S"]
     lengths: Float[Tensor, "F e"]
-    coarse: Bool[Tensor, " F"]
     cover: Cover | None
     boundary: BoundaryNodes
 
 
 def curve(
     points: Float[Tensor, "N n"],
-    fits: VertexFits,
+    plan: FitPlan,
+    fits: LocalFits,
     nodes: Nodes,
-    boundary: BoundaryNodes,
+    edge_nodes: BoundaryNodesPlan,
     held: Bool[Tensor, " N"] | None = None,
-) -> tuple[CurvedMesh, Float[Tensor, "F Q S"]]:
+) -> tuple[CurvingPlan, CurvedMesh]:
     """Stand the nodes on the graphs of their vertices where these agree, and flatten what they would distort.
 
-    With it comes the metric at the Gauss points, of flat triangles from mollified lengths. Nodes along the boundary of
-    triangles stay on its curves. `held` are vertices with a Dirichlet condition: boundary edges between them are no
-    mirrors.
+    Nodes along the boundary of triangles stay on its curves. `held` are vertices with a Dirichlet condition: boundary
+    edges between them are no mirrors.
     """
-    flat = torch.einsum("xv,xvn->xn", nodes.shares, at(points, nodes.corners))
-    start = flat + boundary.displacement
-    standing, sound = _moved(points, fits, nodes, start)
-    if nodes.dim == 2:
-        standing[boundary.nodes] = start[boundary.nodes]
+    boundary, flat = edge_nodes.at(points), flat_places(points, nodes)
+    start = _start(flat, boundary)
+    standing, sound = _moved(points, plan, fits, nodes, start, boundary)
     ratio = (start - flat).norm(dim=1) / _sizes(points, nodes)
     curved, *whole = nodes.by_side(sound & (ratio <= STEEP))
     uses = nodes.sides[2].uses
-    coarse, free = torch.zeros(len(nodes.cells), dtype=torch.bool), uses == 1
+    coarse, fixed = torch.zeros(len(nodes.cells), dtype=torch.bool), uses == 1
     if nodes.dim == 2:
         curved &= ~_opposed(points, nodes) & (uses <= 2)
+        free = uses == 1
         if held is not None:
             free &= ~held[nodes.edges].all(1)
-        coarse = coarse_triangles(points, nodes, fits, free)
+        coarse = coarse_triangles(points, nodes, plan, free)
         curved[nodes.edge[coarse].flatten()] = False
+        fixed &= ~free
+        fixed[nodes.edge[~coarse].flatten()] = True
     places, curved, bent, g, lengths = _flattened(points, nodes, (flat, standing), curved, whole)
-    cover = cover_of(nodes, lengths, coarse, free) if nodes.dim == 2 else None
-    return CurvedMesh(nodes, places, curved, bent, lengths, coarse, cover, boundary), g
+    decided = CurvingPlan(nodes, edge_nodes, curved, bent, coarse, fixed, [])
+    cover = decided.cover(lengths, None)
+    if cover is not None:
+        decided.flips.extend(cover.flips)
+    return decided, CurvedMesh(places, g, lengths, cover, boundary)
+
+
+def flat_places(points: Float[Tensor, "N n"], nodes: Nodes) -> Float[Tensor, "X n"]:
+    """Where the nodes stand on flat cells."""
+    return torch.einsum("xv,xvn->xn", nodes.shares, at(points, nodes.corners))
+
+
+def _start(flat: Float[Tensor, "X n"], boundary: BoundaryNodes) -> Float[Tensor, "X n"]:
+    return flat + boundary.displacement
 
 
 def _opposed(points: Tensor, nodes: Nodes) -> Bool[Tensor, " E"]:
@@ -150,47 +214,42 @@ def _sizes(points: Tensor, nodes: Nodes) -> Float[Tensor, " X"]:
 
 
 def _moved(
-    points: Tensor, fits: VertexFits, nodes: Nodes, start: Float[Tensor, "X n"]
+    points: Tensor,
+    plan: FitPlan,
+    fits: LocalFits,
+    nodes: Nodes,
+    start: Float[Tensor, "X n"],
+    boundary: BoundaryNodes,
 ) -> tuple[Float[Tensor, "X n"], Bool[Tensor, " X"]]:
     """Where the graphs of its vertices take every node, in the mean; and whether they agree.
 
-    Asked again from there they do so at the same place, but for h⁶.
+    Asked again from there they do so at the same place, but for h⁶. Nodes along the boundary of triangles stay.
     """
     ends, size, place = node_ends(nodes), _sizes(points, nodes), start
     parts = list(zip(ends.node.split(CHUNK), ends.vertex.split(CHUNK), strict=True))
     apart = torch.zeros_like(size[ends.node])
     for _ in range(ROUNDS):
         moves = torch.cat(
-            [_to_graph(points, fits, at(place, node), vertex) for node, vertex in parts]
+            [_to_graph(fits, plan.highest, at(place, node), vertex) for node, vertex in parts]
         )
         mean = torch.zeros_like(start).index_add_(0, ends.node, ends.share[:, None] * moves)
         place, apart = place + mean, (moves - at(mean, ends.node)).norm(dim=1)
-    bad = (apart > AGREE * at(size, ends.node)) | (fits.degree[ends.vertex] == 0)
+    bad = (apart > AGREE * at(size, ends.node)) | (plan.degree[ends.vertex] == 0)
     sound = (place - start).norm(dim=1) <= STEEP * size
     sound[ends.node[bad]] = False
+    if nodes.dim == 2:
+        place = place.index_copy(0, boundary.nodes, start[boundary.nodes])
     return place, sound
 
 
 def _to_graph(
-    points: Tensor, fits: VertexFits, places: Float[Tensor, "E n"], vertex: Int[Tensor, " E"]
+    fits: LocalFits, degree: int, places: Float[Tensor, "E n"], vertex: Int[Tensor, " E"]
 ) -> Float[Tensor, "E n"]:
     """From places to the graph of the surface at a vertex, orthogonally to its frame."""
-    surface, frame, offset = fits.surface, at(fits.frames, vertex), places - at(points, vertex)
+    frame, offset = at(fits.initial, vertex), places - at(fits.points, vertex)
     along = offset[:, None] @ frame
-    powers = monomials(along / surface.radius[vertex, None, None], surface.highest)
-    return (powers @ at(surface.heights, vertex) + along @ frame.mT)[:, 0] - offset
-
-
-def mollified(sides: Float[Tensor, "F 3"], faces: Int[Tensor, "F 3"]) -> Float[Tensor, "F 3"]:
-    """Lengths of edges, all of a component longer by so much that none of its triangles is without area."""
-    spare = sides.sum(1) - 2 * sides.amax(1)
-    if bool((spare >= SLACK * sides.amax()).all()):
-        return sides
-    piece = torch.from_numpy(pieces_of(faces.numpy(), int(faces.max()) + 1))[faces[:, 0]]
-    number = torch.bincount(piece).clamp_min(1)
-    mean = torch.zeros(len(number), dtype=sides.dtype).index_add_(0, piece, sides.mean(1)) / number
-    lack = torch.zeros_like(mean).scatter_reduce_(0, piece, SLACK * mean[piece] - spare, "amax")
-    return sides + lack[piece, None]
+    powers = monomials(along / fits.surface_radius[vertex, None, None], degree)
+    return (powers @ at(fits.heights, vertex) + along @ frame.mT)[:, 0] - offset
 
 
 def shrunk(sides: Float[Tensor, "F 6"]) -> Float[Tensor, "F 6"]:
@@ -201,6 +260,14 @@ def shrunk(sides: Float[Tensor, "F 6"]) -> Float[Tensor, "F 6"]:
     longest = sides.amax(1)
     none = area_element(flat_metric(sides)) <= NO_VOLUME * longest**3
     return torch.where(none[:, None], POINT * longest[:, None], sides)
+
+
+def _sound_lengths(points: Float[Tensor, "N n"], nodes: Nodes) -> Float[Tensor, "F e"]:
+    """Lengths of the edges of each cell, as those of cells with an area or a volume, or next to nothing."""
+    sides = nodes.lengths(points)
+    if nodes.dim == 2:
+        return mollified(sides, nodes.cells)
+    return shrunk(sides) if nodes.dim == 3 else sides
 
 
 def _flattened(
@@ -215,13 +282,7 @@ def _flattened(
     `stand` is where nodes are on flat cells and on the surface; `whole`, which triangles and cells may have theirs
     there.
     """
-    lengths = sides = (points[nodes.edges[:, 0]] - points[nodes.edges[:, 1]]).norm(dim=1)[
-        nodes.edge
-    ]
-    if nodes.dim == 2:
-        lengths = mollified(sides, nodes.cells)
-    elif nodes.dim == 3:
-        lengths = shrunk(sides)
+    sides, lengths = nodes.lengths(points), _sound_lengths(points, nodes)
     plane, shape = flat_metric(lengths), simplex(nodes.dim, nodes.degree)
     area = area_element(plane)
     curved = curved.clone()

@@ -6,6 +6,7 @@ the surface and its mirror image, each triangle twice, it is an edge like all ot
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from typing import Any, NamedTuple
 
 import torch
@@ -13,10 +14,16 @@ from jaxtyping import Bool, Float, Int
 from scipy import sparse
 from torch import Tensor
 
+from torchlb.geometry.stars import pieces_of
+
 EDGES = ((0, 1), (1, 2), (2, 0))
 """Ends of the sides of a triangle, in turn, in the order of `subsets`."""
 DELAUNAY = 1e-6
 """How far the cotangents across from an edge may sum to less than zero, so that rounding flips nothing."""
+
+
+SLACK = 1e-5
+"""Of the mean length: what two edges of a triangle are to be longer than the third, by mollification."""
 
 
 class Cover(NamedTuple):
@@ -24,21 +31,27 @@ class Cover(NamedTuple):
 
     Attributes
     ----------
-    faces : (2F, 3); copies of a vertex are one vertex, and sides may join it to itself.
-    lengths : (2F, 3), ℓ, of the sides in the order of `EDGES`.
-    flips : in order, (two triangles, share of the first in the area of both) of flips at one time.
+    faces
+        (2F, 3); copies of a vertex are one vertex, and sides may join it to itself.
+    lengths
+        (2F, 3), ℓ, of the sides in the order of `EDGES`.
+    flips
+        In order, the sides that were flipped at one time: side s of face f has number 3f + s.
+    shares
+        Of each of these lots the two triangles, and the share of the first in the area of both.
     """
 
     faces: Int[Tensor, "two_F 3"]
     lengths: Float[Tensor, "two_F 3"]
-    flips: list[tuple[Int[Tensor, "C 2"], Float[Tensor, " C"]]]
+    flips: list[Int[Tensor, " C"]]
+    shares: list[tuple[Int[Tensor, "C 2"], Float[Tensor, " C"]]]
 
     def mixed(self) -> sparse.csr_array:
         """(2F, F), of each triangle what share of the given ones it has, as far as means over two triangles tell."""
         count = len(self.faces) // 2
         one: Any = sparse.eye_array(count, format="csr")
         result: Any = sparse.vstack([one, one], format="csr")
-        for pair, share in self.flips:
+        for pair, share in self.shares:
             same = torch.ones(2 * count, dtype=torch.float64)
             same[pair.flatten()] = 0
             row = torch.cat([torch.arange(2 * count), pair[:, [0, 0, 1, 1]].flatten()])
@@ -49,19 +62,41 @@ class Cover(NamedTuple):
         return result
 
 
+def mollified(sides: Float[Tensor, "F 3"], faces: Int[Tensor, "F 3"]) -> Float[Tensor, "F 3"]:
+    """Lengths of edges, all of a component longer by so much that none of its triangles is without area."""
+    spare = sides.sum(1) - 2 * sides.amax(1)
+    if bool((spare >= SLACK * sides.amax()).all()):
+        return sides
+    piece = torch.from_numpy(pieces_of(faces.numpy(), int(faces.max()) + 1))[faces[:, 0]]
+    number = torch.bincount(piece).clamp_min(1)
+    mean = torch.zeros(len(number), dtype=sides.dtype).index_add_(0, piece, sides.mean(1)) / number
+    lack = torch.zeros_like(mean).scatter_reduce_(0, piece, SLACK * mean[piece] - spare, "amax")
+    return sides + lack[piece, None]
+
+
 def delaunay_cover(
     faces: Int[Tensor, "F 3"],
     lengths: Float[Tensor, "F 3"],
     edge: Int[Tensor, "F 3"],
     fixed: Bool[Tensor, " E"],
+    flips: list[Int[Tensor, " C"]] | None = None,
 ) -> Cover:
     """Triangles that cover the given ones twice, flipped until they are Delaunay but for the edges that are `fixed`.
 
     `edge` numbers the edges of the faces. However many faces an edge has, each is glued there to the back of the next.
+    Given `flips` are done again instead, whatever the lengths are now.
     """
     sheets = torch.cat([faces, faces.flip(1)])
     sides = torch.cat([lengths, lengths[:, [1, 0, 2]]])
-    twin, flips = _glued(faces, edge, fixed), []
+    cover, twin = Cover(sheets, sides, [], []), _glued(faces, edge, fixed)
+    for chosen in _lacking(sheets, sides, twin) if flips is None else flips:
+        cover.flips.append(chosen)
+        cover.shares.append(_flip(sheets, sides, twin, chosen))
+    return cover
+
+
+def _lacking(sheets: Tensor, sides: Tensor, twin: Tensor) -> Iterator[Int[Tensor, " C"]]:
+    """Sides to flip at one time, until all are Delaunay; each lot is flipped before the next is asked for."""
     active = torch.arange(len(twin))
     while True:
         active = active[(twin[active] > active) & (active // 3 != twin[active] // 3)]
@@ -69,9 +104,10 @@ def delaunay_cover(
         lacking = weight < -DELAUNAY
         chosen = _apart(active[lacking], twin[active[lacking]], weight[lacking], len(sheets))
         if len(chosen) == 0:
-            return Cover(sheets, sides, flips)
-        flips.append(_flip(sheets, sides, twin, chosen))
-        slots = (3 * flips[-1][0].view(-1, 1) + torch.arange(3)).flatten()
+            return
+        faces = torch.cat([chosen, twin[chosen]]) // 3
+        yield chosen
+        slots = (3 * faces.view(-1, 1) + torch.arange(3)).flatten()
         met = torch.minimum(slots, twin[slots])
         active = torch.unique(torch.cat([active[lacking], met[met >= 0]]))
 
@@ -129,7 +165,7 @@ def _apart(one: Tensor, other: Tensor, weight: Tensor, num_faces: int) -> Int[Te
 def _flip(
     sheets: Tensor, sides: Tensor, twin: Tensor, chosen: Int[Tensor, " C"]
 ) -> tuple[Int[Tensor, "C 2"], Float[Tensor, " C"]]:
-    """Flip sides, in place: of (a, b, c) and (b, a, d) make (c, d, b) and (d, c, a); as in `Cover.flips`."""
+    """Flip sides, in place: of (a, b, c) and (b, a, d) make (c, d, b) and (d, c, a); as in `Cover.shares`."""
     other = twin[chosen]
     f, g = chosen // 3, other // 3
     (ab, bc, ca), (ba, ad, db) = (

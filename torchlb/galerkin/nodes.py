@@ -9,6 +9,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from torchlb.galerkin.elements import facet_nodes, inner, subsets
+from torchlb.geometry.vectors import at
 
 
 @dataclass(frozen=True)
@@ -83,6 +84,11 @@ class Nodes:
     def beyond(self) -> list[Sides]:
         """The triangles, and the cells."""
         return [self.sides[size] for size in range(3, self.dim + 2)]
+
+    def lengths(self, points: Float[Tensor, "N n"]) -> Float[Tensor, "F e"]:
+        """Those of the edges of each cell, ℓ."""
+        ends = at(points, self.edges)
+        return (ends[:, 1] - ends[:, 0]).norm(dim=1)[self.edge]
 
     def at_nodes(self, *values: Tensor) -> Tensor:
         """Values of the edges, of the triangles, …, at the nodes inside them, in their order."""

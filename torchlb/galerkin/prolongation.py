@@ -5,37 +5,50 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Int
 from scipy import sparse
 from torch import Tensor
 
 from torchlb.fits.weights import cardinal
-from torchlb.galerkin.curving import CurvedMesh, Ends, node_ends
+from torchlb.galerkin.curving import CurvedMesh, CurvingPlan, Ends, node_ends
+from torchlb.geometry.local_fits import FitPlan, LocalFits
 from torchlb.geometry.vectors import at
-from torchlb.geometry.vertex_fits import Fits, VertexFits
 
 AT_ONCE = 2**11
 """Vertices whose nodes are looked at together: some 10 MB at degree 4."""
 
 
 def prolongation(
-    points: Float[Tensor, "N n"], fits: VertexFits, mesh: CurvedMesh
+    plan: FitPlan, fits: LocalFits, curving: CurvingPlan, mesh: CurvedMesh
 ) -> sparse.csr_array:
     """P, (N + X, N): what the vertices' fits say at the nodes, weighted by barycentrics. Its rows sum to one.
 
     Identity rows at the vertices, linear ones at flat nodes, and those of the boundary's own curves along it.
     """
-    count, ends = len(points), node_ends(mesh.nodes)
-    row, col, value, by_fit = _without_fits(points, mesh, ends)
+    count, ends = len(fits.points), node_ends(curving.nodes)
+    row, col, value, by_fit = _without_fits(count, curving, mesh, ends)
     rows = torch.cat([row, count + ends.node[by_fit]])
-    length = torch.cat([torch.ones_like(row), fits.size[ends.vertex[by_fit]]])
+    length = torch.cat([torch.ones_like(row), plan.size[ends.vertex[by_fit]]])
     indptr, start = _places(rows, length, len(mesh.places))
     total = int(indptr[-1])
     indices, data = torch.empty(total, dtype=torch.int32), value.new_empty(total)
     alone, first = start[: len(row)], torch.zeros_like(ends.node)
     indices[alone], data[alone] = col.int(), value
     first[by_fit] = start[len(row) :]
-    _fill((indices, data, first), points, fits, mesh, ends, by_fit)
+    order = by_fit.nonzero()[:, 0]
+    order = order[ends.vertex[order].argsort(stable=True)]
+    for block, coefficients in zip(plan.functions, fits.coefficients, strict=True):
+        for part, own in _of_vertices(block.vertices, ends, order, count):
+            used, vertex = own >= 0, block.vertices[part]
+            end = own.clamp_min(0)
+            node = at(mesh.places, count + at(ends.node, end))
+            offset = plan.reach * (node - fits.points[vertex, None])
+            y = offset @ fits.initial[vertex] / fits.radius[vertex, None, None]
+            weights = cardinal(coefficients[part], y, min(block.degree, plan.jet))
+            weights = weights * at(ends.share, end)[..., None]
+            place = first[own[used]][:, None] + torch.arange(weights.shape[2])
+            indices[place] = block.points[part][used.nonzero()[:, 0]]
+            data[place] = weights[used]
     shape = len(mesh.places), count
     p = sparse.csr_array((data.numpy(), indices.numpy(), indptr.numpy()), shape=shape)
     p.sum_duplicates()
@@ -44,47 +57,20 @@ def prolongation(
 
 
 def _without_fits(
-    points: Tensor, mesh: CurvedMesh, ends: Ends
+    count: int, curving: CurvingPlan, mesh: CurvedMesh, ends: Ends
 ) -> tuple[Tensor, Tensor, Tensor, Bool[Tensor, " E"]]:
     """(row, column, value) of the vertices, of flat nodes and of those along the boundary; and which ends are left."""
-    vertices = torch.arange(len(points))
+    vertices = torch.arange(count)
     node, vertex, weight = mesh.boundary.entries
-    bent = mesh.bent[node]
-    of_rim, flat, by_fit = (
-        (node[bent], vertex[bent], weight[bent]),
-        ~mesh.bent[ends.node],
-        mesh.bent.clone(),
-    )
+    bent, flat, by_fit = curving.bent[node], ~curving.bent[ends.node], curving.bent.clone()
     by_fit[node] = False
-    entries = [(vertices, vertices, points.new_ones(len(vertices)))]
-    for node, vertex, weight in (of_rim, (ends.node[flat], ends.vertex[flat], ends.share[flat])):
-        entries.append((len(vertices) + node, vertex, weight))
-    row, col, value = (torch.cat(parts) for parts in zip(*entries, strict=True))
+    parts = [
+        (vertices, vertices, mesh.places.new_ones(count)),
+        (count + node[bent], vertex[bent], weight[bent]),
+        (count + ends.node[flat], ends.vertex[flat], ends.share[flat]),
+    ]
+    row, col, value = (torch.cat(columns) for columns in zip(*parts, strict=True))
     return row, col, value, by_fit[ends.node]
-
-
-def _fill(
-    entries: tuple[Int[Tensor, " nnz"], Float[Tensor, " nnz"], Int[Tensor, " E"]],
-    points: Float[Tensor, "N n"],
-    fits: VertexFits,
-    mesh: CurvedMesh,
-    ends: Ends,
-    by_fit: Bool[Tensor, " E"],
-) -> None:
-    """The indices and data that come from fits, of each end from its `first` on; the fits are gone thereafter."""
-    indices, data, first = entries
-    for block, part, own in _of_fits(fits.hand_over(), ends, by_fit, len(points)):
-        used, vertex = own >= 0, block.vertices[part]
-        end = own.clamp_min(0)
-        offset = fits.reach * (
-            at(mesh.places, len(points) + at(ends.node, end)) - points[vertex, None]
-        )
-        y = offset @ fits.frames[vertex] / fits.radius[vertex, None, None]
-        weights = cardinal(block.coefficients[part], y, block.degree)
-        weights = weights * at(ends.share, end)[..., None]
-        place = first[own[used]][:, None] + torch.arange(weights.shape[2])
-        indices[place] = block.points[part].int()[used.nonzero()[:, 0]]
-        data[place] = weights[used]
 
 
 def _places(
@@ -98,17 +84,14 @@ def _places(
     return total.cumsum(0), start
 
 
-def _of_fits(
-    blocks: list[Fits], ends: Ends, used: Tensor, count: int
-) -> Iterator[tuple[Fits, Int[Tensor, " b"], Int[Tensor, "b E"]]]:
-    """Parts of the blocks of fits, and the numbers of the used ends at each of their vertices, padded by −1."""
-    order = used.nonzero()[:, 0]
-    order = order[ends.vertex[order].argsort(stable=True)]
+def _of_vertices(
+    vertices: Int[Tensor, " b"], ends: Ends, order: Int[Tensor, " e"], count: int
+) -> Iterator[tuple[Int[Tensor, " c"], Int[Tensor, "c E"]]]:
+    """Some of the vertices at a time, and the numbers of the ends at each of them, padded by −1; `order` has these."""
     number = torch.bincount(ends.vertex[order], minlength=count)
     start = number.cumsum(0) - number
-    for block in blocks if len(order) else []:
-        uses = number[block.vertices]
-        for part in uses.argsort().split(AT_ONCE):  # of about as many ends each
-            slot = torch.arange(int(uses[part].max()))
-            own = order[(start[block.vertices[part], None] + slot).clamp_max(len(order) - 1)]
-            yield block, part, torch.where(slot < uses[part, None], own, -1)
+    uses = number[vertices]
+    for part in uses.argsort().split(AT_ONCE) if len(order) else []:  # of about as many ends each
+        slot = torch.arange(int(uses[part].max()))
+        own = order[(start[vertices[part], None] + slot).clamp_max(len(order) - 1)]
+        yield part, torch.where(slot < uses[part, None], own, -1)

@@ -13,7 +13,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from torchlb.geometry.vertex_fits import MAX_LEBESGUE
+from torchlb.geometry.fit_search import MAX_LEBESGUE
 
 SHARP = cos(radians(60))
 """A boundary that turns by more at a vertex has a corner there."""
@@ -22,19 +22,51 @@ KINK, OUTSTANDING = cos(radians(20)), 3.0
 
 
 @dataclass(frozen=True)
+class RimPlan:
+    """The vertices that a polynomial curve over each boundary edge goes through.
+
+    Attributes
+    ----------
+    index
+        (G, 2 + 2s): both ends of the edge, then those in turn beyond the second end, and those beyond the first.
+    valid
+        (G, 2 + 2s), whether an entry counts.
+    """
+
+    index: Int[Tensor, "G S"]
+    valid: Bool[Tensor, "G S"]
+
+    def at(self, points: Float[Tensor, "N n"]) -> RimCurves:
+        """The curves."""
+        steps = self.index.shape[1] // 2 - 1
+        index, arcs = self.index, [points.new_zeros(len(self.index), 1)]
+        for walk in index[:, 1 : 2 + steps], torch.cat([index[:, :1], index[:, 2 + steps :]], 1):
+            step = points[walk[:, 1:]] - points[walk[:, :-1]]
+            arcs.append(step.norm(dim=2).cumsum(1))
+        length = (points[index[:, 1]] - points[index[:, 0]]).norm(dim=1, keepdim=True)
+        first, ahead, behind = arcs
+        return RimCurves(index, self.valid, torch.cat([first, length, length + ahead, -behind], 1))
+
+
+@dataclass(frozen=True)
 class RimCurves:
     """A polynomial curve over each boundary edge.
 
     Attributes
     ----------
-    index : (G, S), the vertices that it goes through, both ends of the edge first.
-    valid : (G, S), whether an entry counts.
-    arc : (G, S), ℓ: their places along the boundary, 0 at the edge's first end.
+    index, valid
+        As in `RimPlan`.
+    arc
+        (G, S), ℓ: their places along the boundary, 0 at the edge's first end.
     """
 
     index: Int[Tensor, "G S"]
     valid: Bool[Tensor, "G S"]
     arc: Float[Tensor, "G S"]
+
+    def over(self, edges: Int[Tensor, " E"]) -> RimCurves:
+        """Those over some of the edges."""
+        return RimCurves(self.index[edges], self.valid[edges], self.arc[edges])
 
     def weights(self, share: Float[Tensor, "G q"]) -> Float[Tensor, "G q S"]:
         """Lagrange weights of the vertices at shares of the edge, 0 at its first end and 1 at its second."""
@@ -46,31 +78,20 @@ class RimCurves:
         return (to / gap[:, None]).prod(-1) * self.valid[:, None]
 
 
-def rim_curves(points: Float[Tensor, "N n"], rim: Int[Tensor, "G 2"], width: int) -> RimCurves:
+def rim_plan(points: Float[Tensor, "N n"], rim: Int[Tensor, "G 2"], width: int) -> RimPlan:
     """Curves through `width` vertices, fewer where corners are near, over the boundary edges `rim`."""
     mate = _mates(points, rim)
-    walks = [_walk(points, rim, mate, side, width - 2) for side in (0, 1)]
-    (left, left_arc, left_length, wrapped), (right, right_arc, right_length, _) = walks
+    walks = [_walk(rim, mate, side, width - 2) for side in (0, 1)]
+    (left, left_length, wrapped), (right, right_length, _) = walks
     extra = torch.where(wrapped, left_length.clamp_max(width - 2), width - 2)
     ahead = torch.minimum(right_length, torch.maximum(extra // 2, extra - left_length))
     behind = torch.minimum(left_length, extra - ahead)
     place = torch.arange(width - 2)
-    first = torch.zeros(len(rim), 1).to(points)
-    length = (points[rim[:, 1]] - points[rim[:, 0]]).norm(dim=1, keepdim=True)
-    curves = RimCurves(
-        torch.cat([rim, right, left], 1),
-        torch.cat(
-            [
-                torch.ones_like(rim, dtype=torch.bool),
-                place < ahead[:, None],
-                place < behind[:, None],
-            ],
-            1,
-        ),
-        torch.cat([first, length, length + right_arc, -left_arc], 1),
-    )
-    _bound(curves)
-    return curves
+    ends = torch.ones_like(rim, dtype=torch.bool)
+    used = place < ahead[:, None], place < behind[:, None]
+    plan = RimPlan(torch.cat([rim, right, left], 1), torch.cat([ends, *used], 1))
+    _bound(plan.at(points))
+    return plan
 
 
 def _bound(curves: RimCurves) -> None:
@@ -108,19 +129,14 @@ def _mates(points: Float[Tensor, "N n"], rim: Int[Tensor, "G 2"]) -> Int[Tensor,
 
 
 def _walk(
-    points: Float[Tensor, "N n"],
-    rim: Int[Tensor, "G 2"],
-    mate: Int[Tensor, " two_G"],
-    side: int,
-    steps: int,
-) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """(vertices, arc lengths, their number, whether the walk came round) beyond one end of every edge."""
+    rim: Int[Tensor, "G 2"], mate: Int[Tensor, " two_G"], side: int, steps: int
+) -> tuple[Int[Tensor, "G steps"], Int[Tensor, " G"], Bool[Tensor, " G"]]:
+    """(vertices, their number, whether the walk came round) beyond one end of every edge; it stays where it ends."""
     count = len(rim)
     end, start = rim[:, side], rim[:, 1 - side]
     half = torch.arange(count) + count * side
     alive, wrapped = (torch.full((count,), value) for value in (True, False))
-    at, arc = end, points.new_zeros(count)
-    vertices, arcs, length = [], [], torch.zeros(count, dtype=torch.int64)
+    at, vertices, length = end, [], torch.zeros(count, dtype=torch.int64)
     for _ in range(steps):
         following = mate[half]
         alive &= following >= 0
@@ -128,9 +144,7 @@ def _walk(
         next_at = torch.cat([rim[:, 0], rim[:, 1]])[half]
         wrapped |= alive & (next_at == start)
         alive &= next_at != start
-        arc = arc + torch.where(alive, (points[next_at] - points[at]).norm(dim=1), 0.0)
         at = torch.where(alive, next_at, at)
         length += alive
         vertices.append(at)
-        arcs.append(arc)
-    return torch.stack(vertices, 1), torch.stack(arcs, 1), length, wrapped
+    return torch.stack(vertices, 1), length, wrapped

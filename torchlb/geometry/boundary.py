@@ -7,17 +7,19 @@ mesh has a crease, or a corner, ν is the mean of the outer normals around.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from math import cos, radians
 
 import torch
 from jaxtyping import Bool, Float, Int
+from scipy import sparse
 from scipy.spatial import KDTree
 from torch import Tensor
 
 from torchlb.errors import InputError
-from torchlb.geometry.candidates import list_candidates
-from torchlb.geometry.frames import cloud_frames, mesh_frames, normals_of_frames, refine_frames
+from torchlb.geometry.fit_search import FitSearch
+from torchlb.geometry.frames import cloud_frames, mesh_frames, normals_of_frames
+from torchlb.geometry.local_fits import FitPlan, LocalFits
 from torchlb.geometry.neighbors import (
     AT_ONCE,
     GraphBalls,
@@ -53,6 +55,61 @@ class Boundary:
     conormals: Float[Tensor, "N n"]
 
 
+@dataclass(frozen=True)
+class BoundaryPlan:
+    """What is decided about the boundary of a shape.
+
+    Attributes
+    ----------
+    mask
+        (N,), where a condition holds.
+    members
+        (b,), all points of the boundary; the numbers of the others refer to their places here where they are local.
+    sides, opposite
+        (G, d), (G,), of a mesh: the faces' unpaired sides, and the corners across from them; none for a cloud.
+    inside
+        (b, q), of a cloud: points off the boundary, on whose side the shape is.
+    near
+        (b, K), of a cloud: the nearest boundary points, local, from which the first tangents are.
+    fits
+        Of the boundary's own tangents, local; None at the ends of curves.
+    crease
+        (b,), where the boundary of a mesh has one, or a corner.
+    """
+
+    mask: Bool[Tensor, " N"]
+    members: Int[Tensor, " b"]
+    sides: Int[Tensor, "G d"]
+    opposite: Int[Tensor, " G"]
+    inside: Int[Tensor, "b q"]
+    near: Int[Tensor, "b K"]
+    fits: FitPlan | None
+    crease: Bool[Tensor, " b"]
+
+    def at(self, points: Float[Tensor, "N n"], frames: Float[Tensor, "N n d"]) -> Boundary:
+        """The boundary at these points, of a shape with these frames."""
+        own, tangents = (
+            points[self.members],
+            frames.new_zeros(len(self.members), points.shape[1], 0),
+        )
+        if self.fits is not None:
+            tangents = LocalFits.at(self.fits, own, self.initial(points)).frames
+        if len(self.sides):
+            outward = _outward_sums(points, self.sides, self.opposite)[0][self.members]
+        else:
+            outward = (own[:, None] - points[self.inside]).mean(1)
+        conormals = torch.zeros_like(points)
+        conormals[self.members] = _conormals(frames[self.members], tangents, outward, self.crease)
+        return Boundary(self.mask, conormals * self.mask[:, None])
+
+    def initial(self, points: Float[Tensor, "N n"]) -> Float[Tensor, "b n d_minus_1"]:
+        """The boundary's first tangents."""
+        own = points[self.members]
+        if len(self.sides):
+            return mesh_frames(own, torch.searchsorted(self.members, self.sides))
+        return cloud_frames(own, self.near, self.sides.shape[1] - 1)
+
+
 def boundary_faces(faces: Int[Tensor, "F v"]) -> Int[Tensor, "G w"]:
     """Sides of the faces that belong to one face only: edges of triangles, ends of segments.
 
@@ -83,11 +140,8 @@ def _open_sides(faces: Int[Tensor, "F v"]) -> tuple[Int[Tensor, "G w"], Int[Tens
 
 
 def boundary_of_mesh(
-    vertices: Float[Tensor, "N n"],
-    faces: Int[Tensor, "F v"],
-    frames: Float[Tensor, "N n d"],
-    degree: int,
-) -> Boundary | None:
+    vertices: Float[Tensor, "N n"], faces: Int[Tensor, "F v"], degree: int
+) -> BoundaryPlan | None:
     """Boundary of a mesh from its unpaired sides; None for a closed one.
 
     `degree` is that of the fits to the boundary's tangents.
@@ -98,16 +152,14 @@ def boundary_of_mesh(
     mask = torch.zeros(len(vertices), dtype=torch.bool)
     mask[sides.reshape(-1)] = True
     members = mask.nonzero()[:, 0]
-    tangents = frames.new_zeros(len(members), vertices.shape[1], 0)
-    if sides.shape[1] > 1:
-        number = torch.cumsum(mask, 0) - 1
-        local, own = number[sides], vertices[members]
-        graph = mesh_graph(local, len(members))
-        balls = GraphBalls(own, graph, mesh_frames(own, local))
-        tangents = _refined_tangents(balls, degree)
     outward, size = _outward_sums(vertices, sides, opposite)
-    crease = outward.norm(dim=1) < SMOOTH * size
-    return _with_conormals(frames, mask, tangents, outward[members], crease[members])
+    crease = (outward.norm(dim=1) < SMOOTH * size)[members]
+    none = members.new_zeros(0, 0)
+    plan = BoundaryPlan(mask, members, sides, opposite, none, none, None, crease)
+    if sides.shape[1] == 1:
+        return plan
+    graph = mesh_graph(torch.searchsorted(members, sides), len(members))
+    return _with_fits(plan, vertices, graph, degree)
 
 
 def boundary_creases(
@@ -119,28 +171,32 @@ def boundary_creases(
 
 
 def boundary_of_cloud(
-    points: Float[Tensor, "N n"],
-    mask: Bool[Tensor, " N"],
-    frames: Float[Tensor, "N n d"],
-    degree: int,
-) -> Boundary | None:
-    """Boundary of a cloud from the mask of its boundary points; None if there are none."""
+    points: Float[Tensor, "N n"], mask: Bool[Tensor, " N"], dim: int, degree: int
+) -> BoundaryPlan | None:
+    """Boundary of a cloud of dimension d from the mask of its boundary points; None if there are none."""
     if not mask.any():
         return None
-    members, dim = mask.nonzero()[:, 0], frames.shape[-1] - 1
+    members = mask.nonzero()[:, 0]
+    others = (~mask).nonzero()[:, 0] if not mask.all() else members
+    near = min(INSIDE, len(others))
+    _, index = KDTree(points[others].numpy()).query(points[members].numpy(), k=near)
+    inside = others[torch.from_numpy(index.reshape(len(members), near))]
+    none, crease = members.new_zeros(0, dim), torch.zeros_like(members, dtype=torch.bool)
+    plan = BoundaryPlan(mask, members, none, none[:, 0], inside, none, None, crease)
+    if dim == 1:
+        return plan
     own = points[members]
-    tangents = frames.new_zeros(len(members), points.shape[1], 0)
-    if dim > 0:
-        candidates = nearest_neighbors(own, min(8 * dim, len(own)))
-        initial = cloud_frames(own, candidates, dim)
-        balls = GraphBalls(own, nearest_graph(own, initial, candidates), initial)
-        tangents = _refined_tangents(balls, degree)
-    inside = points[~mask] if not mask.all() else points
-    near = min(INSIDE, len(inside))
-    _, index = KDTree(inside.numpy()).query(own.numpy(), k=near)
-    nearest = inside[torch.from_numpy(index.reshape(len(members), near))]
-    outward = (own[:, None] - nearest).mean(1)
-    return _with_conormals(frames, mask, tangents, outward, crease=mask.new_zeros(len(members)))
+    plan = replace(plan, near=nearest_neighbors(own, min(8 * (dim - 1), len(own))))
+    return _with_fits(plan, points, nearest_graph(own, plan.initial(points), plan.near), degree)
+
+
+def _with_fits(
+    plan: BoundaryPlan, points: Float[Tensor, "N n"], graph: sparse.csr_array, degree: int
+) -> BoundaryPlan:
+    """The same with fits of the boundary's tangents."""
+    search = FitSearch(GraphBalls(points[plan.members], graph, plan.initial(points)), degree)
+    search.refine(torch.arange(len(plan.members)))
+    return replace(plan, fits=search.finish()[0])
 
 
 def detect_boundary(
@@ -160,11 +216,6 @@ def detect_boundary(
     return torch.cat(masks)
 
 
-def _refined_tangents(balls: GraphBalls, degree: int) -> Tensor:
-    candidates = list_candidates(balls.frames.shape[-1], range(degree, 0, -1))
-    return refine_frames(balls, torch.arange(len(balls.points)), candidates)[0]
-
-
 def _outward_sums(
     vertices: Float[Tensor, "N n"], sides: Int[Tensor, "G w"], opposite: Int[Tensor, " G"]
 ) -> tuple[Float[Tensor, "N n"], Float[Tensor, " N"]]:
@@ -182,26 +233,22 @@ def _outward_sums(
     return outward, total
 
 
-def _with_conormals(
-    frames: Float[Tensor, "N n d"],
-    mask: Bool[Tensor, " N"],
+def _conormals(
+    frames: Float[Tensor, "b n d"],
     tangents: Float[Tensor, "b n d_minus_1"],
     outward: Float[Tensor, "b n"],
     crease: Bool[Tensor, " b"],
-) -> Boundary:
-    """ν = the direction of the frame orthogonal to the boundary's, on the side of `outward`; on a crease `outward`."""
-    own = frames[mask]
+) -> Float[Tensor, "b n"]:
+    """The direction of the frame orthogonal to the boundary's, on the side of `outward`; on a crease `outward`."""
     if tangents.shape[-1] == 0:
-        conormal = own[..., 0]
+        conormal = frames[..., 0]
     else:
-        along, _ = torch.linalg.qr(own.mT @ tangents)
-        conormal = (own @ normals_of_frames(along)[..., None])[..., 0]
+        along, _ = torch.linalg.qr(frames.mT @ tangents)
+        conormal = (frames @ normals_of_frames(along)[..., None])[..., 0]
     side = (conormal * outward).sum(-1, keepdim=True)
     conormal = torch.where(side < 0, -conormal, conormal)
-    within = (own @ (own.mT @ outward[..., None]))[..., 0]
-    conormals = frames.new_zeros(frames.shape[:2])
-    conormals[mask] = torch.where(crease[:, None], _unit(within), conormal)
-    return Boundary(mask, conormals)
+    within = (frames @ (frames.mT @ outward[..., None]))[..., 0]
+    return torch.where(crease[:, None], _unit(within), conormal)
 
 
 def _unit(vectors: Float[Tensor, "G n"]) -> Float[Tensor, "G n"]:

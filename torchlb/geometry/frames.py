@@ -10,15 +10,13 @@ from __future__ import annotations
 from typing import Literal
 
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 from torch import Tensor
 
-from torchlb.fits.weights import centered_fit, window
-from torchlb.geometry.admission import MIN_ALIGNMENT, admissible_neighbors, planes_of
-from torchlb.geometry.candidates import Candidate, Search
-from torchlb.geometry.neighbors import AT_ONCE, GraphBalls
+from torchlb.fits.weights import window
+from torchlb.geometry.admission import admissible_neighbors, planes_of
+from torchlb.geometry.neighbors import AT_ONCE
 from torchlb.geometry.vectors import at, dot
-from torchlb.geometry.vertex_fits import VertexFits, is_regular
 
 NO_NORMAL = 1e-12
 """A sum of normals below this share of the products of the edges is rounding."""
@@ -84,47 +82,6 @@ def mesh_frames(
     return torch.linalg.eigh(total).eigenvectors[..., -dim:]
 
 
-def refine_frames(
-    balls: GraphBalls,
-    centers: Int[Tensor, " B"],
-    candidates: list[Candidate],
-    fits: VertexFits | None = None,
-) -> tuple[Float[Tensor, "B n d"], Int[Tensor, " B"]]:
-    """Frames of order q at `centers`, by fits of degree q to the heights over those of `balls`.
-
-    Each centre takes the first candidate whose fit is regular, and has a tilt below 60°. What such fits say of the
-    surface is kept in `fits`, and these try the same neighbourhoods.
-
-    Returns
-    -------
-    frames : (B, n, d).
-    order : (B,), the degree that was reached; 0 where the initial frame stayed.
-    """
-    points, frames = balls.points, balls.frames[centers]
-    order = torch.zeros(len(centers), dtype=torch.int64)
-    middles = balls.middles(centers)
-    search = Search(balls, centers, candidates)
-    for number, rows, index in search:
-        frame, places = at(frames, rows), at(points, index)
-        offset = places[:, 1:] - places[:, :1]
-        coords = offset @ frame
-        fit = centered_fit(coords, candidates[number].degree)
-        heights = offset - coords @ frame.mT
-        gradient = fit.coefficients[:, : coords.shape[-1]]
-        slope = gradient @ heights / fit.radius[:, None, None]  # (b, d, n), in the normal space
-        refined = orthonormalized(frame + slope.mT)
-        regular = is_regular(fit, middles[rows])
-        passed = regular & _cosine_bound(slope) & refined.isfinite().all(-1).all(-1)
-        if fits is not None:
-            fits.surface.take(centers[rows], fit, heights, regular)
-            if number == 0:
-                fits.offer(centers[rows], index, fit, heights)
-        frames[rows[passed]] = refined[passed]
-        order[rows[passed]] = candidates[number].degree
-        search.settle(rows[passed])
-    return frames, order
-
-
 def orthonormalized(frames: Float[Tensor, "B n d"]) -> Float[Tensor, "B n d"]:
     """The columns made orthonormal in turn (Gram and Schmidt); they are far from dependent.
 
@@ -137,11 +94,6 @@ def orthonormalized(frames: Float[Tensor, "B n d"]) -> Float[Tensor, "B n d"]:
             column = column - dot(column, other)[..., None] * other
         found.append(column / dot(column, column).sqrt()[..., None])
     return torch.stack(found, -1)
-
-
-def _cosine_bound(slope: Float[Tensor, "B d n"]) -> Bool[Tensor, " B"]:
-    """Whether the steepest slope is below 60°: |∇H| ≤ √(1/MIN_ALIGNMENT² − 1), bounded by the Frobenius norm."""
-    return slope.square().sum((1, 2)) <= 1 / MIN_ALIGNMENT**2 - 1
 
 
 def local_offsets(

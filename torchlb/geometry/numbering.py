@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import torch
 from jaxtyping import Float, Int
+from scipy import sparse
 from scipy.spatial import KDTree
 from torch import Tensor
 
@@ -49,3 +51,15 @@ class Numbering:
         faces = self.here[faces]
         order = faces.amin(1).argsort(stable=True)
         return faces[order], order
+
+    def restored_pattern(
+        self, crow: Int[Tensor, " N_plus_1"], col: Int[Tensor, " nnz"]
+    ) -> tuple[Int[Tensor, " N_plus_1"], Int[Tensor, " nnz"], Int[Tensor, " nnz"]]:
+        """A sparse pattern (N, N) in the user's numbers, columns ascending, and of its entries the places here."""
+        count, given = len(self.given), self.given.int().numpy()
+        parts = np.arange(len(col), dtype=np.int32), given[col.numpy()], crow.numpy()
+        turned: Any = sparse.csr_array(sparse.csr_array(parts, shape=(count, count)).T)
+        turned.indices = given[turned.indices]
+        whole: Any = sparse.csr_array(turned.T)  # sorted as it comes
+        found = whole.indptr.astype(np.int64), whole.indices.astype(np.int64), whole.data
+        return torch.from_numpy(found[0]), torch.from_numpy(found[1]), torch.from_numpy(found[2])

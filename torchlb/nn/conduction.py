@@ -11,12 +11,12 @@ from scipy import sparse
 from torch import Tensor
 
 from torchlb.errors import InputError, first_few
-from torchlb.galerkin.medium import Medium
+from torchlb.galerkin.forms import Forms
 from torchlb.galerkin.pair import stored
 from torchlb.linalg.checks import check_tensor
 from torchlb.linalg.sparse import to_scipy
 from torchlb.operator.laplace_beltrami import LaplaceBeltrami
-from torchlb.operator.medium import medium_of
+from torchlb.operator.medium import forms_of
 
 
 @dataclass(frozen=True, eq=False)
@@ -24,7 +24,7 @@ class Conducting:
     """(K(κ), M) of an operator, under the names of its buffers, and the derivatives of K in κ."""
 
     lb: LaplaceBeltrami
-    medium: Medium
+    forms: Forms
     weak_crow: Int[Tensor, " N_plus_1"]
     weak_col: Int[Tensor, " nnz"]
     weak_values: Float[Tensor, "2 nnz"]
@@ -71,10 +71,11 @@ class Conducting:
         self, conductivity: Tensor, w: Float[Tensor, "N C"], u: Float[Tensor, "N C"]
     ) -> Tensor:
         """∂/∂κ of Σ_c w_cᵀK(κ)u_c, of the shape of κ."""
-        density = self.medium.sensitivity(w.detach().cpu(), u.detach().cpu())
+        density = self.forms.sensitivity(w.detach().cpu(), u.detach().cpu())
         with torch.enable_grad():
             kappa = conductivity.detach().cpu().double().requires_grad_()
-            total = (self.medium.at_gauss_points(kappa) * density).sum()
+            parts = zip(self.forms.conductivities(kappa), density, strict=True)
+            total = torch.stack([(values * slope).sum() for values, slope in parts]).sum()
         return torch.autograd.grad(total, kappa)[0].to(conductivity)
 
 
@@ -83,14 +84,14 @@ def conducting(lb: LaplaceBeltrami, conductivity: Tensor) -> Conducting:
 
     Raises
     ------
-    InputError : for another shape, values that are not positive, and operators that are not of a triangle mesh.
+    InputError : for another shape, values that are not positive, and operators that are without elements.
     """
     check_tensor(conductivity, "conductivity")
-    medium = medium_of(lb)
+    forms = forms_of(lb)
     kappa = conductivity.detach().cpu().double()
-    if kappa.shape not in ((lb.num_points,), (medium.num_faces,)):
+    if kappa.shape not in ((lb.num_points,), (forms.num_faces,)):
         raise InputError(
-            f"conductivity: expected one of each vertex, ({lb.num_points},), or face, ({medium.num_faces},), got "
+            f"conductivity: expected one of each vertex, ({lb.num_points},), or face, ({forms.num_faces},), got "
             f"{tuple(kappa.shape)}"
         )
     bad = (~((kappa > 0) & kappa.isfinite())).nonzero()[:, 0]
@@ -99,17 +100,15 @@ def conducting(lb: LaplaceBeltrami, conductivity: Tensor) -> Conducting:
             f"conductivity: expected finite, positive values, got {float(kappa[bad[0]]):.3g}, … at {len(bad)} of "
             f"{len(kappa)} vertices or faces ({first_few(bad)})"
         )
-    at_gauss_points = medium.at_gauss_points(kappa)
-    mass = sparse.triu(_mass(lb, lb.weak_crow, lb.weak_col, lb.weak_values))
-    pair = stored(medium.stiffness(at_gauss_points) + 1j * mass)
-    linear = pair
+    values = forms.conductivities(kappa)
+    mass = _mass(lb, lb.weak_crow, lb.weak_col, lb.weak_values)
+    linear = pair = stored(forms.matrix(values).real + 1j * mass)
     if len(lb.linear_crow):
-        coarse = medium.coarse_stiffness(at_gauss_points)
-        linear = stored(sparse.triu(coarse + 1j * _mass(lb, *lb.linear_pair)))
+        linear = stored(forms.near(values).real + 1j * _mass(lb, *lb.linear_pair))
     (crow, col, values), near = (
         [t.to(lb.device) for t in (part.crow, part.col, part.values)] for part in (pair, linear)
     )
-    return Conducting(lb, medium, crow, col, values, (near[0], near[1], near[2]))
+    return Conducting(lb, forms, crow, col, values, (near[0], near[1], near[2]))
 
 
 def _mass(lb: LaplaceBeltrami, crow: Tensor, col: Tensor, values: Tensor) -> Any:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import sys
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, replace
 from typing import Any
 
 import torch
@@ -16,13 +16,14 @@ from torchlb.errors import InputError, first_few, renumbered, warn
 from torchlb.galerkin.coarse import lying_triangles, with_area
 from torchlb.galerkin.flips import flipped
 from torchlb.galerkin.nodes import lagrange_nodes
-from torchlb.galerkin.pair import SparsePair, WeakPair, mesh_pair
+from torchlb.galerkin.pair import PairPlan, SparsePair, WeakPair, mesh_pair
 from torchlb.geometry.boundary import boundary_faces
 from torchlb.geometry.neighbors import nearest_neighbors
 from torchlb.geometry.numbering import Numbering
 from torchlb.geometry.orientation import mended_normals
-from torchlb.geometry.surface import NEAREST, SurfaceSummary, cloud_surface
+from torchlb.geometry.surface import NEAREST, cloud_surface
 from torchlb.linalg.threads import threads_for
+from torchlb.operator.assembled import AssembledOperator
 from torchlb.operator.checks import (
     check_boundary,
     check_dimension,
@@ -38,11 +39,12 @@ from torchlb.operator.checks import (
 from torchlb.operator.doubts import warn_of_doubts, warn_of_joins
 from torchlb.operator.inputs import ArrayLike, check_points
 from torchlb.operator.options import Options
-from torchlb.stability.certificate import Certificate
+from torchlb.operator.plan import Plan, stencils_of
 from torchlb.stability.enforce import certify
-from torchlb.stencils.assemble import Stencils, assemble
+from torchlb.stencils.assemble import assemble
 from torchlb.stencils.conditions import CONDITIONS
-from torchlb.stencils.rows import Reason, Rows, matrix_rows
+from torchlb.stencils.low_order import MeshLowOrder
+from torchlb.stencils.rows import Reason, matrix_rows
 from torchlb.stencils.shape import Shape, cloud_shape, mesh_shape, surface_shape
 
 NOWHERE = "condition='dirichlet' holds nowhere: no boundary, or `boundary` has none of it; leave the condition out"
@@ -51,51 +53,6 @@ LONG_BOUNDARY = 0.1
 MANY = 0.5
 """Share of low-order rows from which on a warning names them."""
 REMEDY = "do the points lie on a manifold of dimension {}? If not, pass its dimension as `dim`; else add points"
-
-
-@dataclass(frozen=True)
-class AssembledOperator:
-    """A finished operator, in the user's numbers; None for what was not asked for or cannot be there."""
-
-    rows: Rows
-    points: Float[Tensor, "N n"]
-    frames: Float[Tensor, "N n d"]
-    normals: Float[Tensor, "N n"] | None
-    normal_order: Int[Tensor, " N"]
-    mass: Float[Tensor, " N"]
-    on_boundary: Bool[Tensor, " N"] | None
-    pair: WeakPair | None
-    faces: Int[Tensor, "F v"]
-    source: str
-    options: dict[str, Any]
-    certificate: Certificate | None = None
-    surface: SurfaceSummary | None = None
-
-    @classmethod
-    def of(
-        cls,
-        rows: Rows,
-        shape: Shape,
-        pair: WeakPair | None,
-        faces: Int[Tensor, "F v"],
-        source: str,
-        options: dict[str, Any],
-        certificate: Certificate | None = None,
-    ) -> AssembledOperator:
-        """That of a shape."""
-        mask = None if shape.boundary is None else shape.boundary.mask
-        of_shape = shape.points, shape.frames, shape.normals, shape.normal_order, shape.areas, mask
-        return cls(rows, *of_shape, pair, faces, source, options, certificate)
-
-    def restored(self, numbering: Numbering) -> AssembledOperator:
-        """From a numbering to the user's; the matrices of the pair, the faces and the points have that already."""
-        names = "frames", "normals", "normal_order", "mass", "on_boundary"
-        tensors = {name: getattr(self, name) for name in names}
-        values = {name: numbering.restored(t) for name, t in tensors.items() if t is not None}
-        pair = self.pair
-        if pair is not None and pair.fits is not None:
-            pair = replace(pair, fits=pair.fits[:, numbering.here])
-        return replace(self, **values, rows=self.rows.restored(numbering), pair=pair)
 
 
 def build_cloud(
@@ -150,7 +107,7 @@ def build_cloud(
             built = _finished(shape, "points", options, REMEDY.format(d), progress)
         if options.condition == "dirichlet" and built.on_boundary is None:
             warn(NOWHERE)
-    return replace(built.restored(numbering), points=points)
+    return built.restored(numbering, points, built.faces)
 
 
 def settled_normals(
@@ -196,15 +153,40 @@ def _build_on_surface(
     shape = surface_shape(
         places, surface, options.q, boundary=where, fit_degrees=degrees, **settings
     )
-    pair, fits = None, shape.fits
-    if fits is not None:
-        pair = mesh_pair(places, surface.faces, fits, degree, surface.stars, numbering, shape.held)
+    pair = plan = None
+    if degree > 0:
+        held, fits = shape.held, shape.fits
+        assert fits is not None and shape.plan is not None
+        own = surface.faces, shape.plan.fits, fits, degree, degrees, surface.stars, held
+        plan, pair = mesh_pair(places, *own)
         assert pair.mass is not None
         shape = replace(shape, areas=pair.mass)
-        warn_of_doubts(surface, fits, pair.mass)
+        warn_of_doubts(surface, shape.plan.fits, pair.mass)
     warn_of_joins(surface, where)
-    built = _finished(shape, "points", options, REMEDY.format(2), settings["progress"], pair)
-    return replace(built, faces=numbering.given[surface.faces], surface=surface.summary)
+    built = _finished(shape, "points", options, REMEDY.format(2), settings["progress"], pair, plan)
+    faces = numbering.given[surface.faces]
+    built = replace(built, faces=faces, surface=surface.summary)
+    moved = (places != points).any(1).nonzero()[:, 0]
+    return _with_plan(built, shape, plan, options, numbering, torch.arange(len(faces)), moved)
+
+
+def _with_plan(
+    built: AssembledOperator,
+    shape: Shape,
+    pair: PairPlan | None,
+    options: Options,
+    numbering: Numbering,
+    order: Int[Tensor, " G"],
+    moved: Int[Tensor, " m"],
+) -> AssembledOperator:
+    """The same with its plan, where there is one: of a weak pair without a certificate."""
+    if pair is None or shape.plan is None or built.certificate is not None:
+        return built
+    assert isinstance(shape.low_order, MeshLowOrder)
+    rows = stencils_of(shape, options).plan(built.rows)
+    parts = numbering, shape.plan, rows, pair, shape.low_order.flips, built.faces, order
+    plan = Plan(*parts, shape.on_mesh, moved, built.source, options)
+    return replace(built, plan=plan)
 
 
 def numbered_mesh(
@@ -248,7 +230,7 @@ def build_mesh(
         )
     where = check_boundary(boundary, len(vertices))
     progress = progress and sys.stderr.isatty()
-    numbering, here, corners, _ = numbered_mesh(vertices, corners, flip=degree > 0)
+    numbering, here, corners, order = numbered_mesh(vertices, corners, flip=degree > 0)
     with renumbered(numbering.given), threads_for(len(vertices)):
         shape = mesh_shape(
             here,
@@ -262,16 +244,19 @@ def build_mesh(
         )
         if options.condition == "dirichlet" and shape.boundary is None:
             warn(NOWHERE)
-        pair = None
-        if shape.fits is not None:
-            pair = mesh_pair(
-                here, corners, shape.fits, degree, numbering=numbering, held=shape.held
-            )
+        pair = plan = None
+        if degree > 0:
+            assert shape.fits is not None and shape.plan is not None
+            own = shape.plan.fits, shape.fits, degree, degrees
+            plan, pair = mesh_pair(here, corners, *own, held=shape.held)
             assert pair.mass is not None
             shape = replace(shape, areas=pair.mass)
         remedy = "a finer mesh, or one without noise, has better ones"
-        built = _finished(shape, "mesh", options, remedy, progress, pair)
-    return replace(built.restored(numbering), points=vertices, faces=given)
+        built = _finished(shape, "mesh", options, remedy, progress, pair, plan)
+        built = replace(built, faces=given)
+        none = order.new_zeros(0)
+        built = _with_plan(built, shape, plan, options, numbering, order, none)
+    return built.restored(numbering, vertices, given)
 
 
 def build_cotangent(vertices: ArrayLike, faces: ArrayLike) -> AssembledOperator:
@@ -298,7 +283,7 @@ def build_cotangent(vertices: ArrayLike, faces: ArrayLike) -> AssembledOperator:
         share = torch.zeros_like(mass).index_add(0, rim.flatten(), length.repeat_interleave(2) / 2)
         weak.append(share[row] * diagonal)
     pair = WeakPair(SparsePair(rows.crow, rows.col, torch.stack(weak)))
-    return AssembledOperator.of(rows, shape, pair, corners, "cotangent", {})
+    return replace(AssembledOperator.of(rows, shape, pair, "cotangent", {}), faces=corners)
 
 
 def _warn_of_long_triangles(vertices: Float[Tensor, "N n"], faces: Int[Tensor, "F 3"]) -> None:
@@ -325,15 +310,10 @@ def _finished(
     remedy: str,
     progress: bool,
     pair: WeakPair | None = None,
+    plan: PairPlan | None = None,
 ) -> AssembledOperator:
     """Rows from the candidates, certified if asked for; a warning if at most of the points there are only low ones."""
-    stencils = Stencils(
-        shape,
-        options.order,
-        projection=options.projection,
-        weights=options.weights,
-        num_neighbors=options.num_neighbors,
-    )
+    stencils = stencils_of(shape, options)
     rows, certificate = assemble(stencils, progress=progress), None
     if options.certify:
         rows, mass, certificate = certify(
@@ -345,16 +325,15 @@ def _finished(
             progress=progress,
         )
         shape = replace(shape, areas=mass)
-    low = rows.order == 0
+    low, counts = rows.order == 0, None if plan is None else plan.counts
     share = float(low.double().mean())
     if share >= MANY:
         reason = Reason(int(rows.reason[low].mode().values)).text
         reason += f". {remedy[:1].upper()}{remedy[1:]}; `print(lb.report)` says more"
-        if pair is not None and pair.fits is not None:
-            _, _, edges, curved = pair.fits.sum(1).tolist()
+        if counts is not None:
+            _, _, edges, curved = counts.sum(1).tolist()
             share_curved = f"{curved / max(edges, 1):.0%} of its edges curved"
             reason += f". Spectrum, diffusion and solves have the weak pair, {share_curved}"
         low_rows = "have only low-order rows for Δf and ∇f, of first order at best"
         warn(f"{share:.0%} of the points {low_rows}; at most of them: {reason}")
-    faces = torch.zeros(0, shape.frames.shape[-1] + 1, dtype=torch.int64)
-    return AssembledOperator.of(rows, shape, pair, faces, source, asdict(options), certificate)
+    return AssembledOperator.of(rows, shape, pair, source, asdict(options), counts, certificate)

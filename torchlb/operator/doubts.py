@@ -9,9 +9,10 @@ from torch import Tensor
 from torchlb.errors import first_few, warn
 from torchlb.geometry.boundary import boundary_faces
 from torchlb.geometry.doubtful import spectral_change
+from torchlb.geometry.fit_search import REASONS
+from torchlb.geometry.local_fits import FitPlan
 from torchlb.geometry.places import in_words, places_of
 from torchlb.geometry.surface import CloudSurface
-from torchlb.geometry.vertex_fits import REASONS, VertexFits
 
 DOUBTFUL = 0.1
 """Share of the points that do not resolve the surface of a cloud, or of the area that those without a fit hold, from
@@ -26,11 +27,11 @@ ASTRAY = 0.02
 """Of the points of a declared boundary: how many may lie inside."""
 
 
-def warn_of_doubts(surface: CloudSurface, fits: VertexFits, mass: Float[Tensor, " N"]) -> None:
+def warn_of_doubts(surface: CloudSurface, plan: FitPlan, mass: Float[Tensor, " N"]) -> None:
     """Warnings that name points where a cloud does not resolve its surface, if they are many or hold much of it."""
     apart = ~torch.isin(torch.arange(len(surface.points)), surface.faces)
-    doubtful = (fits.surface.reason == REASONS.index("points do not resolve the surface")) | apart
-    flat = (fits.degree == 0) | apart
+    doubtful = (plan.reason == REASONS.index("points do not resolve the surface")) | apart
+    flat = (plan.degree == 0) | apart
     large = float(mass[flat].sum() / mass.sum()) >= DOUBTFUL
     doubtful |= flat & large
     most = NOISY if surface.summary.noise else DOUBTFUL

@@ -268,7 +268,7 @@ class LaplaceBeltrami(StencilFace, WeakFace):
             "normals": points[:0] if built.normals is None else built.normals,
             "faces": built.faces,
         }
-        fits = None if built.pair is None else built.pair.fits
+        fits = built.fit_counts
         fits = rows.length.new_zeros(4, len(points)) if fits is None else fits
         buffers |= {f"report_{name}": t for name, t in zip(FIT_FIELDS, fits, strict=True)}
         if built.pair is not None:
@@ -276,7 +276,7 @@ class LaplaceBeltrami(StencilFace, WeakFace):
         if built.on_boundary is not None and built.on_boundary.any():
             buffers["on_boundary"] = built.on_boundary
         lb = cls.from_buffers(buffers, {"source": built.source, "options": built.options})
-        lb.certificate, lb.surface = built.certificate, built.surface
+        lb.certificate, lb.surface, lb.plan = built.certificate, built.surface, built.plan
         if (
             built.certificate is not None or built.pair is not None
         ):  # else flows find them, if there are any

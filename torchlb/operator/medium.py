@@ -1,4 +1,4 @@
-"""The elements behind an operator's weak pair, made again when a conductivity asks for them."""
+"""The plan of an operator, and the elements of its weak pair: made again where they are not at hand."""
 
 from __future__ import annotations
 
@@ -7,50 +7,61 @@ from typing import Any
 from torch.utils.weak import WeakIdKeyDictionary
 
 from torchlb.errors import InputError
-from torchlb.galerkin.medium import Medium
-from torchlb.operator.build import numbered_mesh
+from torchlb.galerkin.forms import Forms
+from torchlb.operator.build import build_cloud, build_mesh
 from torchlb.operator.laplace_beltrami import LaplaceBeltrami
 from torchlb.operator.options import Options
-from torchlb.stencils.shape import mesh_shape
+from torchlb.operator.plan import Plan
 
-_MEDIA: Any = WeakIdKeyDictionary()
+_FORMS: Any = WeakIdKeyDictionary()
 
 
-def medium_of(lb: LaplaceBeltrami) -> Medium:
-    """The elements of a mesh's operator; made once, and kept as long as it.
+def plan_of(lb: LaplaceBeltrami) -> Plan:
+    """What is decided about an operator; copies and what comes from files decide anew.
 
     Raises
     ------
-    InputError : for clouds, batches, and operators without a weak pair.
+    InputError
+        For batches, the cotangent operator, and operators with a certificate or without a weak pair.
     """
-    if lb.values not in _MEDIA:
-        _MEDIA[lb.values] = _made(lb)
-    return _MEDIA[lb.values]
+    if lb.plan is None and lb.source in ("mesh", "points") and lb.has_weak_form:
+        points = lb.points.detach().cpu().double()
+        settings: Any = {"boundary": lb.boundary, "progress": False}
+        if lb.source == "mesh":
+            built = build_mesh(points, lb.faces.cpu(), Options(**lb.options), **settings)
+        else:
+            normals = lb.normals if len(lb.normals) else None
+            built = build_cloud(points, lb.dim, Options(**lb.options), normals=normals, **settings)
+        lb.plan = built.plan
+    if lb.plan is None:
+        raise InputError(
+            f"plan: an operator of kind {lb.source!r} has none, nor one with a certificate or without a weak pair; "
+            "LaplaceBeltrami.from_mesh and from_points build operators that have"
+        )
+    return lb.plan
 
 
-def _made(lb: LaplaceBeltrami) -> Medium:
-    if lb.source not in ("mesh", "cotangent") or not lb.has_weak_form:
-        remedy = {
-            "points": "build LaplaceBeltrami.from_mesh(lb.points, lb.faces) of the cloud's surface",
-            "batch": "solve shape by shape, lb.unbatch()",
-        }.get(lb.source, "build from a triangle mesh, with its weak pair")
-        raise InputError(f"conductivity: this operator has no elements; {remedy}")
-    points, given = lb.points.detach().cpu().double(), lb.faces.cpu()
-    if lb.source == "cotangent":
-        return Medium.linear(points, given)
-    options = Options(**lb.options)
-    degree, degrees = options.elements
-    numbering, points, faces, order = numbered_mesh(points, given, flip=True)
-    shape = mesh_shape(
-        points,
-        faces,
-        options.q,
-        num_neighbors=options.num_neighbors,
-        condition=None,
-        fit_degrees=degrees,
-        progress=False,
-    )
-    assert shape.fits is not None
-    held = None if lb.fixed is None else numbering.sorted(lb.fixed.cpu())
-    medium = Medium.curved(points, faces, shape.fits, degree, held)
-    return medium.restored(numbering, order, len(given))
+def forms_of(lb: LaplaceBeltrami) -> Forms:
+    """The elements of an operator; made once, and kept as long as it.
+
+    Raises
+    ------
+    InputError
+        For batches, and operators without a weak pair.
+    """
+    if lb.values not in _FORMS:
+        points = lb.points.detach().cpu().double()
+        if lb.source == "cotangent":
+            _FORMS[lb.values] = Forms.linear(points, lb.faces.cpu())
+        elif lb.source == "batch":
+            raise InputError(
+                "conductivity: a batch has no elements; solve shape by shape, lb.unbatch()"
+            )
+        elif not lb.has_weak_form:
+            raise InputError(
+                "conductivity: this operator has no elements; build it with its weak pair, of a mesh if there is none "
+                "of the points"
+            )
+        else:
+            _FORMS[lb.values] = plan_of(lb).forms(points)
+    return _FORMS[lb.values]

@@ -9,8 +9,8 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from torchlb.fits.rules import WEIGHT_RULES, reference
+from torchlb.geometry.fit_search import REASONS
 from torchlb.geometry.surface import SurfaceSummary
-from torchlb.geometry.vertex_fits import REASONS
 from torchlb.stencils.rows import Reason
 
 

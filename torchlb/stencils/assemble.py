@@ -17,9 +17,11 @@ from torch import Tensor
 from tqdm import tqdm
 
 from torchlb.errors import StencilError, first_few
+from torchlb.fits.polynomials import num_monomials
 from torchlb.fits.rules import WEIGHT_RULES
 from torchlb.fits.weights import MAX_RESIDUAL, Weights, least_squares_weights, positive_weights
 from torchlb.geometry.candidates import (
+    PIECE_BYTES,
     Candidate,
     Search,
     list_candidates,
@@ -30,7 +32,14 @@ from torchlb.geometry.neighbors import AT_ONCE
 from torchlb.geometry.vectors import at
 from torchlb.stencils.acceptance import WIDEST_AT_BOUNDARY, Acceptance
 from torchlb.stencils.low_order import MeshLowOrder
-from torchlb.stencils.rows import Reason, Rows, matrix_rows, stencil_rows, to_tangent_vectors
+from torchlb.stencils.rows import (
+    Reason,
+    Rows,
+    RowsPlan,
+    matrix_rows,
+    stencil_rows,
+    to_tangent_vectors,
+)
 from torchlb.stencils.shape import Shape
 
 RULES = list(WEIGHT_RULES)
@@ -71,6 +80,7 @@ class Stencils:
         """Rows of `centers`, each of the first candidate (from `start` on) that passes, else the low-order row."""
         blocks, taken = [], []
         reason = torch.full_like(centers, Reason.FEW)  # until something is tried
+        assert self.shape.balls is not None
         search = Search(self.shape.balls, centers, self.candidates, start)
         for number, tried, index in search:
             candidate = self.candidates[number]
@@ -113,25 +123,118 @@ class Stencils:
             return torch.zeros(len(index), dtype=torch.bool)
         return self.shape.boundary.mask[index].any(1)
 
+    def plan(self, rows: Rows) -> RowsPlan:
+        """What was decided about all rows."""
+        row = torch.arange(len(rows.length)).repeat_interleave(rows.length)
+        own = (rows.candidate == len(self.candidates)) & (rows.slope > 0)
+        slope = (rows.gradient != 0).any(1)
+        # Dirichlet's condition takes weights of Δ away, that of Neumann knows more than those of ∇.
+        weights = slope if self.shape.condition.share is None else rows.laplacian != 0
+        positive = rows.rule == RULES.index("positive")
+        used = (~positive[row] | weights) & (~own[row] | slope)
+        kinds = rows.candidate, rows.rule, rows.order, rows.slope, rows.reason
+        return RowsPlan(rows.length, rows.col.int(), *kinds, used)
+
+    def evaluated(self, plan: RowsPlan) -> Rows:
+        """The rows of all points that were decided for."""
+        every, blocks, taken = torch.arange(len(plan.length)), [], []
+        for number, candidate in enumerate(self.candidates):
+            rows = every[plan.candidate == number]
+            entry = 8 * candidate.size * num_monomials(self.shape.frames.shape[2], candidate.degree)
+            for centers in rows.split(max(64, PIECE_BYTES // entry)) if len(rows) else ():
+                places = plan.entries(centers)
+                own = plan.col[places] == centers[:, None]
+                places = places.gather(1, own.byte().argsort(dim=1, descending=True, stable=True))
+                index, used = plan.col[places].long(), plan.used[places][:, 1:]
+                with_data = self._holds_boundary(index) & (self.shape.condition.share is not None)
+                keep, slope = None if used.all() else used, plan.slope[centers]
+                weights = self._weights(centers, index, candidate, with_data, keep, slope)
+                gradient = self._tangent_vectors(centers, index, weights.gradient)
+                weights = replace(weights, gradient=gradient)
+                order = candidate.degree - 1
+                blocks.append(stencil_rows(index, weights, number, order, plan.rule[centers]))
+                taken.append(centers)
+        low = every[plan.candidate == len(self.candidates)]
+        if len(low):
+            blocks.append(self._low_order_again(low, plan))
+            taken.append(low)
+        rows = Rows.stack(blocks)[torch.cat(taken).argsort()]
+        if self.shape.boundary is not None:
+            finish = self.shape.condition.finish
+            rows = finish(self.shape.points, self.shape.boundary, every, rows)
+        rows = rows.on_pattern(plan) if len(low) else rows
+        return replace(rows, reason=plan.reason)
+
+    def _low_order_again(self, centers: Int[Tensor, " B"], plan: RowsPlan) -> Rows:
+        """Low-order rows, with the gradients that were decided for."""
+        assert self.shape.low_order is not None
+        matrix = self.shape.low_order.rows(centers)
+        rows = matrix_rows(matrix, self.shape.points, self.shape.frames, centers)
+        length = plan.length[centers]
+        start = (plan.length.cumsum(0) - plan.length)[centers]
+        row = torch.arange(len(centers)).repeat_interleave(length)
+        entry = start[row] + torch.arange(len(row)) - (length.cumsum(0) - length)[row]
+        entry, row = entry[plan.used[entry]], row[plan.used[entry]]
+        size, slope = torch.bincount(row, minlength=len(centers)), plan.slope[centers]
+        found = []
+        for degree, count in torch.stack([slope, size], 1)[slope > 0].unique(dim=0).tolist():
+            local = ((slope == degree) & (size == count)).nonzero()[:, 0]
+            index = plan.col[entry[torch.isin(row, local)]].long().view(-1, count)
+            own = index == centers[local, None]
+            index = index.gather(1, own.byte().argsort(dim=1, descending=True, stable=True))
+            weights = self._free_weights(centers[local], index, Candidate(degree, count, RULES[0]))
+            gradient = self._tangent_vectors(centers[local], index, weights.gradient)
+            found.append((local.repeat_interleave(count), index.flatten(), gradient.flatten(0, 1)))
+        if found:
+            rows = rows.with_gradient(*(torch.cat(parts) for parts in zip(*found, strict=True)))
+        return replace(rows, candidate=plan.candidate[centers], slope=slope)
+
     def _weights(
-        self, centers: Tensor, index: Tensor, candidate: Candidate, with_data: Bool[Tensor, " B"]
+        self,
+        centers: Tensor,
+        index: Tensor,
+        candidate: Candidate,
+        with_data: Bool[Tensor, " B"],
+        keep: Bool[Tensor, "B neighbors"] | None = None,
+        slope: Int[Tensor, " B"] | None = None,
     ) -> Weights:
-        """Weights of a batch, with the data of the boundary where `with_data` says so."""
+        """Weights of a batch, with the data of the boundary where `with_data` says so.
+
+        Where they were decided for, positive ones are of the neighbours `keep`, and gradients beside data of the degree
+        `slope`.
+        """
         parts, order = [], []
         for data, rows in ((False, ~with_data), (True, with_data)):
             if rows.any():
+                options = [None if x is None else x[rows] for x in (keep, slope)]
                 fit = self._weights_with_data if data else self._free_weights
-                parts.append(fit(centers[rows], index[rows], candidate))
+                parts.append(fit(centers[rows], index[rows], candidate, *options))
                 order.append(rows.nonzero()[:, 0])
         return Weights.stack(parts)[torch.cat(order).argsort()] if len(parts) > 1 else parts[0]
 
-    def _free_weights(self, centers: Tensor, index: Tensor, candidate: Candidate) -> Weights:
+    def _free_weights(
+        self,
+        centers: Tensor,
+        index: Tensor,
+        candidate: Candidate,
+        keep: Bool[Tensor, "B neighbors"] | None = None,
+        slope: Int[Tensor, " B"] | None = None,
+    ) -> Weights:
         points, frames = self.shape.points, self.shape.frames
         coords = local_offsets(points, frames, centers, index[:, 1:], self.projection)
         heights = self._heights(centers, index, coords)
+        if keep is not None:
+            return least_squares_weights(coords, candidate.degree, keep, heights=heights)
         return WEIGHT_RULES[candidate.rule](coords, candidate.degree, heights=heights)
 
-    def _weights_with_data(self, centers: Tensor, index: Tensor, candidate: Candidate) -> Weights:
+    def _weights_with_data(
+        self,
+        centers: Tensor,
+        index: Tensor,
+        candidate: Candidate,
+        keep: Bool[Tensor, "B neighbors"] | None = None,
+        slope: Int[Tensor, " B"] | None = None,
+    ) -> Weights:
         """Δ by a fit that uses the condition; first derivatives by one that does not, to serve any f.
 
         By straight projection, where the derivative along a conormal is its component in the plane. Splines have no
@@ -144,18 +247,25 @@ class Stencils:
         assert share is not None
         coords = local_offsets(points, frames, centers, index[:, 1:], "tangent")
         flux = boundary.conormals[index] @ frames[centers]
-        rule = positive_weights if candidate.rule == "positive" else least_squares_weights
-        weights = rule(coords, degree, flux=flux, share=share)
+        if candidate.rule == "positive" and keep is None:
+            weights = positive_weights(coords, degree, flux=flux, share=share)
+        else:
+            weights = least_squares_weights(coords, degree, keep, flux, share)
         heights = self._heights(centers, index, coords)
         free = part = least_squares_weights(coords, degree, heights=heights)
         gradient, left = free.gradient.clone(), torch.arange(len(centers))
+        settled = torch.zeros_like(left) if slope is None else slope
         for lower in range(degree - 1, 0, -1):
-            left = left[~_good_slope(part)]
-            if len(left) == 0:
-                break
-            part = least_squares_weights(coords[left], lower)
-            gradient[left] = part.gradient
-        return replace(weights, gradient=gradient, height_residual=free.height_residual)
+            if slope is None and len(left):
+                left = left[~_good_slope(part)]
+                settled[left] = lower
+            elif slope is not None:
+                left = (slope == lower).nonzero()[:, 0]
+            if len(left):
+                part = least_squares_weights(coords[left], lower)
+                gradient[left] = part.gradient
+        found = {"gradient": gradient, "slope": settled}
+        return replace(weights, height_residual=free.height_residual, **found)
 
     def _heights(self, centers: Tensor, index: Tensor, coords: Tensor) -> Float[Tensor, "B K n"]:
         """What a polynomial must follow: heights over the points of the plane that the coordinates name, on a mesh.
@@ -195,16 +305,18 @@ class Stencils:
         found = list(self._gradients(centers[fitted]))
         if not found:
             return rows
-        local = [fitted[row].repeat_interleave(index.shape[1]) for row, index, _ in found]
+        for row, _, _, degree in found:
+            rows.slope[fitted[row]] = degree
+        local = [fitted[row].repeat_interleave(index.shape[1]) for row, index, *_ in found]
         index, gradient = (torch.cat([f[i].flatten(0, 1) for f in found]) for i in (1, 2))
         return rows.with_gradient(torch.cat(local), index, gradient)
 
     def _gradients(
         self, centers: Int[Tensor, " B"]
-    ) -> Iterator[tuple[Int[Tensor, " b"], Int[Tensor, "b K"], Float[Tensor, "b K d"]]]:
+    ) -> Iterator[tuple[Int[Tensor, " b"], Int[Tensor, "b K"], Float[Tensor, "b K d"], int]]:
         """First derivatives where only Δ has no good stencil, as at a boundary: of the highest degree that has.
 
-        Batches of (places in `centers`, points, weights). Of degree 1 those of the low-order row are as good.
+        Batches of (places in `centers`, points, weights, degree). Of degree 1 those of the low-order row are as good.
         """
         dim = self.shape.frames.shape[-1]
         degrees = range(self.order + 1, 1, -1)
@@ -213,6 +325,7 @@ class Stencils:
             for c in list_candidates(dim, degrees, num_neighbors=self.num_neighbors)
             if c.factor <= WIDEST_AT_BOUNDARY
         ]
+        assert self.shape.balls is not None
         search = Search(self.shape.balls, centers, candidates)
         for number, tried, index in search:
             weights = self._free_weights(centers[tried], index, candidates[number])
@@ -220,7 +333,8 @@ class Stencils:
             search.settle(tried[passed])
             if passed.any():
                 tried, index, gradient = tried[passed], index[passed], weights.gradient[passed]
-                yield tried, index, self._tangent_vectors(centers[tried], index, gradient)
+                gradient = self._tangent_vectors(centers[tried], index, gradient)
+                yield tried, index, gradient, candidates[number].degree
 
 
 def _good_slope(weights: Weights) -> Bool[Tensor, " B"]:

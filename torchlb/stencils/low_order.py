@@ -1,8 +1,7 @@
 """Low-order rows, for points where no stencil passes: positive weights, stable, and first order at best.
 
-On triangles, those of a mesh or of the surface through a cloud, they are robust_laplacian's, on the segments of a curve
-those of linear elements. Elsewhere they are finite volumes of the Voronoi cell in the tangent plane, built from
-admissible neighbours alone.
+On the simplices of a mesh, or of the surface through a cloud, they are those of linear elements. Elsewhere they are
+finite volumes of the Voronoi cell in the tangent plane, built from admissible neighbours alone.
 """
 
 from __future__ import annotations
@@ -15,9 +14,11 @@ import torch
 from jaxtyping import Bool, Float, Int
 from scipy import sparse
 from torch import Tensor
-from torch.nn.functional import pad
 
-from torchlb.baseline.robust import LEAST_AREA, robust_rows
+from torchlb.errors import first_few, warn
+from torchlb.galerkin.assembly import linear_elements
+from torchlb.galerkin.delaunay import delaunay_cover, mollified
+from torchlb.galerkin.nodes import lagrange_nodes
 from torchlb.geometry.boundary import Boundary
 from torchlb.geometry.neighbors import GraphBalls, nearest_neighbors
 from torchlb.geometry.voronoi import (
@@ -26,6 +27,10 @@ from torchlb.geometry.voronoi import (
     rows_at_once,
     unrolled,
 )
+from torchlb.linalg.sparse import with_diagonal
+
+LEAST_AREA = 1e-12
+"""Of the mean: what the mass of a vertex has at least."""
 
 
 def simplex_shares(
@@ -44,11 +49,70 @@ def simplex_shares(
     return torch.zeros_like(vertices[:, 0]).index_add_(0, faces.reshape(-1), share)
 
 
-class CurveLowOrder:
-    """Linear elements on the segments of a curve with lumped mass; where several meet, what flows in flows out."""
+class MeshLowOrder:
+    """Linear elements with lumped mass: on triangles those of the intrinsic Delaunay triangulation (`delaunay_cover`).
 
-    def __init__(self, vertices: Float[Tensor, "N n"], segments: Int[Tensor, "F 2"]) -> None:
-        self.vertices, self.segments = vertices, segments
+    Negative weights, which tetrahedra may have, are left out, so that rows are those of an M-matrix; where several
+    segments meet, what flows in flows out.
+
+    Parameters
+    ----------
+    points, cells
+        (N, n), ℓ; (F, d + 1).
+    flips
+        Those that lead to the triangulation, `flips` of the same shape before it moved; None to look for them.
+    """
+
+    def __init__(
+        self,
+        points: Float[Tensor, "N n"],
+        cells: Int[Tensor, "F corners"],
+        flips: list[Int[Tensor, " C"]] | None = None,
+    ) -> None:
+        self.points, self.cells, self._flips = points, cells, flips
+
+    @property
+    def flips(self) -> list[Int[Tensor, " C"]]:
+        """The flips of edges that lead to the triangulation; none where it was not needed, or is not of triangles."""
+        return self._elements[2] if "_elements" in vars(self) else []
+
+    @cached_property
+    def _elements(self) -> tuple[sparse.csr_array, Float[Tensor, " N"], list[Int[Tensor, " C"]]]:
+        """Stiffness, lumped mass, and flips."""
+        nodes, flips, share = lagrange_nodes(self.cells, len(self.points), 1), [], 1.0
+        cells, lengths = nodes.cells, nodes.lengths(self.points)
+        if nodes.dim == 2:
+            free = torch.zeros(len(nodes.edges), dtype=torch.bool)
+            lengths = mollified(lengths, cells)
+            cover = delaunay_cover(cells, lengths, nodes.edge, free, self._flips)
+            cells, lengths, flips, share = cover.faces, cover.lengths, cover.flips, 0.5
+        pair = share * linear_elements(lengths, cells, len(self.points))
+        return pair.real, torch.from_numpy(pair.imag.sum(axis=1)), flips
+
+    def areas(self) -> Float[Tensor, " N"]:
+        """Equal shares of the cells around each vertex, ℓ^d; those of the triangulation where some have next to none."""
+        shares = simplex_shares(self.points, self.cells)
+        longest = torch.zeros_like(shares)
+        square = (
+            lagrange_nodes(self.cells, len(self.points), 1).lengths(self.points).amax(1).square()
+        )
+        corner = self.cells.flatten(), square.repeat_interleave(self.cells.shape[1])
+        longest.scatter_reduce_(0, *corner, "amax")
+        sound = self.cells.shape[1] != 3 or (shares > LEAST_AREA * longest).all()
+        return shares if sound else self._masses
+
+    @cached_property
+    def _masses(self) -> Float[Tensor, " N"]:
+        """Lumped masses of the triangulation, none of them zero."""
+        mass = self._elements[1]
+        least = LEAST_AREA * mass.mean()
+        tiny = (mass < least).nonzero()[:, 0]
+        if len(tiny):
+            warn(
+                f"{len(tiny)} points ({first_few(tiny)}) have next to no area, their triangles are degenerate; "
+                f"{LEAST_AREA:g} of the mean is taken, so that rows stay finite"
+            )
+        return mass.clamp_min(least)
 
     def rows(self, centers: Int[Tensor, " B"]) -> sparse.csr_array:
         """Rows (B, N) of Δ, 1/ℓ²."""
@@ -56,43 +120,12 @@ class CurveLowOrder:
 
     @cached_property
     def _matrix(self) -> sparse.csr_array:
-        i, j = self.segments.T.numpy()
-        length = (self.vertices[self.segments[:, 1]] - self.vertices[self.segments[:, 0]]).norm(
-            dim=1
-        )
-        count = len(self.vertices)
-        weights = sparse.csr_array((1 / length.numpy(), (i, j)), shape=(count, count))
-        weights = sparse.csr_array(weights + weights.T)
-        strong = weights - sparse.diags_array(weights.sum(axis=1))
-        half = simplex_shares(self.vertices, self.segments).numpy()
-        return sparse.csr_array(sparse.diags_array(1 / half) @ strong)
-
-
-class MeshLowOrder:
-    """Rows and areas of robust_laplacian on a triangle mesh."""
-
-    def __init__(self, vertices: Float[Tensor, "N n"], faces: Int[Tensor, "F 3"]) -> None:
-        self.vertices, self.faces = vertices, faces
-
-    @cached_property
-    def _robust(self) -> tuple[sparse.csr_array, Float[Tensor, " N"]]:
-        return robust_rows(self.vertices, self.faces)
-
-    def areas(self) -> Float[Tensor, " N"]:
-        """A third of the triangles around each vertex, ℓ²; robust_laplacian's where some have next to none."""
-        corners = pad(self.vertices, (0, 3 - self.vertices.shape[1]))[self.faces]
-        sides = corners - corners.roll(1, 1)
-        area = torch.linalg.cross(sides[:, 0], sides[:, 1]).norm(dim=1) / 2
-        thirds, longest = torch.zeros(2, len(self.vertices), dtype=self.vertices.dtype)
-        flat = self.faces.reshape(-1)
-        thirds.index_add_(0, flat, (area / 3).repeat_interleave(3))
-        square = sides.square().sum(2).amax(1)
-        longest.scatter_reduce_(0, flat, square.repeat_interleave(3), "amax")
-        return thirds if (thirds > LEAST_AREA * longest).all() else self._robust[1]
-
-    def rows(self, centers: Int[Tensor, " B"]) -> sparse.csr_array:
-        """Rows (B, N) of Δ, 1/ℓ²."""
-        return sparse.csr_array(self._robust[0][centers.numpy()])
+        off = sparse.coo_array(-self._elements[0])
+        row, col = off.coords
+        keep = (row != col) & (off.data > 0)
+        weights = sparse.csr_array((off.data[keep], (row[keep], col[keep])), shape=off.shape)
+        strong = with_diagonal(sparse.csr_array(weights - sparse.diags_array(weights.sum(axis=1))))
+        return sparse.csr_array(sparse.diags_array(1 / self._masses.numpy()) @ strong)
 
 
 class CloudLowOrder:

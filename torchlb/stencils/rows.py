@@ -5,11 +5,9 @@ from __future__ import annotations
 from collections.abc import Iterable
 from dataclasses import dataclass, fields, replace
 from enum import IntEnum
-from typing import Any
 
-import numpy as np
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from scipy import sparse
 from torch import Tensor
 
@@ -59,6 +57,7 @@ class Rows:
     growth : (B,), ρ² Σ|w|, the factor of the a-priori error bound.
     condition : (B,), of the scaled weighted Vandermonde matrix.
     off_diagonal_ratio : (B,), Σ_{j≠i}|w_ij| / |w_ii|; 1 for an M-matrix row.
+    slope : (B,), degree of the fit of the gradient where that is another one, else 0.
     reason : (B,), a `Reason`.
     """
 
@@ -72,6 +71,7 @@ class Rows:
     growth: Float[Tensor, " B"]
     condition: Float[Tensor, " B"]
     off_diagonal_ratio: Float[Tensor, " B"]
+    slope: Int[Tensor, " B"]
     reason: Int[Tensor, " B"]
 
     @property
@@ -108,24 +108,63 @@ class Rows:
 
     def restored(self, numbering: Numbering) -> Rows:
         """All rows, with the user's numbers."""
-        count, given = len(self.length), numbering.given.int().numpy()
-        number = np.arange(len(self.col), dtype=np.int32)
-        parts = number, given[self.col.numpy()], self.crow.numpy()
-        turned: Any = sparse.csr_array(sparse.csr_array(parts, shape=(count, count)).T)
-        turned.indices = given[turned.indices]
-        whole: Any = sparse.csr_array(turned.T)  # sorted as it comes
-        entry = torch.from_numpy(whole.data)
+        _, col, entry = numbering.restored_pattern(self.crow, self.col)
         values = {
             f.name: getattr(self, f.name)[entry if f.name in ENTRIES else numbering.here]
             for f in fields(Rows)
         }
-        return Rows(**values | {"col": torch.from_numpy(whole.indices).long()})
+        return Rows(**values | {"col": col})
+
+    def on_pattern(self, other: Rows | RowsPlan) -> Rows:
+        """The same on the pattern of as many others; what is not there goes to the diagonal."""
+        span = int(max(self.col.max(), other.col.max())) + 1
+        ours, theirs = (
+            torch.arange(len(rows.length)).repeat_interleave(rows.length) * span + rows.col
+            for rows in (self, other)
+        )
+        place = torch.searchsorted(theirs, ours).clamp_max(len(theirs) - 1)
+        there = theirs[place] == ours
+        values = torch.cat([self.laplacian[:, None], self.gradient], 1)
+        found = values.new_zeros(len(theirs), values.shape[1])
+        found.index_add_(0, place[there], values[there])
+        diagonal = theirs // span == theirs % span
+        lost = values.new_zeros(len(self.length), values.shape[1])
+        lost.index_add_(0, ours[~there] // span, values[~there])
+        found[diagonal] += lost[theirs[diagonal] // span]
+        entries = {"laplacian": found[:, 0], "gradient": found[:, 1:]}
+        return replace(self, length=other.length, col=other.col.long(), **entries)
 
     @staticmethod
     def stack(blocks: Iterable[Rows]) -> Rows:
         """Blocks of rows one after the other."""
         blocks = list(blocks)
         return Rows(*(torch.cat([getattr(b, f.name) for b in blocks]) for f in fields(Rows)))
+
+
+@dataclass(frozen=True)
+class RowsPlan:
+    """What is decided about rows; attributes are those of `Rows`.
+
+    Attributes
+    ----------
+    used
+        (nnz,), which entries have weights: of positive weights those that are not zero, of low-order rows with another
+        fit for the gradient those of that.
+    """
+
+    length: Int[Tensor, " B"]
+    col: Int[Tensor, " nnz"]
+    candidate: Int[Tensor, " B"]
+    rule: Int[Tensor, " B"]
+    order: Int[Tensor, " B"]
+    slope: Int[Tensor, " B"]
+    reason: Int[Tensor, " B"]
+    used: Bool[Tensor, " nnz"]
+
+    def entries(self, rows: Int[Tensor, " b"]) -> Int[Tensor, "b K"]:
+        """Places of the entries of rows of one length."""
+        start = (self.length.cumsum(0) - self.length)[rows]
+        return start[:, None] + torch.arange(int(self.length[rows[0]]))
 
 
 ENTRIES = {"col", "laplacian", "gradient"}
@@ -177,6 +216,7 @@ def stencil_rows(
         growth=weights.radius.square() * total,
         condition=weights.condition,
         off_diagonal_ratio=(total - center) / center,
+        slope=weights.slope,
         reason=torch.zeros(batch, dtype=torch.int64),
     )
 
@@ -224,5 +264,6 @@ def matrix_rows(
         growth=radius.square() * total,
         condition=torch.full_like(total, torch.nan),
         off_diagonal_ratio=(total - center) / center,
+        slope=torch.zeros_like(length),
         reason=torch.zeros_like(length),
     )

@@ -11,16 +11,22 @@ from torch import Tensor
 from tqdm import tqdm
 
 from torchlb.errors import InputError, first_few, warn
-from torchlb.geometry.boundary import Boundary, boundary_of_cloud, boundary_of_mesh, detect_boundary
-from torchlb.geometry.candidates import list_candidates
+from torchlb.geometry.boundary import (
+    Boundary,
+    BoundaryPlan,
+    boundary_of_cloud,
+    boundary_of_mesh,
+    detect_boundary,
+)
+from torchlb.geometry.fit_search import FitSearch
 from torchlb.geometry.frames import (
     cloud_frames,
     complete_frames,
     mesh_frames,
     normals_of_frames,
-    refine_frames,
     vertex_normals,
 )
+from torchlb.geometry.local_fits import FitPlan, LocalFits
 from torchlb.geometry.neighbors import (
     AT_ONCE,
     GraphBalls,
@@ -30,51 +36,103 @@ from torchlb.geometry.neighbors import (
 )
 from torchlb.geometry.orientation import consistently_wound, orient_normals, thin_sides
 from torchlb.geometry.surface import CloudSurface
-from torchlb.geometry.vertex_fits import VertexFits
 from torchlb.stencils.conditions import Condition, Neumann
-from torchlb.stencils.low_order import (
-    CloudLowOrder,
-    CurveLowOrder,
-    MeshLowOrder,
-    simplex_shares,
-)
+from torchlb.stencils.low_order import CloudLowOrder, MeshLowOrder
 
-LowOrder = CloudLowOrder | CurveLowOrder | MeshLowOrder
+LowOrder = CloudLowOrder | MeshLowOrder
 NEUMANN = Neumann()
 CANDIDATES = {1: 32, 2: 24, 3: 64}
 """Nearest points from which the frames and the graph of a cloud start, by dimension."""
 
 
 @dataclass(frozen=True)
-class Shape:
-    """A shape ready for stencils.
+class ShapePlan:
+    """What is decided about a shape of simplices.
 
     Attributes
     ----------
-    points : (N, n), ℓ, float64.
-    frames : (N, n, d), orthonormal; [frames, normal] is right-handed where there is a normal.
-    normals : (N, n) unit normals of a hypersurface, else None. Oriented by the faces, or consistently on a cloud.
-    normal_order : (N,), the degree q of the fit behind each frame; 0 for a frame that stayed the initial one.
-    balls : its neighbourhoods.
-    areas : (N,), ℓ^d, positive: a first-order share of the area.
-    low_order : M-matrix rows for points without a stencil; None if there are none to be had.
-    boundary : its points and conormals; None for a closed shape, or where no condition holds.
-    condition : what holds there.
-    on_mesh : whether the triangles are given, and know the surface where points do not resolve it.
-    fits : of functions at each vertex, where a weak pair is to be made from them.
+    cells
+        (F, d + 1), whose planes the frames start from.
+    fits
+        Of heights, and of functions where there is to be a weak pair.
+    side
+        (N,), ±1: on which side of the normal of the cells around a vertex its own is; None for shapes without sides.
+    boundary
+        None for a closed shape, or where no condition holds.
+    """
+
+    cells: Int[Tensor, "F corners"]
+    fits: FitPlan
+    side: Int[Tensor, " N"] | None
+    boundary: BoundaryPlan | None
+
+    def at(self, points: Float[Tensor, "N n"]) -> tuple[Placed, LocalFits]:
+        """Frames, normals and boundary at these points, and the fits behind them."""
+        fits = LocalFits.at(self.fits, points, mesh_frames(points, self.cells))
+        return self.placed(fits), fits
+
+    def placed(self, fits: LocalFits) -> Placed:
+        """The same from fits that are there."""
+        frames, normals = _righthanded(fits.frames, None)
+        if self.side is not None:
+            reference = self.side[:, None] * vertex_normals(fits.points, self.cells)
+            frames, normals = _righthanded(fits.frames, reference)
+        boundary = None if self.boundary is None else self.boundary.at(fits.points, frames)
+        return Placed(fits.points, frames, normals, boundary)
+
+
+@dataclass(frozen=True)
+class Placed:
+    """Where a shape is.
+
+    Attributes
+    ----------
+    points
+        (N, n), ℓ, float64.
+    frames
+        (N, n, d), orthonormal; [frames, normal] is right-handed where there is a normal.
+    normals
+        (N, n) unit normals of a hypersurface, else None. Oriented by the cells, or consistently on a cloud.
+    boundary
+        Its points and conormals; None for a closed shape, or where no condition holds.
     """
 
     points: Float[Tensor, "N n"]
     frames: Float[Tensor, "N n d"]
     normals: Float[Tensor, "N n"] | None
+    boundary: Boundary | None
+
+
+@dataclass(frozen=True)
+class Shape(Placed):
+    """A shape ready for stencils.
+
+    Attributes
+    ----------
+    normal_order
+        (N,), the degree q of the fit behind each frame; 0 for a frame that stayed the initial one.
+    balls
+        Its neighbourhoods; None where all is decided.
+    areas
+        (N,), ℓ^d, positive: a first-order share of the area.
+    low_order
+        M-matrix rows for points without a stencil; None if there are none to be had.
+    condition
+        What holds at the boundary.
+    on_mesh
+        Whether the triangles are given, and know the surface where points do not resolve it.
+    plan, fits
+        What is decided, and the fits that follow from it; None for a cloud without simplices.
+    """
+
     normal_order: Int[Tensor, " N"]
-    balls: GraphBalls
+    balls: GraphBalls | None
     areas: Float[Tensor, " N"]
     low_order: LowOrder | None
-    boundary: Boundary | None
     condition: Condition
     on_mesh: bool = False
-    fits: VertexFits | None = None
+    plan: ShapePlan | None = None
+    fits: LocalFits | None = None
 
     @property
     def held(self) -> Bool[Tensor, " N"] | None:
@@ -105,16 +163,28 @@ def cloud_shape(
         oriented = orient_normals(points, normals_of_frames(initial), candidates)
         normals = oriented if normals is None else normals
         sides = thin_sides(points, oriented, candidates)
-    balls, order, _ = _refined(
-        GraphBalls(points, graph, initial, sides), normal_order, num_neighbors, progress
-    )
-    frames = balls.frames
-    mask = detect_boundary(points, frames, balls) if isinstance(boundary, str) else boundary
+    balls = GraphBalls(points, graph, initial, sides)
+    plan, fits = _searched(balls, normal_order, num_neighbors, progress)
+    mask = detect_boundary(points, fits.frames, balls) if isinstance(boundary, str) else boundary
     if mask is None and dim == 2:
-        _warn_of_open_surface(detect_boundary(points, frames, balls))
-    edge = None if mask is None else boundary_of_cloud(points, mask, frames, normal_order)
+        _warn_of_open_surface(detect_boundary(points, fits.frames, balls))
+    edge = None
+    if mask is not None and condition is not None:
+        edge = boundary_of_cloud(points, mask, dim, normal_order)
+    frames, normals = _righthanded(fits.frames, normals)
+    edge = None if edge is None else edge.at(points, frames)
+    placed = Placed(points, frames, normals, edge)
+    balls = balls.with_frames(frames, _follow(balls.sides, frames))
     low_order = CloudLowOrder(balls, edge)
-    return _oriented(balls, normals, order, low_order.areas(), low_order, edge, condition)
+    own = Condition() if condition is None else condition
+    return Shape(
+        **vars(placed),
+        normal_order=plan.order,
+        balls=balls,
+        areas=low_order.areas(),
+        low_order=low_order,
+        condition=own,
+    )
 
 
 def _warn_of_open_surface(rim: Bool[Tensor, " N"]) -> None:
@@ -143,33 +213,25 @@ def mesh_shape(
     `condition` holds on its boundary, or on the part of it that is the mask `boundary`; None leaves it alone. With
     `areas` given there are no low-order rows. `fit_degrees` asks for `fits` of the first of them that passes.
     """
-    initial = mesh_frames(vertices, faces)
-    graph = mesh_graph(faces, len(vertices))
-    reference = sides = None
-    if faces.shape[1] == vertices.shape[1] and faces.shape[1] < 4:
-        reference = vertex_normals(vertices, faces)
-        if areas is None and consistently_wound(faces):
-            candidates = nearest_neighbors(vertices, min(CANDIDATES[2], len(vertices)))
-            sides = thin_sides(vertices, reference, candidates)
-    start = GraphBalls(vertices, graph, initial, sides)
-    balls, order, fits = _refined(start, normal_order, num_neighbors, progress, fit_degrees)
+    sides = None
+    hypersurface = faces.shape[1] == vertices.shape[1] and faces.shape[1] < 4
+    if hypersurface and areas is None and consistently_wound(faces):
+        candidates = nearest_neighbors(vertices, min(CANDIDATES[2], len(vertices)))
+        sides = thin_sides(vertices, vertex_normals(vertices, faces), candidates)
+    balls = GraphBalls(
+        vertices, mesh_graph(faces, len(vertices)), mesh_frames(vertices, faces), sides
+    )
+    plan, fits = _searched(balls, normal_order, num_neighbors, progress, fit_degrees)
     edge = None
     if condition is not None or boundary is not None:
-        edge = boundary_of_mesh(vertices, faces, balls.frames, normal_order)
+        edge = boundary_of_mesh(vertices, faces, normal_order)
     if boundary is not None:
         edge = _part(edge, boundary)
-    low_order = None
-    if areas is None:
-        if faces.shape[1] == 2:
-            low_order = CurveLowOrder(vertices, faces)
-        elif faces.shape[1] == 3 and vertices.shape[1] <= 3:
-            low_order = MeshLowOrder(vertices, faces)
-        else:
-            low_order = CloudLowOrder(balls, edge)
-        of_mesh = isinstance(low_order, MeshLowOrder)
-        areas = low_order.areas() if of_mesh else simplex_shares(vertices, faces)
-    shape = _oriented(balls, reference, order, areas, low_order, edge, condition)
-    return replace(shape, on_mesh=isinstance(low_order, MeshLowOrder), fits=fits)
+    low_order = None if areas is not None else MeshLowOrder(vertices, faces)
+    side = torch.ones(len(vertices), dtype=torch.int8) if hypersurface else None
+    whole = ShapePlan(faces, plan, side, None if condition is None else edge)
+    shares = areas if low_order is None else low_order.areas()
+    return _shape(whole, fits, balls, shares, low_order, condition, on_mesh=faces.shape[1] == 3)
 
 
 def surface_shape(
@@ -191,30 +253,59 @@ def surface_shape(
     """
     flat = points.shape[1] == 2
     triangles = torch.cat([surface.faces, surface.stars])
-    initial = mesh_frames(points, triangles) if flat else surface.frames
     sides = None if flat else thin_sides(points, surface.normals, surface.neighbors)
     graph = mesh_graph(triangles, len(points))
     if surface.lone.any():
         others = sparse.diags_array((~surface.lone).numpy().astype(graph.dtype))
         graph = sparse.csr_array(others @ graph @ others)
         graph.eliminate_zeros()
-    start = GraphBalls(points, graph, initial, sides)
-    balls, order, fits = _refined(start, normal_order, num_neighbors, progress, fit_degrees)
+    balls = GraphBalls(points, graph, mesh_frames(points, triangles), sides)
+    plan, fits = _searched(balls, normal_order, num_neighbors, progress, fit_degrees)
     edge = None
     if condition is not None:
-        edge = boundary_of_mesh(points, surface.faces, balls.frames, normal_order)
+        edge = boundary_of_mesh(points, surface.faces, normal_order)
         if edge is not None and len(surface.stars):
             edge = _part(edge, edge.mask & ~torch.isin(torch.arange(len(points)), surface.stars))
         found = torch.zeros(len(points), dtype=torch.bool) if edge is None else edge.mask
         if boundary is not None and not torch.equal(boundary, found):
-            edge = boundary_of_cloud(points, boundary, balls.frames, normal_order)
+            edge = boundary_of_cloud(points, boundary, 2, normal_order)
+    side = None
+    if not flat:
+        reference = surface.normals if normals is None else normals
+        _, own = _righthanded(fits.frames, reference)
+        assert own is not None
+        against = (own * vertex_normals(points, triangles)).sum(1) < 0
+        side = torch.where(against, -1, 1).to(torch.int8)
     low_order = MeshLowOrder(points, triangles)
-    reference = None if flat else surface.normals if normals is None else normals
-    shape = _oriented(balls, reference, order, low_order.areas(), low_order, edge, condition)
-    return replace(shape, fits=fits)
+    whole = ShapePlan(triangles, plan, side, edge)
+    return _shape(whole, fits, balls, low_order.areas(), low_order, condition)
 
 
-def _part(boundary: Boundary | None, mask: Bool[Tensor, " N"]) -> Boundary | None:
+def _shape(
+    plan: ShapePlan,
+    fits: LocalFits,
+    balls: GraphBalls,
+    areas: Float[Tensor, " N"],
+    low_order: LowOrder | None,
+    condition: Condition | None,
+    on_mesh: bool = False,
+) -> Shape:
+    """What follows from a plan where it was made, with what is needed to look for stencils."""
+    placed = plan.placed(fits)
+    return Shape(
+        **vars(placed),
+        normal_order=plan.fits.order,
+        balls=balls.with_frames(placed.frames, _follow(balls.sides, placed.frames)),
+        areas=areas,
+        low_order=low_order,
+        condition=Condition() if condition is None else condition,
+        on_mesh=on_mesh,
+        plan=plan,
+        fits=fits,
+    )
+
+
+def _part(boundary: BoundaryPlan | None, mask: Bool[Tensor, " N"]) -> BoundaryPlan | None:
     """The boundary of a mesh where the mask is set; InputError if points of it lie inside."""
     astray = (mask if boundary is None else mask & ~boundary.mask).nonzero()[:, 0]
     if len(astray):
@@ -222,9 +313,7 @@ def _part(boundary: Boundary | None, mask: Bool[Tensor, " N"]) -> Boundary | Non
             f"boundary: expected points of the mesh's own boundary, got {len(astray)} inside ({first_few(astray)}); "
             "leave them out of the mask, or leave `boundary` out to take all of the boundary"
         )
-    if boundary is None or not mask.any():
-        return None
-    return Boundary(mask, boundary.conormals * mask[:, None])
+    return None if boundary is None or not mask.any() else replace(boundary, mask=mask)
 
 
 def _follow(sides: Tensor | None, frames: Tensor) -> Tensor | None:
@@ -239,50 +328,32 @@ def _turned(normals: Tensor, reference: Tensor) -> Tensor:
     return torch.where(((normals * reference).sum(1) < 0)[:, None], -normals, normals)
 
 
-def _refined(
+def _searched(
     balls: GraphBalls,
     degree: int,
     num_neighbors: int | None,
     progress: bool,
     fit_degrees: tuple[int, ...] = (),
-) -> tuple[GraphBalls, Int[Tensor, " N"], VertexFits | None]:
-    """The same neighbourhoods with frames of order q, in chunks; the initial ones if q = 0 or in a flat space.
-
-    And fits of functions, if `fit_degrees` asks for some, with what the frames' fits say of the surface.
-    """
-    points, frames, refined = balls.points, balls.frames, balls
-    surface_degree = 0 if frames.shape[1] == frames.shape[2] else degree
-    fits = VertexFits(balls, fit_degrees, surface_degree) if fit_degrees else None
-    order = torch.full((len(points),), degree)
-    if surface_degree > 0:
-        degrees = range(degree, 0, -1)
-        candidates = list_candidates(frames.shape[-1], degrees, num_neighbors=num_neighbors)
-        parts = torch.arange(len(points)).split(AT_ONCE)
-        bar = tqdm(parts, "tangent frames", delay=2, disable=not progress, leave=False)
-        found = [refine_frames(balls, centers, candidates, fits) for centers in bar]
-        frames, order = (torch.cat(part) for part in zip(*found, strict=True))
-        refined = balls.with_frames(frames, _follow(balls.sides, frames))
-    return refined, order, None if fits is None else fits.complete()
+) -> tuple[FitPlan, LocalFits]:
+    """Tangent planes of order q, in chunks, the initial ones if q = 0 or in a flat space; and fits of functions."""
+    flat = balls.dim == balls.points.shape[1]
+    search = FitSearch(balls, 0 if flat else degree, fit_degrees, num_neighbors)
+    if flat or degree == 0:
+        search.order.fill_(degree)
+    else:
+        parts = torch.arange(len(balls.points)).split(AT_ONCE)
+        for centers in tqdm(parts, "tangent frames", delay=2, disable=not progress, leave=False):
+            search.refine(centers)
+    return search.finish()
 
 
-def _oriented(
-    balls: GraphBalls,
-    reference: Tensor | None,
-    order: Tensor,
-    areas: Tensor,
-    low_order: LowOrder | None,
-    boundary: Boundary | None,
-    condition: Condition | None,
-) -> Shape:
-    """Turn normals to the side of `reference`, and frames so that [frames, normal] is right-handed."""
-    points, frames = balls.points, balls.frames
-    normals = None
-    if frames.shape[-1] == points.shape[1] - 1:
-        righthanded = normals_of_frames(frames)
-        normals = righthanded if reference is None else _turned(righthanded, reference)
-        hand = (normals * righthanded).sum(1)[:, None, None].sign()
-        frames = torch.cat([hand * frames[..., :1], frames[..., 1:]], -1)
-    balls = balls.with_frames(frames, balls.sides)
-    if condition is None:
-        boundary, condition = None, Condition()
-    return Shape(points, frames, normals, order, balls, areas, low_order, boundary, condition)
+def _righthanded(
+    frames: Float[Tensor, "N n d"], reference: Float[Tensor, "N n"] | None
+) -> tuple[Float[Tensor, "N n d"], Float[Tensor, "N n"] | None]:
+    """Frames turned so that [frames, normal] is right-handed, normals of hypersurfaces on the side of `reference`."""
+    if frames.shape[2] != frames.shape[1] - 1:
+        return frames, None
+    righthanded = normals_of_frames(frames)
+    normals = righthanded if reference is None else _turned(righthanded, reference)
+    hand = (normals * righthanded).sum(1)[:, None, None].sign()
+    return torch.cat([hand * frames[..., :1], frames[..., 1:]], -1), normals

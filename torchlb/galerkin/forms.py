@@ -1,0 +1,261 @@
+"""Stiffness and mass of a complex from its elements, for any conductivity, and derivatives in it (`method.md`, 10)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from itertools import combinations_with_replacement
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+from jaxtyping import Float, Int
+from scipy import sparse
+from torch import Tensor
+
+from torchlb.galerkin.assembly import (
+    CHUNK,
+    area_element,
+    cofactors,
+    element_matrices,
+    flat_metric,
+    linear_elements,
+    summed,
+)
+from torchlb.galerkin.curving import CurvedMesh, CurvingPlan
+from torchlb.galerkin.delaunay import mollified
+from torchlb.galerkin.elements import Element, simplex, subsets
+from torchlb.galerkin.prolongation import prolongation
+from torchlb.geometry.local_fits import FitPlan, LocalFits
+from torchlb.geometry.numbering import Numbering
+from torchlb.linalg.once import once_differentiable
+
+ROWS = 2**17
+"""Rows of a product at a time, so that not all of AP is held."""
+
+
+class FlatCells(NamedTuple):
+    """Flat simplices with linear elements, which stand for others.
+
+    Attributes
+    ----------
+    cells
+        (T, d + 1).
+    lengths
+        (T, e), of their edges, ℓ.
+    share
+        How much of each counts.
+    lumped
+        Whether their mass is lumped, to equal shares for the corners.
+    mix
+        (T, F), how much of each face of the mesh is in a cell; None where they stand for none.
+    """
+
+    cells: Int[Tensor, "T corners"]
+    lengths: Float[Tensor, "T e"]
+    share: float
+    lumped: bool
+    mix: Any
+
+
+@dataclass(frozen=True)
+class Forms:
+    """The elements of a weak pair: stiffnesses for many conductivities cost an assembly each.
+
+    Attributes
+    ----------
+    cells, lengths
+        (T, d + 1), (T, e), ℓ: simplices, and their edges in the order of `subsets`.
+    faces
+        (T,), the face of the mesh that each of them is.
+    num_faces
+        F, of the mesh.
+    prolongation
+        P, (N + X, N), from the vertices to the nodes.
+    nodes
+        (T, n), of each element.
+    metric
+        (T, Q, S), at its Gauss points.
+    element
+        Its shape functions there.
+    flats
+        Simplices beside these, with linear elements.
+    """
+
+    cells: Int[Tensor, "T corners"]
+    lengths: Float[Tensor, "T e"]
+    faces: Int[Tensor, " T"]
+    num_faces: int
+    prolongation: Any
+    nodes: Int[Tensor, "T n"]
+    metric: Float[Tensor, "T Q S"]
+    element: Element
+    flats: list[FlatCells]
+
+    @classmethod
+    def curved(
+        cls,
+        fit_plan: FitPlan,
+        fits: LocalFits,
+        plan: CurvingPlan,
+        mesh: CurvedMesh,
+        stars: Int[Tensor, "S corners"],
+    ) -> Forms:
+        """Those of curved cells, of the cover that stands for coarse triangles, and of local stars.
+
+        A star's simplex is in those of all its corners, each of which has an equal share of it.
+        """
+        nodes, count, own, flats = plan.nodes, len(fits.points), ~plan.coarse, []
+        if mesh.cover is not None:
+            same: Any = sparse.eye_array(len(own), format="csr")
+            mix = mesh.cover.mixed() @ same[plan.coarse.numpy()]
+            flats.append(FlatCells(mesh.cover.faces, mesh.cover.lengths, 0.5, True, mix))
+        if len(stars):
+            lengths = mollified(edge_lengths(fits.points, stars), stars)
+            flats.append(FlatCells(stars, lengths, 1 / stars.shape[1], False, None))
+        p = prolongation(fit_plan, fits, plan, mesh)
+        cells, faces = (nodes.cells[own], mesh.lengths[own]), own.nonzero()[:, 0]
+        curved = p, nodes.elements[own], mesh.metric[own], simplex(nodes.dim, nodes.degree)
+        return cls(*cells, faces, len(own), *curved, flats)
+
+    @classmethod
+    def linear(cls, points: Float[Tensor, "N n"], faces: Int[Tensor, "F corners"]) -> Forms:
+        """Those of linear elements, whose stiffness for κ = 1 is the cotangent's."""
+        lengths, element = edge_lengths(points, faces), simplex(faces.shape[1] - 1, 1)
+        metric = flat_metric(lengths)[:, None].expand(-1, len(element.weights), -1)
+        same: Any = sparse.eye_array(len(points), format="csr")
+        every = torch.arange(len(faces))
+        return cls(faces, lengths, every, len(faces), same, faces, metric, element, [])
+
+    def restored(self, numbering: Numbering, order: Int[Tensor, " G"], num_faces: int) -> Forms:
+        """With the user's numbers of the points and of so many faces, `order` those of the faces here."""
+        given = numbering.given
+        flats = [
+            flat._replace(
+                cells=given[flat.cells],
+                mix=None if flat.mix is None else _renumbered(flat.mix, order, num_faces),
+            )
+            for flat in self.flats
+        ]
+        return replace(
+            self,
+            cells=given[self.cells],
+            faces=order[self.faces],
+            num_faces=num_faces,
+            prolongation=_renumbered(self.prolongation, given, len(given)),
+            flats=flats,
+        )
+
+    def conductivities(self, conductivity: Tensor) -> list[Tensor]:
+        """κ at the Gauss points (T, Q), and its means on flat cells; differentiable.
+
+        Of the vertices (N,), whose logarithm is prolonged, or of each face, if F ≠ N. So it is positive, and of high
+        order where the fits are.
+        """
+        if len(conductivity) != self.prolongation.shape[1]:
+            points = conductivity[self.faces, None].expand(-1, len(self.element.weights))
+            return [points, *(_prolonged(conductivity, flat.mix) for flat in self.flats)]
+        log = conductivity.log()
+        found = [(_prolonged(log, self.prolongation)[self.nodes] @ self.element.values.T).exp()]
+        for flat in self.flats:
+            shape = simplex(self.element.dim, 1)
+            means = (log[flat.cells] @ shape.values.T).exp() @ shape.weights
+            found.append(means / shape.weights.sum())
+        return found
+
+    def matrix(self, conductivities: list[Tensor] | None = None) -> sparse.csr_array:
+        """K + iM, (N, N), positive semidefinite for every κ > 0; the rows of K sum to zero."""
+        kappa = None if conductivities is None else conductivities[0]
+        return congruence(self.prolongation, self.elements(kappa)) + self.flat(conductivities)
+
+    def elements(self, conductivity: Float[Tensor, "T Q"] | None = None) -> sparse.csr_array:
+        """K_FE + iM_FE of the curved elements, (N + X, N + X)."""
+        blocks = element_matrices(self.metric, self.element, conductivity)
+        return summed(blocks, self.nodes, self.prolongation.shape[0])
+
+    def near(self, conductivities: list[Tensor] | None = None) -> sparse.csr_array:
+        """K₁ + iM₁ of linear elements on flat simplices, with the mean of κ on each: it preconditions."""
+        means = None
+        if conductivities is not None:
+            means = conductivities[0] @ self.element.weights / self.element.weights.sum()
+        count = self.prolongation.shape[1]
+        return linear_elements(self.lengths, self.cells, count, means) + self.flat(conductivities)
+
+    def flat(self, conductivities: list[Tensor] | None = None) -> sparse.csr_array:
+        """K + iM of the flat cells."""
+        count = self.prolongation.shape[1]
+        total: Any = sparse.csr_array((count, count), dtype=complex)
+        for number, flat in enumerate(self.flats, 1):
+            kappa = None if conductivities is None else conductivities[number]
+            part = linear_elements(flat.lengths, flat.cells, count, kappa, lumped=flat.lumped)
+            total = total + flat.share * part
+        return total
+
+    def sensitivity(self, w: Float[Tensor, "N C"], u: Float[Tensor, "N C"]) -> list[Tensor]:
+        """∂/∂κ of Σ_c w_cᵀK(κ)u_c, of the shapes of `conductivities`: weights times ∇w·∇u."""
+        at_nodes = [torch.from_numpy(self.prolongation @ x.numpy()) for x in (w, u)]
+        found = [_slopes(self.metric, self.element, self.nodes, at_nodes)]
+        for flat in self.flats:
+            shape = simplex(self.element.dim, 1)
+            metric = flat_metric(flat.lengths)[:, None].expand(-1, len(shape.weights), -1)
+            found.append(flat.share * _slopes(metric, shape, flat.cells, [w, u]).sum(1))
+        return found
+
+
+def edge_lengths(
+    points: Float[Tensor, "N n"], cells: Int[Tensor, "T corners"]
+) -> Float[Tensor, "T e"]:
+    """Lengths of the edges of each cell, in the order of `subsets`, ℓ."""
+    ends = points[cells[:, [list(pair) for pair in subsets(cells.shape[1] - 1, 2)]]]
+    return (ends[:, :, 1] - ends[:, :, 0]).norm(dim=2)
+
+
+def congruence(p: Any, matrix: sparse.csr_array) -> sparse.csr_array:
+    """PᵀAP, some rows at a time."""
+    left: Any = sparse.csr_array(p.T)
+    parts = [left[first : first + ROWS] @ matrix @ p for first in range(0, p.shape[1], ROWS)]
+    return parts[0] if len(parts) == 1 else sparse.csr_array(sparse.vstack(parts))
+
+
+def _renumbered(matrix: Any, columns: Int[Tensor, " C"], count: int) -> sparse.csr_array:
+    parts = matrix.data, columns.numpy()[matrix.indices], matrix.indptr
+    return sparse.csr_array(parts, shape=(matrix.shape[0], count))
+
+
+def _slopes(
+    metric: Float[Tensor, "T Q S"],
+    element: Element,
+    nodes: Int[Tensor, "T n"],
+    values: list[Float[Tensor, "NX C"]],
+) -> Float[Tensor, "T Q"]:
+    """Weights times Σ_c ∇w_c·∇u_c at the Gauss points."""
+    found = []
+    for part in torch.arange(len(nodes)).split(max(CHUNK // values[0].shape[1], 1)):
+        g = metric[part]
+        one, two = (
+            torch.einsum("qnd,tnc->dtqc", element.gradients, x[nodes[part]]) for x in values
+        )
+        pairs = combinations_with_replacement(range(element.dim), 2)
+        products = [
+            one[a] * two[b] if a == b else one[a] * two[b] + one[b] * two[a] for a, b in pairs
+        ]
+        parts = zip(cofactors(g).unbind(-1), products, strict=True)
+        total = sum(m * x.sum(-1) for m, x in parts)
+        found.append(element.weights * total / area_element(g))
+    return torch.cat(found) if found else metric.new_zeros(metric.shape[:2])
+
+
+class _Prolonged(torch.autograd.Function):
+    """P x for a vector x."""
+
+    @staticmethod
+    def forward(ctx: Any, x: Tensor, matrix: Any) -> Tensor:  # pyright: ignore[reportIncompatibleMethodOverride]
+        ctx.matrix = matrix
+        return torch.from_numpy(np.asarray(matrix @ x.detach().numpy()))
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, g: Tensor) -> tuple[Any, ...]:  # pyright: ignore[reportIncompatibleMethodOverride]
+        return torch.from_numpy(np.asarray(ctx.matrix.T @ g.numpy())), None
+
+
+_prolonged: Any = _Prolonged.apply

@@ -1,0 +1,261 @@
+"""The search for fits: of which degree, and through which neighbours (`method.md`, sections 4 and 9)."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from math import ceil
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from torchlb.fits.polynomials import num_monomials
+from torchlb.fits.weights import MAX_RESIDUAL, CenteredFit
+from torchlb.geometry.admission import MIN_ALIGNMENT
+from torchlb.geometry.candidates import Search, list_candidates
+from torchlb.geometry.local_fits import FitPlan, LocalFits, Neighborhoods, slope_of
+from torchlb.geometry.neighbors import AT_ONCE, GraphBalls
+from torchlb.geometry.vectors import at
+
+MAX_LEBESGUE = 10.0
+"""Of a fit in the middles of the edges of its point; where neighbours lie well around it has less than 2."""
+MAX_MISFIT = {2: 0.3}
+"""Of the heights of a quadratic, which is the last resort; all others have to follow them to `FAITHFUL`."""
+FAITHFUL = 0.05
+REASONS = (
+    "reached",
+    "too few admissible neighbours",
+    "neighbours too close to a line or conic",
+    "points do not resolve the surface",
+)
+IN_ROWS = 2
+"""Place in `REASONS` of too few rows of neighbours."""
+LEAST = 1.5
+"""Neighbours per polynomial without which a fit is not tried."""
+ROOM = 2**18
+"""Fits in a pile, 0.7 GB at degree 4: pieces below 32 MB would stay with glibc, and scatter its memory."""
+
+
+class _Pile:
+    """Rows of several tensors, in pieces of `ROOM`, of which only what is filled takes memory.
+
+    In large pieces: thousands of arrays that stay, between those that come and go, would scatter the memory.
+    """
+
+    def __init__(self, room: int) -> None:
+        self.room, self.filled = min(room, ROOM), 0
+        self.pieces: list[list[Tensor]] = []
+
+    def add(self, *rows: Tensor) -> None:
+        """Further rows."""
+        count = len(rows[0])
+        if not self.pieces or self.filled + count > len(self.pieces[-1][0]):
+            self._close()
+            room = max(self.room, count)
+            self.pieces.append([row.new_empty(room, *row.shape[1:]) for row in rows])
+            self.filled = 0
+        for column, row in zip(self.pieces[-1], rows, strict=True):
+            column[self.filled : self.filled + count] = row
+        self.filled += count
+
+    def _close(self) -> None:
+        if self.pieces:
+            self.pieces[-1] = [column[: self.filled] for column in self.pieces[-1]]
+
+    def rows(self) -> list[list[Tensor]]:
+        """All of them."""
+        self._close()
+        return self.pieces
+
+
+class FitSearch:
+    """Fits of heights, of the first of the degrees q, q − 1, … that is regular; and of functions, of the first of theirs.
+
+    Parameters
+    ----------
+    balls
+        Neighbourhoods, and the frames that the fits are over.
+    frame_degree
+        q of the tangent planes; 0 leaves them alone.
+    degrees
+        m of the fits of functions, best first; none asks for no such fits, and no graphs.
+    num_neighbors
+        Number of points of the fits of heights, if the user has fixed it.
+    """
+
+    def __init__(
+        self,
+        balls: GraphBalls,
+        frame_degree: int = 0,
+        degrees: tuple[int, ...] = (),
+        num_neighbors: int | None = None,
+    ) -> None:
+        count, self.balls, self.degrees = len(balls.points), balls, degrees
+        self.candidates = list_candidates(
+            balls.dim, range(frame_degree, 0, -1), num_neighbors=num_neighbors
+        )
+        self.highest = max(frame_degree, *degrees, 0) if degrees else 0
+        self.jet, self.reach = (1, 0.5) if max(degrees, default=0) <= 3 else (degrees[0], 1.0)
+        self.fits = LocalFits(balls.points, balls.frames, self.highest)
+        self.order, self.degree, self.surface_degree, self.size, self.tried, self.owner = (
+            torch.zeros(6, count, dtype=torch.int64)
+        )
+        self.reason, self._takings = torch.ones_like(self.order), 0
+        self._surface: dict[int, dict[int, _Pile]] = {}
+        self._functions: dict[int, dict[int, _Pile]] = {}
+
+    def refine(self, centers: Int[Tensor, " B"]) -> None:
+        """Find tangent planes at `centers`; fits of functions try the neighbourhoods that are looked at anyway.
+
+        Each centre takes the first candidate whose fit is regular, and has a tilt below 60°.
+        """
+        middles = self.balls.middles(centers)
+        search = Search(self.balls, centers, self.candidates)
+        steepest = 1 / MIN_ALIGNMENT**2 - 1  # |∇H|² of a tilt of 60°, bounded by the Frobenius norm
+        for number, rows, index in search:
+            block = _block(self.candidates[number].degree, centers[rows], index)
+            fit, heights, graph = self.fits.fitted(block)
+            regular = is_regular(fit, middles[rows])
+            flat_enough = slope_of(fit, graph, self.fits.initial).square().sum((1, 2)) <= steepest
+            passed = regular & flat_enough  # false for NaN
+            self.order[centers[rows[passed]]] = block.degree
+            self._keep_surface(block, fit, heights, graph, regular, passed)
+            if number == 0 and self.degrees:
+                self._offer(block, fit, heights, graph)
+            search.settle(rows[passed])
+
+    def finish(self) -> tuple[FitPlan, LocalFits]:
+        """The plan, and what follows from it where it was made.
+
+        Vertices without a fit of functions have tried the degrees, with more neighbours in turn, or with all of few.
+        """
+        dim = self.balls.dim
+        for degree in self.degrees:
+            sizes = list_candidates(dim, [degree])
+            for vertices in (self.degree == 0).nonzero()[:, 0].split(AT_ONCE):
+                start = self.tried[vertices] if degree == self.degrees[0] else None
+                search = Search(self.balls, vertices, sizes, start)
+                for _, rows, index in search:
+                    search.settle(rows[self._try(_block(degree, vertices[rows], index))])
+                vertices = vertices[self.degree[vertices] == 0]
+                least, few = 1 + ceil(LEAST * (num_monomials(dim, degree) - 1)), sizes[0].size
+                index, count = self.balls(vertices, few)
+                some = (count >= least) & (count < few)
+                keep = torch.arange(1, few) < count[some, None]
+                self._try(_block(degree, vertices[some], index[some], keep))
+        surface, functions = [], []
+        for degree, piles in self._surface.items():
+            for rows in (rows for pile in piles.values() for rows in pile.rows()):
+                *block, owner = rows
+                block[-1] &= self.owner[block[0]] == owner
+                surface.append(_kept(degree, block, block[-1] | block[-2]))
+        for degree, piles in self._functions.items():
+            for rows in (rows for pile in piles.values() for rows in pile.rows()):
+                *block, coefficients = rows
+                functions.append(Neighborhoods(degree, *(column.clone() for column in block)))
+                self.fits.coefficients.append(coefficients)
+        counts = self.order, self.surface_degree, self.degree, self.reason, self.size
+        settings = self.highest, self.jet, self.reach
+        return FitPlan(surface, functions, *counts, *settings), self.fits
+
+    def _offer(
+        self, block: Neighborhoods, fit: CenteredFit, heights: Tensor, graph: Tensor
+    ) -> None:
+        """Try the nearest points of the neighbourhoods first for functions, by the same fit if it is that."""
+        first = list_candidates(self.balls.dim, self.degrees)[0]
+        size = block.points.shape[1]
+        if size < first.size:
+            return
+        self.tried[block.vertices] = 1
+        if (block.degree, size) == (first.degree, first.size):
+            self._keep(block, fit, heights, graph)
+        else:
+            self._try(_block(first.degree, block.vertices, block.points[:, : first.size]))
+
+    def _try(self, block: Neighborhoods) -> Bool[Tensor, " b"]:
+        """Make fits of functions, and keep those that pass; which do."""
+        if len(block.vertices) == 0:
+            return torch.zeros(0, dtype=torch.bool)
+        return self._keep(block, *self.fits.fitted(block))
+
+    def _keep(
+        self, block: Neighborhoods, fit: CenteredFit, heights: Tensor, graph: Tensor
+    ) -> Bool[Tensor, " b"]:
+        """Keep the fits of functions that pass; which do."""
+        terms = num_monomials(self.balls.dim, min(block.degree, self.jet)) - 1
+        kept = replace(
+            fit,
+            coefficients=fit.coefficients[:, :terms],
+            values=fit.values[..., :terms],
+            degree=min(block.degree, self.jet),
+        )
+        regular = is_regular(kept, self.balls.middles(block.vertices))
+        good = self._keep_surface(block, fit, heights, graph, regular, torch.zeros_like(regular))
+        if good.any():
+            found, size = block.vertices[good], block.points.shape[1]
+            none = torch.zeros(2, len(found), dtype=torch.bool)
+            self._pile(self._functions, block).add(
+                found, block.points[good].int(), block.keep[good], *none, kept.coefficients[good]
+            )
+            self.degree[found], self.size[found] = block.degree, size
+            self.fits.radius[found] = fit.radius[good]
+        return good
+
+    def _keep_surface(
+        self,
+        block: Neighborhoods,
+        fit: CenteredFit,
+        heights: Float[Tensor, "b neighbors n"],
+        graph: Float[Tensor, "b M n"],
+        regular: Bool[Tensor, " b"],
+        frame: Bool[Tensor, " b"],
+    ) -> Bool[Tensor, " b"]:
+        """Keep tangent planes, and the regular graphs that follow the heights where there was none of their degree.
+
+        Which do follow them.
+        """
+        vertices, good = block.vertices, regular
+        new = torch.zeros_like(frame)
+        if self.degrees:
+            good = regular & (fit.misfit(heights, graph) <= MAX_MISFIT.get(fit.degree, FAITHFUL))
+            vacant = self.surface_degree[vertices] < fit.degree
+            if fit.degree == self.highest:
+                reason = torch.where(good, 0, torch.where(regular, 3, IN_ROWS))
+                self.reason[vertices] = torch.where(vacant, reason, self.reason[vertices])
+            new = good & vacant
+            self.surface_degree[vertices[new]] = fit.degree
+        taken = block._replace(frame=frame, surface=new)
+        self.fits.take_surface(taken, fit, graph)
+        rows = (frame | new).nonzero()[:, 0]
+        if len(rows):
+            self._takings += 1
+            self.owner[vertices[new]] = self._takings
+            columns = (vertices, block.points.int(), block.keep, frame, new)
+            owner = torch.full((len(rows),), self._takings)
+            self._pile(self._surface, block).add(*(at(column, rows) for column in columns), owner)
+        return good
+
+    def _pile(self, piles: dict[int, dict[int, _Pile]], block: Neighborhoods) -> _Pile:
+        of_degree = piles.setdefault(block.degree, {})
+        return of_degree.setdefault(block.points.shape[1], _Pile(len(self.order)))
+
+
+def _block(
+    degree: int,
+    vertices: Int[Tensor, " b"],
+    points: Int[Tensor, "b K"],
+    keep: Bool[Tensor, "b neighbors"] | None = None,
+) -> Neighborhoods:
+    """With no flag set; without `keep` all points count."""
+    keep = torch.ones_like(points[:, 1:], dtype=torch.bool) if keep is None else keep
+    none = torch.zeros(2, len(vertices), dtype=torch.bool)
+    return Neighborhoods(degree, vertices, points, keep, *none)
+
+
+def _kept(degree: int, columns: list[Tensor], rows: Bool[Tensor, " b"]) -> Neighborhoods:
+    return Neighborhoods(degree, *(column[rows] for column in columns))
+
+
+def is_regular(fit: CenteredFit, middles: Float[Tensor, "B E d"]) -> Bool[Tensor, " B"]:
+    """Whether the neighbours determine a fit, and well in the middles of the edges, ℓ: `MAX_LEBESGUE`."""
+    return (fit.residual <= MAX_RESIDUAL) & (fit.lebesgue(middles) <= MAX_LEBESGUE)

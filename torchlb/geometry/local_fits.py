@@ -1,0 +1,186 @@
+"""Polynomials over the initial frame of every vertex: its tangent plane, the surface around it, functions on it.
+
+`FitSearch` decides of which degree they are, and through which neighbours. What it has decided is a `FitPlan`, of
+integers alone; `LocalFits` are the numbers that follow from a plan at given points.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from torchlb.fits.polynomials import num_monomials
+from torchlb.fits.weights import CenteredFit, centered_fit
+from torchlb.geometry.candidates import PIECE_BYTES
+from torchlb.geometry.frames import orthonormalized
+from torchlb.geometry.vectors import at
+
+
+class Neighborhoods(NamedTuple):
+    """Of fits of one degree through as many points each.
+
+    Attributes
+    ----------
+    degree
+        m of the fits.
+    vertices
+        (b,).
+    points
+        (b, K), the vertex first; padded by the vertex.
+    keep
+        (b, K − 1), which of its neighbours are none of the padding.
+    frame, surface
+        (b,), whether the tangent plane, and the graph of the surface, is that of this fit; all false where the fit is
+        one of functions.
+    """
+
+    degree: int
+    vertices: Int[Tensor, " b"]
+    points: Int[Tensor, "b K"]
+    keep: Bool[Tensor, "b neighbors"]
+    frame: Bool[Tensor, " b"]
+    surface: Bool[Tensor, " b"]
+
+    def parts(self, dim: int) -> Iterator[tuple[slice, Neighborhoods]]:
+        """So many at a time that an array of all monomials stays below `PIECE_BYTES`."""
+        size = max(64, PIECE_BYTES // (8 * self.points.shape[1] * num_monomials(dim, self.degree)))
+        for first in range(0, len(self.vertices), size):
+            part = slice(first, first + size)
+            yield part, Neighborhoods(self.degree, *(tensor[part] for tensor in self[1:]))
+
+
+@dataclass(frozen=True)
+class FitPlan:
+    """What is decided about the fits of a shape.
+
+    Attributes
+    ----------
+    surface, functions
+        The neighbourhoods of the fits of heights, and of functions.
+    order
+        (N,), degree of the fit behind each tangent plane; 0 where it stays the initial one.
+    surface_degree
+        (N,), degree of the graph around each vertex; 0 where there is none.
+    degree
+        (N,), degree m of the fit of functions; 0 where none passed, which leaves the vertex flat.
+    reason
+        (N,), why the highest degree was not reached, a place in `REASONS`.
+    size
+        (N,), number of points of the fit of functions, the vertex among them.
+    highest
+        Degree up to which graphs are kept.
+    jet, reach
+        Degree up to which fits of functions are kept, and the part of the way to a node where they are asked. Of fits of
+        degree 2 and 3 that is the gradient, half of the way: for the cubic Hermite interpolant in the middles of edges
+        (u_a + u_b)/2 + (∂u_a − ∂u_b)/8, ∂ along the edge, is the mean of u_a + ∇u_a·y there.
+    """
+
+    surface: list[Neighborhoods]
+    functions: list[Neighborhoods]
+    order: Int[Tensor, " N"]
+    surface_degree: Int[Tensor, " N"]
+    degree: Int[Tensor, " N"]
+    reason: Int[Tensor, " N"]
+    size: Int[Tensor, " N"]
+    highest: int
+    jet: int
+    reach: float
+
+    def flattened(self, vertices: Bool[Tensor, " N"]) -> FitPlan:
+        """The same without fits of functions at these vertices, which makes the surface flat there."""
+        return replace(self, degree=torch.where(vertices, 0, self.degree))
+
+
+class LocalFits:
+    """What fits say at given points.
+
+    Parameters
+    ----------
+    points
+        (N, n), ℓ.
+    initial
+        (N, n, d), the frames that the fits are over.
+    degree
+        Up to which graphs are kept.
+
+    Attributes
+    ----------
+    frames
+        (N, n, d), of the tangent planes.
+    heights
+        (N, M − 1, n), ℓ: graphs of the surface over the initial frames, as vectors; zero beyond a fit's own monomials.
+    surface_radius, radius
+        (N,), ℓ, of the fits of heights and of functions.
+    coefficients
+        Of the fits of functions, in the order of `FitPlan.functions`, as in `CenteredFit`.
+    """
+
+    def __init__(
+        self, points: Float[Tensor, "N n"], initial: Float[Tensor, "N n d"], degree: int
+    ) -> None:
+        self.points, self.initial, self.frames = points, initial, initial.clone()
+        terms = num_monomials(initial.shape[2], degree) - 1
+        self.heights = points.new_zeros(len(points), terms, points.shape[1])
+        self.surface_radius, self.radius = points.new_ones(2, len(points))
+        self.coefficients: list[Float[Tensor, "b M neighbors"]] = []
+
+    @classmethod
+    def at(
+        cls, plan: FitPlan, points: Float[Tensor, "N n"], initial: Float[Tensor, "N n d"]
+    ) -> LocalFits:
+        """Those of a plan."""
+        found, dim = cls(points, initial, plan.highest), initial.shape[2]
+        for block in plan.surface:
+            for _, part in block.parts(dim):
+                fit, _, graph = found.fitted(part)
+                found.take_surface(part, fit, graph)
+        for block in plan.functions:
+            terms = num_monomials(dim, min(block.degree, plan.jet)) - 1
+            kept = points.new_empty(len(block.vertices), terms, block.keep.shape[1])
+            for place, part in block.parts(dim):
+                fit, _, _ = found.fitted(part)
+                kept[place] = fit.coefficients[:, :terms]
+                found.radius[part.vertices] = fit.radius
+            found.coefficients.append(kept)
+        return found
+
+    def fitted(
+        self, block: Neighborhoods
+    ) -> tuple[CenteredFit, Float[Tensor, "b neighbors n"], Float[Tensor, "b M n"]]:
+        """The fits, the heights over the initial planes that they are to follow, and the graphs that they make of them."""
+        frame, places = at(self.initial, block.vertices), at(self.points, block.points)
+        offset = places[:, 1:] - places[:, :1]
+        coords = offset @ frame
+        heights = offset - coords @ frame.mT
+        keep = None if block.keep.all() else block.keep
+        if keep is not None:
+            heights = heights * keep[..., None]
+        fit = centered_fit(coords, block.degree, keep)
+        return fit, heights, fit.coefficients @ heights
+
+    def take_surface(
+        self, block: Neighborhoods, fit: CenteredFit, graph: Float[Tensor, "b M n"]
+    ) -> None:
+        """Keep the tangent planes and the graphs of these fits."""
+        on = block.frame
+        if on.any():
+            tilted = (
+                at(self.initial, block.vertices[on]) + slope_of(fit, graph, self.initial)[on].mT
+            )
+            self.frames[block.vertices[on]] = orthonormalized(tilted)
+        on = block.surface
+        if on.any():
+            self.heights[block.vertices[on], : graph.shape[1]] = graph[on]
+            self.surface_radius[block.vertices[on]] = fit.radius[on]
+
+
+def slope_of(
+    fit: CenteredFit, graph: Float[Tensor, "b M n"], frames: Float[Tensor, "N n d"]
+) -> Float[Tensor, "b d n"]:
+    """First derivatives of the heights, in the normal space."""
+    return graph[:, : frames.shape[2]] / fit.radius[:, None, None]
