@@ -221,7 +221,7 @@ def test_conormals_of_disk_and_hemisphere():
         frames = mesh_frames(vertices, faces)
         if isinstance(surface, Hemisphere):
             frames = surface.frames(vertices)
-        boundary = boundary_of_mesh(vertices, faces, frames, 4)
+        boundary = boundary_of_mesh(vertices, faces, 4).at(vertices, frames)
         mask = surface.boundary_mask(vertices)
         assert torch.equal(boundary.mask, mask)
         down = torch.tensor([0.0, 0, -1]).double().expand(int(mask.sum()), 3)
@@ -420,7 +420,7 @@ def test_points_on_a_line_along_the_rim_have_no_stencil():
     assert (lb(f) + (math.pi / 3) ** 2 * f).abs().max() < 0.05
     assert (lb.gradient(points[:, 2]) - torch.tensor([0.0, 0, 1])).abs().max() < 1e-3
     rim = lb.boundary
-    conormals = boundary_of_mesh(points, lb.faces, lb.frames, 4).conormals[rim]
+    conormals = boundary_of_mesh(points, lb.faces, 4).at(points, lb.frames).conormals[rim]
     assert (conormals[:, 2] * (points[rim, 2] - 1.5)).min() > 1
 
 

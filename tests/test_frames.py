@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from tolerances import TOLERANCE
-from torchlb.geometry.candidates import list_candidates
+from torchlb.geometry.fit_search import FitSearch
 from torchlb.geometry.frames import (
     PROJECTIONS,
     cloud_frames,
@@ -16,7 +16,6 @@ from torchlb.geometry.frames import (
     local_offsets,
     mesh_frames,
     normals_of_frames,
-    refine_frames,
 )
 from torchlb.geometry.neighbors import GraphBalls, nearest_graph, nearest_neighbors
 from torchlb.surfaces import (
@@ -50,8 +49,10 @@ def initial_and_balls(surface, points):
 
 def refined(surface, points, degree):
     _, balls = initial_and_balls(surface, points)
-    candidates = list_candidates(surface.dim, range(degree, 0, -1))
-    return refine_frames(balls, torch.arange(len(points)), candidates)
+    search = FitSearch(balls, degree)
+    search.refine(torch.arange(len(points)))
+    plan, fits = search.finish()
+    return fits.frames, plan.order
 
 
 def tilt(frames, exact):

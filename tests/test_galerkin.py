@@ -13,11 +13,11 @@ from torchlb.galerkin import flips
 from torchlb.galerkin.elements import lattice, simplex
 from torchlb.galerkin.flips import flipped
 from torchlb.galerkin.pair import mesh_pair
-from torchlb.galerkin.rim import rim_curves
+from torchlb.galerkin.rim import rim_plan
 from torchlb.geometry.boundary import boundary_faces
+from torchlb.geometry.fit_search import FitSearch
 from torchlb.geometry.frames import complete_frames, vertex_normals
 from torchlb.geometry.neighbors import GraphBalls, mesh_graph
-from torchlb.geometry.fit_search import VertexFits
 from torchlb.surfaces import CliffordTorus, Hemisphere, Sphere, Torus, UnitDisk, deserno_points
 
 
@@ -151,8 +151,7 @@ def test_linear_elements_are_the_cotangent_with_its_full_mass(surface):
     vertices, faces = surface.mesh(400)
     frames = complete_frames(vertex_normals(vertices, faces))
     balls = GraphBalls(vertices, mesh_graph(faces, len(vertices)), frames)
-    fits = VertexFits(balls, (2,)).complete()
-    pair = mesh_pair(vertices, faces, fits, 2).linear
+    pair = mesh_pair(vertices, faces, *FitSearch(balls, 0, (2,)).finish(), 2, (2,))[1].linear
     args = vertices.numpy(), faces.numpy()
     expected = -igl.cotmatrix(*args), igl.massmatrix(*args, igl.MASSMATRIX_TYPE_FULL)
     for values, matrix in zip(pair.values, expected, strict=True):
@@ -261,7 +260,7 @@ def test_curves_of_the_rim_reproduce_polynomials_of_arc_length():
     x = torch.tensor([0.0, 1, 1.5, 2.7, 4, 5.5], dtype=torch.float64)
     points = torch.stack([x, 0 * x, 0 * x], 1)
     rim = torch.stack([torch.arange(5), torch.arange(1, 6)], 1)
-    curves = rim_curves(points, rim, 4)
+    curves = rim_plan(points, rim, 4).at(points)
     weights = curves.weights(torch.full((5, 1), 0.3, dtype=torch.float64))
     places = (weights * x[curves.index][:, None]).sum(-1)[:, 0]
     torch.testing.assert_close(places, x[:-1] + 0.3 * x.diff(), **TOLERANCE[torch.float64])
@@ -319,7 +318,7 @@ def test_blocks_of_any_size_make_the_same_pair(monkeypatch):
     """Of a hemisphere of one block, and of many with a rest, in all that is done a few at a time."""
     vertices, faces = Hemisphere().mesh(500)
     whole = LaplaceBeltrami.from_mesh(vertices, faces)
-    for name in ("galerkin.pair.ROWS", "galerkin.prolongation.AT_ONCE", "stencils.shape.AT_ONCE"):
+    for name in ("galerkin.forms.ROWS", "galerkin.prolongation.AT_ONCE", "stencils.shape.AT_ONCE"):
         monkeypatch.setattr(f"torchlb.{name}", 70)
     for module in ("assembly", "curving"):
         monkeypatch.setattr(f"torchlb.galerkin.{module}.CHUNK", 70)

@@ -7,10 +7,7 @@ import torch
 
 from torchlb import LaplaceBeltrami, implicit_step
 from torchlb.errors import InputError, first_few, renumbered
-from torchlb.geometry.frames import mesh_frames
-from torchlb.geometry.neighbors import GraphBalls, mesh_graph
 from torchlb.geometry.numbering import Numbering
-from torchlb.geometry.fit_search import VertexFits
 from torchlb.linalg.sparse import to_scipy
 from torchlb.stencils.rows import matrix_rows
 from torchlb.surfaces import Hemisphere, Sphere, UnitDisk
@@ -111,15 +108,6 @@ def test_a_conductivity_has_the_users_numbers():
         u = implicit_step(one, f, 0.1, conductivity=given)
         v = implicit_step(two, f[order], 0.1, conductivity=shuffled)
         torch.testing.assert_close(u[order], v)
-
-
-def test_fits_are_handed_over_once():
-    vertices, faces = UnitDisk().mesh(100)
-    balls = GraphBalls(vertices, mesh_graph(faces, 100), mesh_frames(vertices, faces))
-    fits = VertexFits(balls, (2,)).complete()
-    assert sum(len(part.vertices) for part in fits.hand_over()) == int((fits.degree > 0).sum()) > 90
-    with pytest.raises(RuntimeError, match="before"):
-        fits.hand_over()
 
 
 def test_messages_name_points_as_the_user_does():

@@ -166,14 +166,14 @@ def test_every_row_of_a_creased_mesh_is_valid():
 
 
 def test_low_order_rows_are_m_matrix_rows():
-    """At order 0: off-diagonal entries ≥ 0, off-diagonal ratio 1."""
+    """At order 0: off-diagonal entries ≥ 0, to the tolerance of the flips to Delaunay, and off-diagonal ratio 1."""
     _, lb = cube()
     rows = lb.report.order == 0
     if not rows.any():
         pytest.skip("no point of the cube fell back")
     matrix = lb.matrix.to_dense()
     off = matrix - matrix.diagonal().diag()
-    assert (off[rows] >= 0).all()
+    assert (off[rows] >= -1e-6 * matrix.diagonal().abs().max()).all()
     torch.testing.assert_close(
         lb.report.off_diagonal_ratio[rows], torch.ones(int(rows.sum())).double()
     )

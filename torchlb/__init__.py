@@ -1,8 +1,8 @@
 """High-order Laplace–Beltrami operators on meshes and point clouds, for PyTorch.
 
 The packages, lowest first: `linalg`, matrices without shapes; `fits`, weights from local polynomials; `geometry`,
-neighbours, frames, boundaries; `baseline`, libigl and robust_laplacian; `stencils`, rows of Δ and ∇; `galerkin`, the
-weak pair; `stability`, the certificate; `spectral`, eigenpairs and signatures; `operator`, the module that holds it
+neighbours, frames, boundaries; `baseline`, libigl's cotangents; `galerkin`, the weak pair; `stencils`, rows of Δ and ∇;
+`stability`, the certificate; `spectral`, eigenpairs and signatures; `operator`, the module that holds it
 all; `nn`, solves and layers that take it as an argument; `io` and `interop`, files and other libraries. `surfaces` are
 shapes with exact answers.
 """

@@ -1,4 +1,4 @@
-"""The low-order peers as strong-form rows, analyst's sign; the only imports of either library.
+"""The low-order peer as strong-form rows, analyst's sign; the only import of its library.
 
-`cotangent`: libigl's cotangent operator. `robust`: robust_laplacian's rows, of any triangle mesh or a cloud.
+`cotangent`: libigl's cotangent operator.
 """

@@ -130,7 +130,7 @@ def linear_elements(
     *,
     lumped: bool = False,
 ) -> sparse.csr_array:
-    """K + iM of linear elements on flat simplices with these edges; M lumped to equal shares of the corners if asked."""
+    """K + iM of linear elements on flat simplices with these edges; M lumped to equal shares of corners if asked."""
     shape, g = simplex(cells.shape[1] - 1, 1), flat_metric(lengths)
     points = len(shape.weights)
     kappa = None if conductivity is None else conductivity[:, None].expand(-1, points)

@@ -6,7 +6,7 @@ Curves along the boundary, mollified lengths and normals are of triangles alone;
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -15,7 +15,7 @@ from torch import Tensor
 from torchlb.fits.polynomials import monomials
 from torchlb.galerkin.assembly import CHUNK, area_element, flat_metric, metric
 from torchlb.galerkin.coarse import coarse_triangles
-from torchlb.galerkin.delaunay import Cover, delaunay_cover, mollified
+from torchlb.galerkin.delaunay import Cover, delaunay_cover, sound_lengths
 from torchlb.galerkin.elements import simplex
 from torchlb.galerkin.nodes import Nodes
 from torchlb.geometry.frames import vertex_normals
@@ -28,9 +28,6 @@ AGREE, STEEP = 0.075, 0.3
 """Of an edge's length: how far a graph may be from the mean of a node's, and the node from the edge."""
 FLAT = 1e-3
 """Height of a triangle over its longest edge, below which it is flat."""
-NO_VOLUME, POINT = 1e-6, 1e-30
-"""Volume of a tetrahedron over the cube of its longest edge, that rounding may make of none; and the size that it has
-then, over that edge."""
 STRETCH = 3.0
 """Largest ratio of the curved area element and the flat one, or of the flat one and the curved one."""
 
@@ -63,6 +60,7 @@ class BoundaryNodes:
     entries: tuple[Int[Tensor, " E"], Int[Tensor, " E"], Float[Tensor, " E"]]
 
 
+@runtime_checkable
 class BoundaryNodesPlan(Protocol):
     """What is decided about the nodes along the boundary."""
 
@@ -98,7 +96,7 @@ class CurvingPlan:
     bent: Bool[Tensor, " X"]
     coarse: Bool[Tensor, " F"]
     fixed: Bool[Tensor, " E"]
-    flips: list[Int[Tensor, " C"]]
+    flips: list[Tensor]
 
     def at(self, points: Float[Tensor, "N n"], plan: FitPlan, fits: LocalFits) -> CurvedMesh:
         """The cells at these points."""
@@ -106,7 +104,10 @@ class CurvingPlan:
         flat = flat_places(points, nodes)
         standing, _ = _moved(points, plan, fits, nodes, _start(flat, boundary), boundary)
         places = torch.cat([points, torch.where(self.bent[:, None], standing, flat)])
-        lengths, some = _sound_lengths(points, nodes), self.curved[nodes.edge].any(1)
+        lengths, some = (
+            sound_lengths(nodes.lengths(points), nodes.cells),
+            self.curved[nodes.edge].any(1),
+        )
         shape = simplex(nodes.dim, nodes.degree)
         g = flat_metric(lengths)[:, None].repeat(1, len(shape.weights), 1)
         for part in some.nonzero()[:, 0].split(CHUNK):
@@ -114,7 +115,7 @@ class CurvingPlan:
         cover = self.cover(lengths, self.flips)
         return CurvedMesh(places, g, lengths, cover, boundary)
 
-    def cover(self, lengths: Float[Tensor, "F 3"], flips: list[Tensor] | None) -> Cover | None:
+    def cover(self, lengths: Float[Tensor, "F e"], flips: list[Tensor] | None) -> Cover | None:
         """The Delaunay triangulation of the coarse triangles and their mirror image, glued along the free boundary."""
         coarse, nodes = self.coarse, self.nodes
         if not coarse.any():
@@ -252,24 +253,6 @@ def _to_graph(
     return (powers @ at(fits.heights, vertex) + along @ frame.mT)[:, 0] - offset
 
 
-def shrunk(sides: Float[Tensor, "F 6"]) -> Float[Tensor, "F 6"]:
-    """Lengths of edges, those of tetrahedra without volume next to nothing, so that they count for nothing.
-
-    Delaunay tetrahedra of a grid have such slivers, four points of a square; what is around them fills the solid.
-    """
-    longest = sides.amax(1)
-    none = area_element(flat_metric(sides)) <= NO_VOLUME * longest**3
-    return torch.where(none[:, None], POINT * longest[:, None], sides)
-
-
-def _sound_lengths(points: Float[Tensor, "N n"], nodes: Nodes) -> Float[Tensor, "F e"]:
-    """Lengths of the edges of each cell, as those of cells with an area or a volume, or next to nothing."""
-    sides = nodes.lengths(points)
-    if nodes.dim == 2:
-        return mollified(sides, nodes.cells)
-    return shrunk(sides) if nodes.dim == 3 else sides
-
-
 def _flattened(
     points: Float[Tensor, "N n"],
     nodes: Nodes,
@@ -282,7 +265,7 @@ def _flattened(
     `stand` is where nodes are on flat cells and on the surface; `whole`, which triangles and cells may have theirs
     there.
     """
-    sides, lengths = nodes.lengths(points), _sound_lengths(points, nodes)
+    sides, lengths = nodes.lengths(points), sound_lengths(nodes.lengths(points), nodes.cells)
     plane, shape = flat_metric(lengths), simplex(nodes.dim, nodes.degree)
     area = area_element(plane)
     curved = curved.clone()

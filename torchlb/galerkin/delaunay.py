@@ -14,6 +14,7 @@ from jaxtyping import Bool, Float, Int
 from scipy import sparse
 from torch import Tensor
 
+from torchlb.galerkin.assembly import area_element, flat_metric
 from torchlb.geometry.stars import pieces_of
 
 EDGES = ((0, 1), (1, 2), (2, 0))
@@ -24,6 +25,10 @@ DELAUNAY = 1e-6
 
 SLACK = 1e-5
 """Of the mean length: what two edges of a triangle are to be longer than the third, by mollification."""
+
+NO_VOLUME, POINT = 1e-6, 1e-30
+"""Volume of a tetrahedron over the cube of its longest edge, that rounding may make of none; and the size that it has
+then, over that edge."""
 
 
 class Cover(NamedTuple):
@@ -43,8 +48,8 @@ class Cover(NamedTuple):
 
     faces: Int[Tensor, "two_F 3"]
     lengths: Float[Tensor, "two_F 3"]
-    flips: list[Int[Tensor, " C"]]
-    shares: list[tuple[Int[Tensor, "C 2"], Float[Tensor, " C"]]]
+    flips: list[Tensor]
+    shares: list[tuple[Tensor, Tensor]]
 
     def mixed(self) -> sparse.csr_array:
         """(2F, F), of each triangle what share of the given ones it has, as far as means over two triangles tell."""
@@ -74,12 +79,31 @@ def mollified(sides: Float[Tensor, "F 3"], faces: Int[Tensor, "F 3"]) -> Float[T
     return sides + lack[piece, None]
 
 
+def shrunk(sides: Float[Tensor, "F 6"]) -> Float[Tensor, "F 6"]:
+    """Lengths of edges, those of tetrahedra without volume next to nothing, so that they count for nothing.
+
+    Delaunay tetrahedra of a grid have such slivers, four points of a square; what is around them fills the solid.
+    """
+    longest = sides.amax(1)
+    none = area_element(flat_metric(sides)) <= NO_VOLUME * longest**3
+    return torch.where(none[:, None], POINT * longest[:, None], sides)
+
+
+def sound_lengths(
+    sides: Float[Tensor, "F e"], cells: Int[Tensor, "F corners"]
+) -> Float[Tensor, "F e"]:
+    """Lengths of the edges of cells, as those of cells with an area or a volume, or next to nothing."""
+    if cells.shape[1] == 3:
+        return mollified(sides, cells)
+    return shrunk(sides) if cells.shape[1] == 4 else sides
+
+
 def delaunay_cover(
     faces: Int[Tensor, "F 3"],
     lengths: Float[Tensor, "F 3"],
     edge: Int[Tensor, "F 3"],
     fixed: Bool[Tensor, " E"],
-    flips: list[Int[Tensor, " C"]] | None = None,
+    flips: list[Tensor] | None = None,
 ) -> Cover:
     """Triangles that cover the given ones twice, flipped until they are Delaunay but for the edges that are `fixed`.
 

@@ -22,7 +22,7 @@ from torchlb.galerkin.assembly import (
     summed,
 )
 from torchlb.galerkin.curving import CurvedMesh, CurvingPlan
-from torchlb.galerkin.delaunay import mollified
+from torchlb.galerkin.delaunay import sound_lengths
 from torchlb.galerkin.elements import Element, simplex, subsets
 from torchlb.galerkin.prolongation import prolongation
 from torchlb.geometry.local_fits import FitPlan, LocalFits
@@ -104,13 +104,13 @@ class Forms:
 
         A star's simplex is in those of all its corners, each of which has an equal share of it.
         """
-        nodes, count, own, flats = plan.nodes, len(fits.points), ~plan.coarse, []
+        nodes, own, flats = plan.nodes, ~plan.coarse, []
         if mesh.cover is not None:
             same: Any = sparse.eye_array(len(own), format="csr")
             mix = mesh.cover.mixed() @ same[plan.coarse.numpy()]
             flats.append(FlatCells(mesh.cover.faces, mesh.cover.lengths, 0.5, True, mix))
         if len(stars):
-            lengths = mollified(edge_lengths(fits.points, stars), stars)
+            lengths = sound_lengths(edge_lengths(fits.points, stars), stars)
             flats.append(FlatCells(stars, lengths, 1 / stars.shape[1], False, None))
         p = prolongation(fit_plan, fits, plan, mesh)
         cells, faces = (nodes.cells[own], mesh.lengths[own]), own.nonzero()[:, 0]
@@ -225,7 +225,7 @@ def _slopes(
     metric: Float[Tensor, "T Q S"],
     element: Element,
     nodes: Int[Tensor, "T n"],
-    values: list[Float[Tensor, "NX C"]],
+    values: list[Tensor],
 ) -> Float[Tensor, "T Q"]:
     """Weights times Σ_c ∇w_c·∇u_c at the Gauss points."""
     found = []

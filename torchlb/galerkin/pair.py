@@ -111,7 +111,7 @@ class PairPlan:
 
     @property
     def counts(self) -> Int[Tensor, "4 N"]:
-        """Of each vertex: degree of its fit, 0 if it is flat; why no higher, a place in `REASONS`; edges; curved ones."""
+        """Of each vertex: degree of its fit, 0 if flat; why no higher, a place in `REASONS`; edges; curved edges."""
         fits, edges = self.fits, self.curving.nodes.edges
         ends = edges, edges[self.curving.curved]
         uses = [torch.bincount(e.flatten(), minlength=len(fits.degree)) for e in ends]
@@ -211,7 +211,7 @@ def boundary_mass(points: Tensor, plan: CurvingPlan, mesh: CurvedMesh, p: Any) -
 
 
 def stored(matrix: Any, rim: Any = None) -> SparsePair:
-    """Of K + iM: exactly symmetric, rows of K sum to zero, as real parts on one pattern; `rim` is the boundary's mass."""
+    """K + iM, exactly symmetric and with rows of K that sum to zero, as real matrices; `rim` is the boundary's mass."""
     matrix = sparse.csr_array(matrix)
     matrix.sort_indices()
     other: Any = sparse.csr_array(matrix.T)

@@ -81,8 +81,8 @@ class BoundaryPlan:
     members: Int[Tensor, " b"]
     sides: Int[Tensor, "G d"]
     opposite: Int[Tensor, " G"]
-    inside: Int[Tensor, "b q"]
-    near: Int[Tensor, "b K"]
+    inside: Int[Tensor, "_ q"]
+    near: Int[Tensor, "_ K"]
     fits: FitPlan | None
     crease: Bool[Tensor, " b"]
 

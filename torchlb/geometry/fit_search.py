@@ -69,7 +69,7 @@ class _Pile:
 
 
 class FitSearch:
-    """Fits of heights, of the first of the degrees q, q − 1, … that is regular; and of functions, of the first of theirs.
+    """Fits of heights, of the first of the degrees q, q − 1, … that is regular; and of functions, likewise.
 
     Parameters
     ----------

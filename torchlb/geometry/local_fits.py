@@ -75,9 +75,9 @@ class FitPlan:
     highest
         Degree up to which graphs are kept.
     jet, reach
-        Degree up to which fits of functions are kept, and the part of the way to a node where they are asked. Of fits of
-        degree 2 and 3 that is the gradient, half of the way: for the cubic Hermite interpolant in the middles of edges
-        (u_a + u_b)/2 + (∂u_a − ∂u_b)/8, ∂ along the edge, is the mean of u_a + ∇u_a·y there.
+        Degree up to which fits of functions are kept, and the part of the way to a node where they are asked. Of fits
+        of degree 2 and 3 that is the gradient, half of the way: the cubic Hermite interpolant in the middle of an edge,
+        (u_a + u_b)/2 + (∂u_a − ∂u_b)/8 with ∂ along it, is the mean of u_a + ∇u_a·y there.
     """
 
     surface: list[Neighborhoods]
@@ -127,7 +127,7 @@ class LocalFits:
         terms = num_monomials(initial.shape[2], degree) - 1
         self.heights = points.new_zeros(len(points), terms, points.shape[1])
         self.surface_radius, self.radius = points.new_ones(2, len(points))
-        self.coefficients: list[Float[Tensor, "b M neighbors"]] = []
+        self.coefficients: list[Tensor] = []
 
     @classmethod
     def at(
@@ -152,7 +152,7 @@ class LocalFits:
     def fitted(
         self, block: Neighborhoods
     ) -> tuple[CenteredFit, Float[Tensor, "b neighbors n"], Float[Tensor, "b M n"]]:
-        """The fits, the heights over the initial planes that they are to follow, and the graphs that they make of them."""
+        """The fits, the heights over the initial planes that they are to follow, and the graphs that they make."""
         frame, places = at(self.initial, block.vertices), at(self.points, block.points)
         offset = places[:, 1:] - places[:, :1]
         coords = offset @ frame

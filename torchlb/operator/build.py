@@ -40,6 +40,7 @@ from torchlb.operator.doubts import warn_of_doubts, warn_of_joins
 from torchlb.operator.inputs import ArrayLike, check_points
 from torchlb.operator.options import Options
 from torchlb.operator.plan import Plan, stencils_of
+from torchlb.operator.storage import OperatorStorage
 from torchlb.stability.enforce import certify
 from torchlb.stencils.assemble import assemble
 from torchlb.stencils.conditions import CONDITIONS
@@ -155,13 +156,13 @@ def _build_on_surface(
     )
     pair = plan = None
     if degree > 0:
-        held, fits = shape.held, shape.fits
-        assert fits is not None and shape.plan is not None
-        own = surface.faces, shape.plan.fits, fits, degree, degrees, surface.stars, held
-        plan, pair = mesh_pair(places, *own)
+        assert shape.plan is not None
+        assert shape.fits is not None
+        own = surface.faces, shape.plan.fits, shape.fits, degree, degrees
+        plan, pair = mesh_pair(places, *own, surface.stars, shape.held)
         assert pair.mass is not None
         shape = replace(shape, areas=pair.mass)
-        warn_of_doubts(surface, shape.plan.fits, pair.mass)
+        warn_of_doubts(surface, plan.fits, pair.mass)
     warn_of_joins(surface, where)
     built = _finished(shape, "points", options, REMEDY.format(2), settings["progress"], pair, plan)
     faces = numbering.given[surface.faces]
@@ -246,7 +247,8 @@ def build_mesh(
             warn(NOWHERE)
         pair = plan = None
         if degree > 0:
-            assert shape.fits is not None and shape.plan is not None
+            assert shape.plan is not None
+            assert shape.fits is not None
             own = shape.plan.fits, shape.fits, degree, degrees
             plan, pair = mesh_pair(here, corners, *own, held=shape.held)
             assert pair.mass is not None
@@ -257,6 +259,17 @@ def build_mesh(
         none = order.new_zeros(0)
         built = _with_plan(built, shape, plan, options, numbering, order, none)
     return built.restored(numbering, vertices, given)
+
+
+def built_again(lb: OperatorStorage) -> AssembledOperator:
+    """The operator of a mesh or a cloud, from what is stored of it."""
+    points, options = lb.points.detach().cpu().double(), Options(**lb.options)
+    boundary = None if lb.boundary is None else lb.boundary.cpu()
+    settings: dict[str, Any] = {"boundary": boundary, "progress": False}
+    if lb.source == "mesh":
+        return build_mesh(points, lb.faces.cpu(), options, **settings)
+    normals = lb.normals.cpu() if len(lb.normals) else None
+    return build_cloud(points, lb.dim, options, normals=normals, **settings)
 
 
 def build_cotangent(vertices: ArrayLike, faces: ArrayLike) -> AssembledOperator:

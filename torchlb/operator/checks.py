@@ -13,7 +13,7 @@ from torch import Tensor
 
 from torchlb.errors import InputError, first_few, warn
 from torchlb.fits.polynomials import num_monomials
-from torchlb.galerkin.curving import NO_VOLUME
+from torchlb.galerkin.delaunay import NO_VOLUME
 from torchlb.geometry.noise import in_two_layers
 from torchlb.operator.cleaning import (
     are_quads,

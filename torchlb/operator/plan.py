@@ -52,7 +52,7 @@ class Plan:
     shape: ShapePlan
     rows: RowsPlan
     pair: PairPlan
-    flips: list[Int[Tensor, " C"]]
+    flips: list[Tensor]
     faces: Int[Tensor, "F corners"]
     order: Int[Tensor, " G"]
     on_mesh: bool

@@ -82,7 +82,7 @@ class OperatorStorage(nn.Module):
         self.surface: SurfaceSummary | None = None
         self._sizes: list[Tensor] | None = None
         self.parts: list[dict[str, Any]] | None = None  # the extra states of the shapes of a batch
-        self.plan: Any = None
+        self._plan: Any = None
         self._bounds: Tensor | None = None
         self._pairs = torch.empty(0, 0)  # as many rows as `num_pairs`
         for name in BUFFERS:
@@ -102,7 +102,7 @@ class OperatorStorage(nn.Module):
 
     def __getstate__(self) -> dict[str, Any]:
         """For copies and files: without the plan, which is made again when it is asked for."""
-        return {**self.__dict__, "plan": None}
+        return {**self.__dict__, "_plan": None}
 
     def __getattr__(self, name: str) -> Any:
         """A buffer. Not by way of `nn.Module`, for whose buffers `torch.compile` makes a graph of every size."""

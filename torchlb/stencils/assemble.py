@@ -308,7 +308,10 @@ class Stencils:
         for row, _, _, degree in found:
             rows.slope[fitted[row]] = degree
         local = [fitted[row].repeat_interleave(index.shape[1]) for row, index, *_ in found]
-        index, gradient = (torch.cat([f[i].flatten(0, 1) for f in found]) for i in (1, 2))
+        index, gradient = (
+            torch.cat([part.flatten(0, 1) for part in parts])
+            for parts in ([f[1] for f in found], [f[2] for f in found])
+        )
         return rows.with_gradient(torch.cat(local), index, gradient)
 
     def _gradients(

@@ -17,7 +17,7 @@ from torch import Tensor
 
 from torchlb.errors import first_few, warn
 from torchlb.galerkin.assembly import linear_elements
-from torchlb.galerkin.delaunay import delaunay_cover, mollified
+from torchlb.galerkin.delaunay import delaunay_cover, sound_lengths
 from torchlb.galerkin.nodes import lagrange_nodes
 from torchlb.geometry.boundary import Boundary
 from torchlb.geometry.neighbors import GraphBalls, nearest_neighbors
@@ -52,8 +52,8 @@ def simplex_shares(
 class MeshLowOrder:
     """Linear elements with lumped mass: on triangles those of the intrinsic Delaunay triangulation (`delaunay_cover`).
 
-    Negative weights, which tetrahedra may have, are left out, so that rows are those of an M-matrix; where several
-    segments meet, what flows in flows out.
+    Symmetric and negative in the mass, so that the certificate holds for these rows alone; those of segments and of
+    triangles are M-matrix rows, too. Where several segments meet, what flows in flows out.
 
     Parameters
     ----------
@@ -67,30 +67,29 @@ class MeshLowOrder:
         self,
         points: Float[Tensor, "N n"],
         cells: Int[Tensor, "F corners"],
-        flips: list[Int[Tensor, " C"]] | None = None,
+        flips: list[Tensor] | None = None,
     ) -> None:
         self.points, self.cells, self._flips = points, cells, flips
 
     @property
-    def flips(self) -> list[Int[Tensor, " C"]]:
+    def flips(self) -> list[Tensor]:
         """The flips of edges that lead to the triangulation; none where it was not needed, or is not of triangles."""
         return self._elements[2] if "_elements" in vars(self) else []
 
     @cached_property
-    def _elements(self) -> tuple[sparse.csr_array, Float[Tensor, " N"], list[Int[Tensor, " C"]]]:
+    def _elements(self) -> tuple[sparse.csr_array, Float[Tensor, " N"], list[Tensor]]:
         """Stiffness, lumped mass, and flips."""
         nodes, flips, share = lagrange_nodes(self.cells, len(self.points), 1), [], 1.0
-        cells, lengths = nodes.cells, nodes.lengths(self.points)
+        cells, lengths = nodes.cells, sound_lengths(nodes.lengths(self.points), nodes.cells)
         if nodes.dim == 2:
             free = torch.zeros(len(nodes.edges), dtype=torch.bool)
-            lengths = mollified(lengths, cells)
             cover = delaunay_cover(cells, lengths, nodes.edge, free, self._flips)
             cells, lengths, flips, share = cover.faces, cover.lengths, cover.flips, 0.5
         pair = share * linear_elements(lengths, cells, len(self.points))
         return pair.real, torch.from_numpy(pair.imag.sum(axis=1)), flips
 
     def areas(self) -> Float[Tensor, " N"]:
-        """Equal shares of the cells around each vertex, ℓ^d; those of the triangulation where some have next to none."""
+        """Equal shares of the cells around each vertex, ℓ^d; the triangulation's where some have next to none."""
         shares = simplex_shares(self.points, self.cells)
         longest = torch.zeros_like(shares)
         square = (
@@ -120,12 +119,8 @@ class MeshLowOrder:
 
     @cached_property
     def _matrix(self) -> sparse.csr_array:
-        off = sparse.coo_array(-self._elements[0])
-        row, col = off.coords
-        keep = (row != col) & (off.data > 0)
-        weights = sparse.csr_array((off.data[keep], (row[keep], col[keep])), shape=off.shape)
-        strong = with_diagonal(sparse.csr_array(weights - sparse.diags_array(weights.sum(axis=1))))
-        return sparse.csr_array(sparse.diags_array(1 / self._masses.numpy()) @ strong)
+        strong = -sparse.diags_array(1 / self._masses.numpy()) @ self._elements[0]
+        return with_diagonal(sparse.csr_array(strong))
 
 
 class CloudLowOrder:

@@ -227,11 +227,14 @@ def mesh_shape(
         edge = boundary_of_mesh(vertices, faces, normal_order)
     if boundary is not None:
         edge = _part(edge, boundary)
-    low_order = None if areas is not None else MeshLowOrder(vertices, faces)
+    low_order = None
+    if areas is None:
+        low_order = MeshLowOrder(vertices, faces)
+        areas = low_order.areas()
     side = torch.ones(len(vertices), dtype=torch.int8) if hypersurface else None
     whole = ShapePlan(faces, plan, side, None if condition is None else edge)
-    shares = areas if low_order is None else low_order.areas()
-    return _shape(whole, fits, balls, shares, low_order, condition, on_mesh=faces.shape[1] == 3)
+    on_mesh = faces.shape[1] == 3
+    return _shape(whole, fits, balls, areas, low_order, condition, on_mesh)
 
 
 def surface_shape(

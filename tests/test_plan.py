@@ -1,0 +1,158 @@
+"""Plan and evaluate: what is decided once says at the same points what was built, at others what has moved."""
+
+import copy
+import math
+from functools import cache
+
+import numpy as np
+import pytest
+import torch
+from scipy.spatial import Delaunay
+
+from torchlb import LaplaceBeltrami
+from torchlb.errors import InputError
+from torchlb.operator.plan import evaluate
+from torchlb.surfaces import Ellipsoid, Hemisphere, SpaceCurve, Sphere, Torus, UnitDisk
+
+
+def grid(n):
+    axes = [torch.linspace(0, 1, n, dtype=torch.float64)] * 3
+    points = torch.cartesian_prod(*axes)
+    inside = ((points > 0) & (points < 1)).all(1, keepdim=True)
+    noise = torch.rand(points.shape, generator=torch.Generator().manual_seed(0)).double()
+    return points + 0.3 / n * (noise - 0.5) * inside
+
+
+def tetrahedra(n):
+    points = grid(n)
+    return points, torch.from_numpy(Delaunay(points.numpy()).simplices).long()
+
+
+def noisy_sphere():
+    vertices, faces = Sphere().mesh(400)
+    noise = torch.randn(vertices.shape, generator=torch.Generator().manual_seed(1)).double()
+    return vertices + 0.05 * noise, faces
+
+
+def random_square():
+    """Long triangles along the boundary, which the cover stands for."""
+    points = np.random.default_rng(0).random((200, 2))
+    faces = torch.from_numpy(Delaunay(points).simplices).long()
+    return torch.nn.functional.pad(torch.from_numpy(points), (0, 1)), faces
+
+
+def knot():
+    points = SpaceCurve().points(100)
+    return points, torch.stack([torch.arange(100), (torch.arange(100) + 1) % 100], 1)
+
+
+MESHES = {
+    "sphere": lambda: LaplaceBeltrami.from_mesh(*Sphere().mesh(300)),
+    "order 1": lambda: LaplaceBeltrami.from_mesh(*UnitDisk().mesh(300), order=1),
+    "order 5": lambda: LaplaceBeltrami.from_mesh(*Hemisphere().mesh(500), order=5),
+    "held": lambda: LaplaceBeltrami.from_mesh(*Hemisphere().mesh(300), condition="dirichlet"),
+    "along normals": lambda: LaplaceBeltrami.from_mesh(*Torus().mesh(400), projection="normal"),
+    "splines": lambda: LaplaceBeltrami.from_mesh(*Torus().mesh(400), weights="polyharmonic"),
+    "noise": lambda: LaplaceBeltrami.from_mesh(*noisy_sphere()),
+    "long triangles": lambda: LaplaceBeltrami.from_mesh(*random_square()),
+    "curve": lambda: LaplaceBeltrami.from_mesh(*knot()),
+    "solid": lambda: LaplaceBeltrami.from_mesh(*tetrahedra(6)),
+    "solid, held": lambda: LaplaceBeltrami.from_mesh(*tetrahedra(6), condition="dirichlet"),
+    "cloud": lambda: LaplaceBeltrami.from_points(Ellipsoid().points(400)),
+    "cloud of a disk": lambda: LaplaceBeltrami.from_points(UnitDisk().points(300)),
+}
+built = cache(lambda name: MESHES[name]())
+
+
+@pytest.mark.filterwarnings("ignore:.*low-order rows")
+@pytest.mark.parametrize("name", MESHES)
+def test_at_the_same_points_it_is_the_operator(name):
+    """Every matrix, the mass, frames, normals and the report, to 1e-12 of the largest entry; splines to 1e-10."""
+    lb, bound = built(name), 1e-10 if name == "splines" else 1e-12
+    again = lb.at(lb.points)
+    for key, ours in lb.tensors.items():
+        theirs = again.tensors[key]
+        assert ours.shape == theirs.shape, key
+        if ours.is_floating_point() and ours.numel():
+            scale = ours.abs().nan_to_num().max().clamp_min(1e-300)
+            gap = (ours - theirs).abs()[~(ours.isnan() & theirs.isnan())] / scale
+            assert gap.numel() == 0 or gap.max() < bound, key
+        else:
+            assert torch.equal(ours, theirs), key
+
+
+@pytest.mark.parametrize("name", ["sphere", "held", "curve", "solid", "cloud"])
+def test_a_shape_that_is_turned_scaled_and_moved(name):
+    """λ falls by the square of the scale; the plan is the same."""
+    lb = built(name)
+    turn, _ = torch.linalg.qr(torch.randn(3, 3, dtype=torch.float64))
+    moved = lb.at(1.7 * lb.points @ turn + 0.3)
+    ours, theirs = (operator.eigenbasis(6).eigenvalues for operator in (lb, moved))
+    torch.testing.assert_close(theirs[1:] * 1.7**2, ours[1:], rtol=1e-8, atol=0)
+    if name != "curve":
+        torch.testing.assert_close(
+            moved.mass / lb.mass, lb.mass * 0 + 1.7**lb.dim, rtol=1e-8, atol=0
+        )
+    assert moved.plan is lb.plan
+
+
+def test_a_sphere_becomes_an_ellipsoid():
+    """As accurate as the operator that is built on the ellipsoid: eigenvalues within 1e-4 of each other."""
+    lb = LaplaceBeltrami.from_mesh(*Sphere().mesh(1500))
+    axes = torch.tensor([1.0, 1.15, 0.9], dtype=torch.float64)
+    moved, anew = lb.at(lb.points * axes), LaplaceBeltrami.from_mesh(lb.points * axes, lb.faces)
+    values = [operator.eigenbasis(12).eigenvalues[1:] for operator in (moved, anew)]
+    torch.testing.assert_close(*values, rtol=1e-4, atol=0)
+    f = moved.points[:, 0].square()
+    assert (moved(f) - anew(f)).abs().max() < 0.02 * anew(f).abs().max()
+
+
+def test_a_curve_that_is_stretched_is_differentiated_by_its_length():
+    """Of a circle that becomes twice as large λ is a quarter; of one that is turned over it stays."""
+    angle = 2 * math.pi * torch.arange(60, dtype=torch.float64) / 60
+    circle = torch.stack([angle.cos(), angle.sin()], 1)
+    segments = torch.stack([torch.arange(60), (torch.arange(60) + 1) % 60], 1)
+    lb = LaplaceBeltrami.from_mesh(circle, segments)
+    for points, factor in ((2 * circle, 0.25), (circle.flip(1), 1.0)):
+        values = lb.at(points).eigenbasis(5).eigenvalues
+        torch.testing.assert_close(
+            values[1:], factor * lb.eigenbasis(5).eigenvalues[1:], rtol=1e-9, atol=0
+        )
+
+
+def test_a_plan_has_no_unit_of_length():
+    """Made of points a million times as large it says the same."""
+    vertices, faces = Torus().mesh(300)
+    one, two = (LaplaceBeltrami.from_mesh(s * vertices, faces) for s in (1.0, 2.0**20))
+    again = evaluate(two.plan, one.points)
+    torch.testing.assert_close(again.rows.laplacian, one.values, rtol=1e-9, atol=1e-9)
+
+
+def test_copies_and_files_decide_anew(tmp_path):
+    lb = built("held")
+    loaded = LaplaceBeltrami()
+    loaded.load_state_dict(lb.state_dict())
+    for other in (copy.deepcopy(lb), loaded):
+        again = other.at(lb.points)
+        torch.testing.assert_close(again.weak_values, lb.weak_values)
+        torch.testing.assert_close(again.values, lb.values)
+
+
+def test_what_has_no_plan_says_so():
+    lb = built("sphere")
+    with pytest.raises(InputError, match="as the operator has"):
+        lb.at(lb.points[1:])
+    batch = LaplaceBeltrami.batch([lb, lb])
+    cotangent = LaplaceBeltrami.from_cotangent(lb.points, lb.faces)
+    certified = LaplaceBeltrami.from_mesh(lb.points, lb.faces, certify=True)
+    for other in (batch, cotangent, certified):
+        with pytest.raises(InputError, match="plan: "):
+            other.at(other.points)
+
+
+def test_a_noisy_cloud_is_not_smoothed_again():
+    points = Sphere().points(800)
+    noise = torch.randn(points.shape, generator=torch.Generator().manual_seed(2)).double()
+    lb = LaplaceBeltrami.from_points(points + 0.03 * noise)
+    with pytest.raises(InputError, match="put elsewhere"):
+        lb.at(lb.points)
