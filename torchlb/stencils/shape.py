@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import torch
 from jaxtyping import Bool, Float, Int
 from scipy import sparse
 from torch import Tensor
+from torch.nn.functional import normalize
 from tqdm import tqdm
 
 from torchlb.errors import InputError, first_few, warn
@@ -36,6 +38,7 @@ from torchlb.geometry.neighbors import (
 )
 from torchlb.geometry.orientation import consistently_wound, orient_normals, thin_sides
 from torchlb.geometry.surface import CloudSurface
+from torchlb.geometry.vectors import dot
 from torchlb.stencils.conditions import Condition, Neumann
 from torchlb.stencils.low_order import CloudLowOrder, MeshLowOrder
 
@@ -43,6 +46,56 @@ LowOrder = CloudLowOrder | MeshLowOrder
 NEUMANN = Neumann()
 CANDIDATES = {1: 32, 2: 24, 3: 64}
 """Nearest points from which the frames and the graph of a cloud start, by dimension."""
+
+
+class FirstNormals(NamedTuple):
+    """Normals of a surface in R³ that are better than those of its triangles, as what they are beside these.
+
+    Attributes
+    ----------
+    neighbor
+        (N,), a point beside each, towards which the first tangent is.
+    components
+        (N, 3), along the triangles' normal, that tangent, and the vector orthogonal to both.
+    """
+
+    neighbor: Int[Tensor, " N"]
+    components: Float[Tensor, "N 3"]
+
+
+def _axes(
+    points: Float[Tensor, "N 3"], triangles: Int[Tensor, "F 3"], neighbor: Int[Tensor, " N"]
+) -> Float[Tensor, "N 3 3"]:
+    """Of each point the normal of the triangles around it, and two tangents; any where there are none."""
+    normal = vertex_normals(points, triangles)
+    normal = torch.where((normal == 0).all(1, keepdim=True), normal.new_tensor([0.0, 0, 1]), normal)
+    along = points[neighbor] - points
+    along = along - dot(along, normal)[:, None] * normal
+    flat = dot(along, along)[:, None] == 0
+    along = normalize(torch.where(flat, complete_frames(normal)[..., 0], along))
+    return torch.stack([normal, along, torch.linalg.cross(normal, along)], 1)
+
+
+def first_normals(
+    points: Float[Tensor, "N 3"], triangles: Int[Tensor, "F 3"], normals: Float[Tensor, "N 3"]
+) -> FirstNormals:
+    """What given normals are beside those of the triangles."""
+    neighbor = torch.arange(len(points))
+    neighbor[triangles.flatten()] = triangles.roll(1, 1).flatten()
+    axes = _axes(points, triangles, neighbor)
+    return FirstNormals(neighbor, (axes @ normals[..., None])[..., 0])
+
+
+def first_frames(
+    points: Float[Tensor, "N n"], cells: Int[Tensor, "F corners"], start: FirstNormals | None
+) -> Float[Tensor, "N n d"]:
+    """The frames that fits are over."""
+    if start is None:
+        return mesh_frames(points, cells)
+    axes = _axes(points, cells, start.neighbor)
+    normal = normalize((start.components[:, None] @ axes)[:, 0])
+    first = normalize(axes[:, 1] - dot(axes[:, 1], normal)[:, None] * normal)
+    return torch.stack([first, torch.linalg.cross(normal, first)], -1)
 
 
 @dataclass(frozen=True)
@@ -55,6 +108,8 @@ class ShapePlan:
         (F, d + 1), whose planes the frames start from.
     fits
         Of heights, and of functions where there is to be a weak pair.
+    start
+        The first normals of a cloud's surface; None where frames start from the planes of the cells.
     side
         (N,), ±1: on which side of the normal of the cells around a vertex its own is; None for shapes without sides.
     boundary
@@ -63,12 +118,13 @@ class ShapePlan:
 
     cells: Int[Tensor, "F corners"]
     fits: FitPlan
+    start: FirstNormals | None
     side: Int[Tensor, " N"] | None
     boundary: BoundaryPlan | None
 
     def at(self, points: Float[Tensor, "N n"]) -> tuple[Placed, LocalFits]:
         """Frames, normals and boundary at these points, and the fits behind them."""
-        fits = LocalFits.at(self.fits, points, mesh_frames(points, self.cells))
+        fits = LocalFits.at(self.fits, points, first_frames(points, self.cells, self.start))
         return self.placed(fits), fits
 
     def placed(self, fits: LocalFits) -> Placed:
@@ -232,7 +288,7 @@ def mesh_shape(
         low_order = MeshLowOrder(vertices, faces)
         areas = low_order.areas()
     side = torch.ones(len(vertices), dtype=torch.int8) if hypersurface else None
-    whole = ShapePlan(faces, plan, side, None if condition is None else edge)
+    whole = ShapePlan(faces, plan, None, side, None if condition is None else edge)
     on_mesh = faces.shape[1] == 3
     return _shape(whole, fits, balls, areas, low_order, condition, on_mesh)
 
@@ -262,7 +318,8 @@ def surface_shape(
         others = sparse.diags_array((~surface.lone).numpy().astype(graph.dtype))
         graph = sparse.csr_array(others @ graph @ others)
         graph.eliminate_zeros()
-    balls = GraphBalls(points, graph, mesh_frames(points, triangles), sides)
+    start = None if flat else first_normals(points, triangles, surface.normals)
+    balls = GraphBalls(points, graph, first_frames(points, triangles, start), sides)
     plan, fits = _searched(balls, normal_order, num_neighbors, progress, fit_degrees)
     edge = None
     if condition is not None:
@@ -280,7 +337,7 @@ def surface_shape(
         against = (own * vertex_normals(points, triangles)).sum(1) < 0
         side = torch.where(against, -1, 1).to(torch.int8)
     low_order = MeshLowOrder(points, triangles)
-    whole = ShapePlan(triangles, plan, side, edge)
+    whole = ShapePlan(triangles, plan, start, side, edge)
     return _shape(whole, fits, balls, low_order.areas(), low_order, condition)
 
 

@@ -1,0 +1,208 @@
+"""Simplices through a cloud of any codimension, from the star that every point has in its tangent plane.
+
+The star is that of the Delaunay triangulation of its neighbours, projected there: the tangential Delaunay complex
+(Boissonnat, Ghosh 2014). On a surface the stars nearly agree; where they do not, triangles are taken greedily, those of
+more stars first, as long as they neither overlap around a point nor share an edge with two others, and what stays open
+is closed ear by ear. In higher dimensions all simplices count, each by the part of it that lies in the Voronoi cells of
+the points whose stars have it: that is 1 where all do, and cells of points on a sphere do not depend on which of their
+triangulations a star has.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from itertools import permutations
+
+import numpy as np
+from jaxtyping import Float, Int
+from scipy.spatial import Delaunay, QhullError
+from torch import Tensor
+
+from torchlb.geometry.admission import mutually_admissible, planes_of
+from torchlb.geometry.manifold import Faces, boundary_loops, edges_of
+from torchlb.geometry.vectors import lengths
+
+REACH, NEAR = 3.0, 6
+"""Largest circumradius of a simplex of a star, over the distance of its point to the neighbour of this number."""
+OVERLAP = 0.05
+"""Angle by which triangles may overlap around a point."""
+LOOP = 12
+"""Edges of the largest loop that is closed."""
+FLAT = 1e-6
+"""Volume of a simplex over the product of its edges at a corner, below which it is none."""
+
+
+def delaunay_stars(
+    points: Float[Tensor, "N n"], frames: Float[Tensor, "N n d"], candidates: Int[Tensor, "N K"]
+) -> Int[np.ndarray, "S corners"]:
+    """Simplices of the star of every point, that point first."""
+    dim, found = frames.shape[2], []
+    _, _, good = mutually_admissible(points, planes_of(frames), candidates)
+    offset = points[candidates[:, 1:]] - points[:, None]
+    coords, near = (offset @ frames).numpy(), candidates.numpy()
+    reach = REACH * offset.norm(dim=2)[:, min(NEAR, offset.shape[1]) - 1].numpy()
+    for point, mask in enumerate(good.numpy()):
+        others = near[point, 1:][mask]
+        if len(others) <= dim:
+            continue
+        places = np.concatenate([np.zeros((1, dim)), coords[point][mask]])
+        try:
+            cells = Delaunay(places).simplices
+        except QhullError:  # all in a line, or a plane
+            continue
+        cells = cells[(cells == 0).any(1)]
+        cells = cells[cells != 0].reshape(-1, dim)
+        corners = places[cells]
+        sound = np.abs(np.linalg.det(corners)) > FLAT * lengths(corners).prod(1)
+        cells, corners = cells[sound], corners[sound]
+        square = (corners**2).sum(2)[..., None] / 2
+        radius = np.linalg.norm(np.linalg.solve(corners, square)[..., 0], axis=1)
+        cells = cells[radius <= reach[point]]
+        first = np.full((len(cells), 1), point)
+        found.append(np.concatenate([first, others[cells - 1]], 1))
+    return np.concatenate([np.zeros((0, dim + 1), dtype=np.int64), *found])
+
+
+def shared(
+    points: Float[np.ndarray, "N n"], stars: Int[np.ndarray, "S corners"]
+) -> tuple[Int[np.ndarray, "F corners"], Float[np.ndarray, " F"]]:
+    """The simplices of all stars, and which part of each counts."""
+    cells, number, votes = np.unique(
+        np.sort(stars, 1), axis=0, return_inverse=True, return_counts=True
+    )
+    part = np.bincount(number.ravel(), voronoi_shares(points[stars]), minlength=len(cells))
+    part = np.where(votes == stars.shape[1], 1.0, part.clip(0.0, 1.0))
+    return cells[part > 0], part[part > 0]
+
+
+def voronoi_shares(corners: Float[np.ndarray, "S corners n"]) -> Float[np.ndarray, " S"]:
+    """Part of each simplex that is in the Voronoi cell of its first corner, with signs; they sum to 1 over its corners.
+
+    The cell is made of simplices of that corner, the centre of an edge there, that of the circumcircle of a triangle
+    at the edge, and so on to the circumcentre.
+
+    >>> voronoi_shares(np.array([[[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]]])).tolist()
+    [0.5]
+    """
+    dim = corners.shape[1] - 1
+    edges = corners[:, 1:] - corners[:, :1]
+    places = np.linalg.qr(edges.transpose(0, 2, 1))[1].transpose(0, 2, 1)  # in its own space
+    whole = np.linalg.det(places)
+    total, sound = np.zeros(len(places)), np.abs(whole) > FLAT * lengths(places).prod(1)
+    places, whole = places[sound], whole[sound]
+    for order in permutations(range(dim)):
+        chain = places[:, list(order)]
+        square = (chain**2).sum(2)[..., None] / 2
+        gram = chain @ chain.transpose(0, 2, 1)
+        centers = [
+            (np.linalg.solve(gram[:, :k, :k], square[:, :k]).transpose(0, 2, 1) @ chain[:, :k])[
+                :, 0
+            ]
+            for k in range(1, dim + 1)
+        ]
+        side = np.sign(np.linalg.det(chain))
+        total[sound] += side * np.linalg.det(np.stack(centers, 1)) / np.abs(whole)
+    return total
+
+
+def glued(
+    points: Float[np.ndarray, "N n"], frames: Float[np.ndarray, "N n 2"], stars: Faces
+) -> Faces:
+    """Triangles of the stars that make a surface: no edge has more than two, and none overlap around a point."""
+    triangles, votes = np.unique(np.sort(stars, 1), axis=0, return_counts=True)
+    order = np.lexsort((circumradii(points, triangles), -votes))
+    triangles, votes = triangles[order], votes[order]
+    edges = edges_of(triangles[votes == 3], len(points))
+    crowded = (edges.uses[edges.of] > 2).reshape(-1, 3).any(1)
+    sure = np.flatnonzero(votes == 3)[~crowded]
+    fans = _Fans(points, frames, triangles[sure])
+    rest = np.delete(triangles, sure, 0)
+    added = [face for face in rest.tolist() if fans.take(face)]
+    faces = np.concatenate([triangles[sure], np.array(added, dtype=np.int64).reshape(-1, 3)])
+    return _closed(points, faces)
+
+
+class _Fans:
+    """The triangles around every point, in its tangent plane."""
+
+    def __init__(
+        self, points: Float[np.ndarray, "N n"], frames: Float[np.ndarray, "N n 2"], faces: Faces
+    ) -> None:
+        self.points, self.frames = points, frames
+        edges = edges_of(faces, len(points))
+        self.uses = dict(zip(edges.keys.tolist(), edges.uses.tolist(), strict=True))
+        self.open = np.ones(len(points), dtype=bool)
+        self.open[faces.ravel()] = False
+        for end in edges.ends:
+            self.open[end[edges.rim]] = True
+        self.wedges: dict[int, list[tuple[float, float]]] = {}
+        for face in faces[self.open[faces].any(1)].tolist():
+            self._put(face)
+
+    def take(self, face: list[int]) -> bool:
+        """Add a triangle if it fits; whether it does."""
+        keys = [min(a, b) * len(self.points) + max(a, b) for a, b in _sides(face)]
+        if not self.open[face].all() or any(self.uses.get(key, 0) >= 2 for key in keys):
+            return False
+        for point, start, width in self._wedges_of(face):
+            for other, theirs in self.wedges.get(point, ()):
+                ahead, behind = (start - other) % (2 * np.pi), (other - start) % (2 * np.pi)
+                if ahead < theirs - OVERLAP or behind < width - OVERLAP:
+                    return False
+        for key in keys:
+            self.uses[key] = self.uses.get(key, 0) + 1
+        self._put(face)
+        return True
+
+    def _put(self, face: list[int]) -> None:
+        for point, start, width in self._wedges_of(face):
+            self.wedges.setdefault(point, []).append((start, width))
+
+    def _wedges_of(self, face: list[int]) -> Iterable[tuple[int, float, float]]:
+        """(point, first angle, width) at each corner."""
+        for k, point in enumerate(face):
+            ends = [face[k - 1], face[k - 2]]
+            x, y = ((self.points[ends] - self.points[point]) @ self.frames[point]).T
+            one, two = np.arctan2(y, x).tolist()
+            width = (two - one) % (2 * np.pi)
+            yield (point, one, width) if width <= np.pi else (point, two, 2 * np.pi - width)
+
+
+def _sides(face: list[int]) -> list[tuple[int, int]]:
+    return [(face[k - 1], face[k]) for k in range(len(face))]
+
+
+def circumradii(points: Float[np.ndarray, "N n"], faces: Faces) -> Float[np.ndarray, " F"]:
+    """Of triangles, ℓ; infinite for those without area."""
+    a, b, c = (
+        np.linalg.norm(points[faces[:, k - 1]] - points[faces[:, k]], axis=1) for k in range(3)
+    )
+    square = np.maximum((a + b + c) * (b + c - a) * (c + a - b) * (a + b - c), 0.0)
+    with np.errstate(divide="ignore"):
+        return a * b * c / np.sqrt(square)
+
+
+def _closed(points: Float[np.ndarray, "N n"], faces: Faces) -> Faces:
+    """The faces with short boundary loops closed, by the ear of the least circumradius first."""
+    count, new = len(points), [faces]
+    known = set(edges_of(faces, count).keys.tolist())
+    for loop in boundary_loops(faces, count):
+        if len(loop) > LOOP:
+            continue
+        ears, own = [], set()
+        while len(loop) > 3:
+            turn = np.stack([np.roll(loop, 1), loop, np.roll(loop, -1)], 1)
+            a, c = turn[:, 0], turn[:, 2]
+            keys = (np.minimum(a, c) * count + np.maximum(a, c)).tolist()
+            cost = circumradii(points, turn)
+            cost[[key in known or key in own for key in keys]] = np.inf
+            best = int(cost.argmin())
+            if not np.isfinite(cost[best]):
+                break
+            ears.append(turn[best])
+            own.add(keys[best])
+            loop = [*loop[:best], *loop[best + 1 :]]
+        if len(loop) == 3:
+            known |= own
+            new.append(np.array([*ears, loop]))
+    return np.concatenate(new)
