@@ -16,7 +16,7 @@ from torchlb.galerkin.assembly import element_matrices, flat_metric, summed
 from torchlb.galerkin.delaunay import delaunay_cover
 from torchlb.galerkin.elements import simplex
 from torchlb.galerkin.nodes import lagrange_nodes
-from torchlb.nn.conduction import conducting
+from torchlb.pde.conduction import conducting
 from torchlb.operator.medium import forms_of
 from torchlb.surfaces import UnitDisk
 

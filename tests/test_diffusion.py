@@ -14,7 +14,7 @@ from builders import stencil_of_cloud, stencil_of_mesh
 from torchlb import Diffusion, DiffusionError, InputError, LaplaceBeltrami, heat_flow
 from torchlb.linalg.exponential import chebyshev_coefficients, hyperbola
 from torchlb.linalg.spectral_bounds import Bounds
-from torchlb.nn.diffusion import Method, checked_method
+from torchlb.pde.heat import Method, checked_method
 from torchlb.surfaces import Circle, Sphere, Torus, UnitDisk
 
 METHODS = get_args(Method)

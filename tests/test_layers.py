@@ -29,9 +29,9 @@ from torchlb import (
     spectral_wavelets,
     wave_kernel_signature,
 )
-from torchlb.nn import systems
 from torchlb.nn.diffusion import LearnedTimes, raw_of_time
-from torchlb.nn.solves import implicit_step, potential
+from torchlb.pde import systems
+from torchlb.pde.solves import implicit_step, potential
 from torchlb.surfaces import Circle, Ellipsoid, Sphere, Torus, UnitDisk
 
 needs_compiler = pytest.mark.skipif(

@@ -20,8 +20,8 @@ from torchlb import (
     poisson_solve,
 )
 from torchlb.linalg.conjugate_gradients import conjugate_gradients
-from torchlb.nn import systems
-from torchlb.nn.pair_flow import _coefficients
+from torchlb.pde import systems
+from torchlb.pde.pair_flow import _coefficients
 from torchlb.surfaces import Ellipsoid, Sphere, StarShaped, Torus, UnitDisk
 
 

@@ -1,10 +1,10 @@
 """High-order Laplace–Beltrami operators on meshes and point clouds, for PyTorch.
 
 The packages, lowest first: `linalg`, matrices without shapes; `fits`, weights from local polynomials; `geometry`,
-neighbours, frames, boundaries; `baseline`, libigl's cotangents; `galerkin`, the weak pair; `stencils`, rows of Δ and ∇;
-`stability`, the certificate; `spectral`, eigenpairs and signatures; `operator`, the module that holds it
-all; `nn`, solves and layers that take it as an argument; `io` and `interop`, files and other libraries. `surfaces` are
-shapes with exact answers.
+neighbours, frames, boundaries; `baseline`, libigl's cotangents; `galerkin`, the weak pair; `stencils`, rows of Δ
+and ∇; `stability`, the certificate; `spectral`, eigenpairs and signatures; `operator`, the module that holds it
+all; `pde`, solves and flows; `nn`, layers; `io` and `interop`, files and other libraries. `surfaces` are shapes with
+exact answers.
 """
 
 from importlib import import_module
@@ -27,18 +27,19 @@ from torchlb.errors import (
 from torchlb.io.cache import load_operator, load_or_build, operator_key, save_operator
 from torchlb.io.files import read_shape
 from torchlb.io.precompute import PrecomputeReport, ShapeResult, precompute_operators
-from torchlb.nn.diffusion import Diffusion, heat_flow
+from torchlb.nn.diffusion import Diffusion
 from torchlb.nn.diffusion_net import DiffusionNet, DiffusionNetBlock
-from torchlb.nn.geodesics import geodesic_distance
 from torchlb.nn.gradient_features import GradientFeatures
 from torchlb.nn.implicit_diffusion import ImplicitDiffusion
 from torchlb.nn.poisson_block import PoissonBlock, PoissonFeatures
-from torchlb.nn.solves import implicit_step, poisson_solve
 from torchlb.nn.spectral_conv import SpectralConv
 from torchlb.operator.cleaning import clean_mesh, clean_points
 from torchlb.operator.collate import collate
 from torchlb.operator.laplace_beltrami import LaplaceBeltrami
 from torchlb.operator.report import StencilReport
+from torchlb.pde.geodesics import geodesic_distance
+from torchlb.pde.heat import heat_flow
+from torchlb.pde.solves import implicit_step, poisson_solve
 from torchlb.spectral.eigenbasis import Eigenbasis
 from torchlb.spectral.signatures import (
     diffusion_distance,

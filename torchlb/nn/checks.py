@@ -1,64 +1,15 @@
-"""What every layer asks of its input: one rule of shapes and types, one of names."""
+"""What every layer asks of its features."""
 
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable
-from functools import wraps
-from typing import Any, ParamSpec, TypeVar, get_args
 
 import torch
 from torch import Tensor
 
-from torchlb.errors import InputError, InputTypeError
-from torchlb.linalg.checks import check_finite, check_tensor
+from torchlb.errors import InputError
 from torchlb.operator.laplace_beltrami import LaplaceBeltrami
-
-P = ParamSpec("P")
-T = TypeVar("T")
-
-
-def check_shape(x: Tensor, lb: LaplaceBeltrami) -> None:
-    """InputError unless x is (N, C) or (B, N, C) with the N of the operator, InputTypeError unless a tensor."""
-    if not hasattr(lb, "num_points"):
-        raise InputTypeError(
-            f"expected an operator, got a {type(lb).__name__} in its place: functions take (lb, f), layers (x, lb); "
-            "several shapes are one operator, LaplaceBeltrami.batch(…), with features below each other, torch.cat(…)"
-        )
-    check_tensor(x)
-    if x.ndim not in (2, 3) or x.shape[-2] != lb.num_points:
-        raise InputError(
-            f"expected features of shape (N, C) or (B, N, C) with N = {lb.num_points}, got {tuple(x.shape)}"
-        )
-
-
-def as_columns(f: Tensor, lb: LaplaceBeltrami) -> Tensor:
-    """(N, C) or (B, N, C) of the f of a user, which may be (N,), too; integers and masks in the operator's type.
-
-    Errors as for `check_shape`, and InputError for complex numbers, NaN and infinity.
-    """
-    x = f[:, None] if isinstance(f, Tensor) and f.ndim == 1 else f
-    check_shape(x, lb)
-    if x.is_complex():
-        raise InputError(f"expected real f, got {x.dtype}; torch.view_as_real(f) makes channels")
-    check_finite(x)
-    return x if x.is_floating_point() else x.to(lb.dtype)
-
-
-def as_times(t: float | Tensor, x: Tensor, dtype: torch.dtype) -> Tensor:
-    """Times for the channels of x, (C,); InputError unless they are one or C, finite and at least 0.
-
-    >>> as_times(0.5, torch.ones(4, 2), torch.float32)
-    tensor([0.5000, 0.5000])
-    """
-    time = torch.as_tensor(t, dtype=dtype, device=x.device)
-    if time.shape not in ((), (1,), x.shape[-1:]):
-        raise InputError(
-            f"t: expected one time or one for each of {x.shape[-1]} channels, got {tuple(time.shape)}"
-        )
-    if not torch.compiler.is_compiling() and not bool(((time >= 0) & time.isfinite()).all()):
-        raise InputError(f"t: expected finite times of at least 0, got {time.detach().cpu()}")
-    return time.expand(x.shape[-1])
+from torchlb.pde.checks import check_shape
 
 
 def check_features(
@@ -99,22 +50,3 @@ def unrounded(x: Tensor, lb: LaplaceBeltrami, channels: int, parameter: Tensor) 
     """
     check_features(x, lb, channels, parameter)
     return x.to(parameter.dtype)
-
-
-def uncompiled(function: Callable[P, T]) -> Callable[P, T]:
-    """`torch.compiler.disable`, put off until something is compiled: it loads the compiler, in more than a second."""
-
-    @wraps(function)
-    def called(*args: P.args, **options: P.kwargs) -> T:
-        if torch.compiler.is_compiling():
-            disabled: Any = torch.compiler.disable(function)
-            return disabled(*args, **options)
-        return function(*args, **options)
-
-    return called
-
-
-def check_choice(name: str, value: str, choices: Any) -> None:
-    """InputError unless the value is one of a Literal."""
-    if value not in get_args(choices):
-        raise InputError(f"{name}: expected one of {get_args(choices)}, got {value!r}")

@@ -15,13 +15,15 @@ from jaxtyping import Float, Int
 from torch import Tensor, nn
 
 from torchlb.errors import InputError
-from torchlb.nn.checks import check_choice, check_features, unrounded
-from torchlb.nn.diffusion import Diffusion, Method, raw_of_time
+from torchlb.nn.checks import check_features, unrounded
+from torchlb.nn.diffusion import Diffusion, raw_of_time
 from torchlb.nn.gradient_features import GradientFeatures
 from torchlb.nn.implicit_diffusion import ImplicitDiffusion
 from torchlb.nn.pointwise import mlp
 from torchlb.nn.poisson_block import PoissonBlock
 from torchlb.operator.laplace_beltrami import LaplaceBeltrami
+from torchlb.pde.checks import check_choice
+from torchlb.pde.heat import Method
 
 Place = Literal["vertices", "edges", "faces", "global_mean"]
 Block = Literal["diffusion", "implicit", "poisson"]

@@ -8,8 +8,8 @@ from torch import Tensor
 
 from torchlb.nn.checks import check_features
 from torchlb.nn.diffusion import LearnedTimes
-from torchlb.nn.solves import implicit_step
 from torchlb.operator.laplace_beltrami import LaplaceBeltrami
+from torchlb.pde.solves import implicit_step
 
 
 class ImplicitDiffusion(LearnedTimes):

@@ -16,8 +16,8 @@ from torch import Tensor, nn
 from torchlb.nn.checks import check_features, unrounded
 from torchlb.nn.gradient_features import GradientFeatures, TangentMap
 from torchlb.nn.pointwise import mlp
-from torchlb.nn.solves import potential
 from torchlb.operator.laplace_beltrami import LaplaceBeltrami
+from torchlb.pde.solves import potential
 
 SOURCE = 3.0
 """Size of the sources at the start in units of the features', 1/ℓ²: about λ_1 of a shape of radius one."""

@@ -29,9 +29,9 @@ from torchlb.linalg.conjugate_gradients import Linear, conjugate_gradients
 from torchlb.linalg.factor import Factor, factorized
 from torchlb.linalg.sparse import multiply, to_scipy
 from torchlb.linalg.two_levels import Matrix, absolute_row_sums, main_entries, two_levels
-from torchlb.nn.conduction import Conducting
 from torchlb.operator.batching import shapes_of
 from torchlb.operator.laplace_beltrami import LaplaceBeltrami
+from torchlb.pde.conduction import Conducting
 from torchlb.stability.null_vector import has_outflow
 
 KEPT = 8

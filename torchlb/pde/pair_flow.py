@@ -18,9 +18,9 @@ from scipy.fft import dct
 from torch import Tensor
 
 from torchlb.linalg.once import once_differentiable
-from torchlb.nn.checks import uncompiled
-from torchlb.nn.systems import PairSystem, pair_system
 from torchlb.operator.laplace_beltrami import LaplaceBeltrami
+from torchlb.pde.checks import uncompiled
+from torchlb.pde.systems import PairSystem, pair_system
 
 SHORTEST = 5.0
 """t/γ of the shortest time that shares a pole; the longest is ten times longer."""

@@ -1,0 +1,195 @@
+"""Heat flow e^{tΔ}f, by the weak pair or by the stencil (`method.md`, section 8).
+
+With a weak pair e^{−tM⁻¹K}, without one e^{tL} of the stencil. method="deflated", the layer's default, splits off
+the span of the slow eigenvectors, where the flow is exact; the rest, of which nothing is left after about 16/λ_k, takes
+a short Chebyshev series: of the stencil, or of the linear pair with lumped mass, since the mesh hardly resolves what is
+beyond the basis. "spectral" is the first part alone: everything beyond the basis is dropped, also as t → 0. "chebyshev"
+and "contour" need no basis, and are exact to the tolerance; with a pair both are the solves of `pair_flow`.
+"""
+
+from __future__ import annotations
+
+import math
+import warnings
+from typing import Literal, cast
+
+import torch
+from jaxtyping import Shaped
+from torch import Tensor
+
+from torchlb.errors import DiffusionError
+from torchlb.linalg.exponential import heat
+from torchlb.linalg.sparse import compute_dtype
+from torchlb.operator.checks import check_tolerance
+from torchlb.operator.laplace_beltrami import LaplaceBeltrami
+from torchlb.pde.checks import as_columns, as_times, check_choice
+from torchlb.pde.pair_flow import pair_flow
+from torchlb.spectral.eigenbasis import Eigenbasis
+
+Method = Literal["deflated", "spectral", "chebyshev", "contour"]
+FORMER_NAMES = {"full": "deflated", "rational": "contour"}
+TOLERANCE = 1e-7
+
+
+def heat_flow(
+    lb: LaplaceBeltrami,
+    f: Shaped[Tensor, "*B N C"] | Shaped[Tensor, " N"],
+    t: float | Tensor,
+    *,
+    method: Method | None = None,
+    k: int = 128,
+    tolerance: float = TOLERANCE,
+) -> Tensor:
+    """e^{tΔ}f: what f becomes when it diffuses over the surface for a time t; differentiable in f and t.
+
+    Computed in the wider of the types of f and the operator, at least float32; only a half-precision f gives its own.
+
+    Parameters
+    ----------
+    lb : operator of one shape, or of a batch.
+    f : (N,), (N, C) or (B, N, C).
+    t : time ≥ 0 in ℓ², one for all channels or (C,). (In a time t a peak spreads to a width of √(2t).)
+    method : "deflated", "spectral", "chebyshev" or "contour"; by default one that is exact to the tolerance: "contour"
+        with a weak pair, "deflated" with a stencil.
+    k : number of eigenpairs, for the first two.
+    tolerance : of the error in the norm of π, relative to |f|. Values that are smaller than that everywhere around,
+        as far away from a heated point, are noise: logarithms and directions of them (geodesics) need an implicit step.
+
+    Raises
+    ------
+    InputError : for times that are negative or not finite, for an unknown method and a wrong shape, a tolerance that
+        is not between 0 and 1.
+    DiffusionError : where the method cannot be used: a series of too many products or of no ellipse, a basis of
+        dependent eigenvectors.
+
+    Examples
+    --------
+    >>> theta = torch.arange(36, dtype=torch.float64) * torch.pi / 18
+    >>> lb = LaplaceBeltrami.from_points(torch.stack([theta.cos(), theta.sin()], dim=1))
+    >>> bool(torch.allclose(heat_flow(lb, theta.cos(), 0.5), math.exp(-0.5) * theta.cos(), atol=1e-2))
+    True
+    """
+    x = as_columns(f, lb)
+    method = checked_method(method or ("contour" if lb.has_weak_form else "deflated"))
+    dtype = compute_dtype(x, lb.values)
+    time = as_times(t, x, dtype)
+    with torch.autocast(x.device.type, enabled=False):
+        y = flow(lb, x.to(dtype), time, method, k, tolerance)
+    y = y.to(x.dtype) if x.dtype.itemsize < 4 else y
+    return y[:, 0] if f.ndim == 1 else y
+
+
+def checked_method(method: str) -> Method:
+    """The method, by its name of today.
+
+    >>> checked_method("chebyshev")
+    'chebyshev'
+    """
+    if method in FORMER_NAMES:
+        message = f"method={method!r} is called {FORMER_NAMES[method]!r} now"
+        warnings.warn(message, DeprecationWarning, stacklevel=3)
+        method = FORMER_NAMES[method]
+    check_choice("method", method, Method)
+    return cast(Method, method)
+
+
+def flow(
+    lb: LaplaceBeltrami, x: Tensor, time: Tensor, method: str, k: int, tolerance: float
+) -> Tensor:
+    """e^{tΔ}x in the type of x, which is float32 or float64; autocast has to be off.
+
+    The surfaces of a stack (B, N, C) become channels.
+    """
+    check_tolerance(tolerance)
+    if x.ndim == 3:
+        columns, times = x.transpose(0, 1).flatten(1), time.repeat(len(x))
+        y = flow(lb, columns, times, method, k, tolerance)
+        return y.view(x.shape[1], x.shape[0], x.shape[2]).transpose(0, 1)
+    if method == "spectral":
+        return _spectral(lb.eigenbasis(k), x, time)
+    if method == "deflated":
+        basis = lb.invariant_basis(k)
+        deflated = _deflated_pair if basis.is_symmetric else _deflated
+        return deflated(lb, basis, x, time, tolerance)
+    if lb.has_weak_form:
+        return pair_flow(lb, x, time, tolerance).to(x.dtype)
+    return _expanded(lb, x, time, method, tolerance)
+
+
+def _spectral(basis: Eigenbasis, x: Tensor, time: Tensor) -> Tensor:
+    """Φ e^{−λt} Φᵀ(πx)."""
+    decay = torch.exp(-basis.eigenvalues.to(x.dtype)[..., None] * time)
+    return basis.from_basis(decay * basis.analyse(basis.functionals, x))
+
+
+def _deflated(
+    lb: LaplaceBeltrami, basis: Eigenbasis, x: Tensor, time: Tensor, tolerance: float
+) -> Tensor:
+    """e^{−tB} on the span, a series on the rest, whose time is cut where it has decayed below the tolerance."""
+    if basis.modal_transform is None or basis.decay_rates is None:
+        raise DiffusionError(
+            "method='deflated': the slow eigenvectors are too close to dependent, or fewer than the components; "
+            "ask for another k, or use method='chebyshev' or 'spectral'"
+        )
+    coefficients = basis.analyse(basis.left, x)
+    v, inverse, turned = basis.modal_transform.to(x.dtype).unbind(-3)
+    rates, frequencies = basis.decay_rates.to(x.dtype)[..., None].unbind(-3)
+    decay = torch.exp(-rates * time)
+    flowed = decay * (frequencies * time).cos() * (inverse @ coefficients)
+    flowed = v @ (flowed + decay * (frequencies * time).sin() * (turned @ coefficients))
+    slow = basis.from_basis(flowed)
+    if lb.has_pairs(lb.num_points):
+        return slow
+    rest = x - basis.from_basis(coefficients)
+    fastest = rates.amax((-2, -1))
+    if basis.sizes is not None:  # a shape whose basis is complete has no rest
+        incomplete = [size > lb.num_pairs for size in basis.sizes]
+        fastest = torch.where(torch.tensor(incomplete, device=x.device), fastest, torch.inf).amin()
+    enough = math.log(1 / tolerance) / fastest
+    return slow + _expanded(lb, rest, torch.minimum(time, enough), "either", tolerance)
+
+
+def _deflated_pair(
+    lb: LaplaceBeltrami, basis: Eigenbasis, x: Tensor, time: Tensor, tolerance: float
+) -> Tensor:
+    """e^{−λt} on the span, the flow of the linear pair with lumped mass on the rest, from which it does not return."""
+    if lb.fixed is not None:
+        x = x * ~lb.fixed[:, None]
+    values, coefficients = basis.eigenvalues.to(x.dtype), basis.analyse(basis.left, x)
+    slow = basis.from_basis(torch.exp(-values[..., None] * time) * coefficients)
+    if lb.has_pairs(lb.num_points):
+        return slow
+    fastest = values.amax(-1)
+    if basis.sizes is not None:  # a shape whose basis is complete has no rest
+        incomplete = [size > lb.num_pairs for size in basis.sizes]
+        fastest = torch.where(torch.tensor(incomplete, device=x.device), fastest, torch.inf).amin()
+    whole, time = time, torch.minimum(time, math.log(1 / tolerance) / fastest)
+    pattern, matrix, root = _linear_flow(lb)
+    options = lb.bounds, "either", tolerance, lb.sizes or (lb.num_points,)
+    rest = root.to(x.dtype)[:, None] * (x - basis.from_basis(coefficients))
+    rest = heat(pattern, matrix.to(x.dtype), rest, time, *options)
+    rest = rest / root.to(x.dtype)[:, None] * torch.exp(-fastest * (whole - time))
+    return slow + rest - basis.from_basis(basis.analyse(basis.left, rest))
+
+
+def _linear_flow(lb: LaplaceBeltrami) -> tuple[list[Tensor], Tensor, Tensor]:
+    """Pattern and values of −D^{−½}K₁D^{−½}, and D^½, D the row sums of M₁; nothing joins Dirichlet points."""
+    crow, col, (stiffness, mass, *_) = lb.linear_pair
+    row = torch.arange(lb.num_points, device=col.device).repeat_interleave(
+        crow.diff(), output_size=len(col)
+    )
+    root = torch.zeros_like(lb.mass).index_add(0, row, mass.to(lb.mass)).sqrt()
+    values = -stiffness / (root[row] * root[col])
+    if lb.fixed is not None:
+        values = torch.where(lb.fixed[row] | lb.fixed[col], 0.0, values)
+    return [crow, col, crow, col, torch.arange(len(col), device=col.device)], values, root
+
+
+def _expanded(
+    lb: LaplaceBeltrami, x: Tensor, time: Tensor, expansion: str, tolerance: float
+) -> Tensor:
+    """e^{tΔ}x by one of the expansions."""
+    pattern = [lb.crow, lb.col, lb.crow_t, lb.col_t, lb.order_t]
+    values = lb.values.to(x.dtype)
+    options = lb.bounds, expansion, tolerance, lb.sizes or (lb.num_points,)
+    return heat(pattern, values, x, time, *options)
