@@ -5,6 +5,7 @@ from math import ceil
 import pytest
 import torch
 
+from torchlb.cloud.voronoi import nearest_graph
 from torchlb.fits.polynomials import num_monomials
 from torchlb.fits.rules import SIZE_FACTORS
 from torchlb.geometry.candidates import (
@@ -13,7 +14,7 @@ from torchlb.geometry.candidates import (
     list_candidates,
     stencil_candidates,
 )
-from torchlb.geometry.neighbors import GraphBalls, nearest_graph, nearest_neighbors
+from torchlb.geometry.neighbors import GraphBalls, nearest_neighbors
 from torchlb.surfaces import Sphere
 
 

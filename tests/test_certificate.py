@@ -13,8 +13,8 @@ from scipy import sparse
 import torchlb
 from builders import stencil_of_cloud, stencil_of_mesh
 from torchlb import StabilityError, StabilityWarning
+from torchlb.cloud.surface import cloud_surface
 from torchlb.errors import warn
-from torchlb.geometry.surface import cloud_surface
 from torchlb.stability.certificate import check_certificate
 from torchlb.stability.enforce import Schedule, certify
 from torchlb.stability.null_vector import left_null_vector, shared_outflow

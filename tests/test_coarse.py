@@ -16,8 +16,8 @@ from torchlb.galerkin.assembly import element_matrices, flat_metric, summed
 from torchlb.galerkin.delaunay import delaunay_cover
 from torchlb.galerkin.elements import simplex
 from torchlb.galerkin.nodes import lagrange_nodes
-from torchlb.pde.conduction import conducting
 from torchlb.operator.medium import forms_of
+from torchlb.pde.conduction import conducting
 from torchlb.surfaces import UnitDisk
 
 SQUARE = np.sort([np.pi**2 * (i * i + j * j) for i in range(8) for j in range(8)])[:12]

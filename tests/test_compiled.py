@@ -15,16 +15,16 @@ from scipy import sparse
 from scipy.spatial import ConvexHull
 
 from torchlb import LaplaceBeltrami, compiled
+from torchlb.cloud import delaunay
+from torchlb.cloud.cocone import best_manifold
+from torchlb.cloud.delaunay import delaunay_tetrahedra
 from torchlb.fits.least_squares import left_inverse
 from torchlb.fits.polynomials import monomial_columns, monomials
 from torchlb.fits.weights import scaled_system
 from torchlb.galerkin import pair
 from torchlb.galerkin.pair import stored, upper_product
-from torchlb.geometry import delaunay
 from torchlb.geometry.admission import admissible
-from torchlb.geometry.cocone import best_manifold
-from torchlb.geometry.delaunay import delaunay_tetrahedra
-from torchlb.geometry.manifold import components, edges_of, spanning_pairs, tree_sides
+from torchlb.geometry.complex import components, edges_of, spanning_pairs, tree_sides
 from torchlb.geometry.numbering import Numbering
 from torchlb.linalg.sparse import both_products
 from torchlb.surfaces import Hemisphere

@@ -7,8 +7,8 @@ from torch.autograd import gradcheck
 from builders import stencil_of_mesh
 from torchlb import InputError, LaplaceBeltrami, implicit_step, poisson_solve
 from torchlb.galerkin.forms import Forms
-from torchlb.pde.conduction import conducting
 from torchlb.operator.medium import forms_of
+from torchlb.pde.conduction import conducting
 from torchlb.surfaces import Ellipsoid, Sphere, Torus, UnitDisk
 
 

@@ -11,8 +11,9 @@ from scipy.spatial import Delaunay
 
 import torchlb
 from torchlb import LaplaceBeltrami, clean_mesh, clean_points
+from torchlb.cloud.doubts import warn_of_near_duplicates
 from torchlb.geometry.neighbors import nearest_neighbors
-from torchlb.operator.checks import check_dimension, mended_faces, warn_of_near_duplicates
+from torchlb.operator.checks import check_dimension, mended_faces
 from torchlb.operator.cleaning import turned_faces
 from torchlb.surfaces import CliffordTorus, Sphere
 

@@ -7,17 +7,18 @@ import pytest
 import torch
 
 from tolerances import TOLERANCE
+from torchlb.cloud.frames import cloud_frames
+from torchlb.cloud.voronoi import nearest_graph
 from torchlb.geometry.fit_search import FitSearch
 from torchlb.geometry.frames import (
     PROJECTIONS,
-    cloud_frames,
     complete_frames,
     face_normals,
     local_offsets,
     mesh_frames,
     normals_of_frames,
 )
-from torchlb.geometry.neighbors import GraphBalls, nearest_graph, nearest_neighbors
+from torchlb.geometry.neighbors import GraphBalls, nearest_neighbors
 from torchlb.surfaces import (
     CliffordTorus,
     Ellipsoid,

@@ -9,10 +9,12 @@ import torch
 from scipy.sparse import csgraph
 
 from torchlb import compiled
+from torchlb.cloud.frames import cloud_frames
+from torchlb.cloud.voronoi import nearest_graph
 from torchlb.geometry import neighbors
 from torchlb.geometry.admission import admissible
-from torchlb.geometry.frames import cloud_frames, mesh_frames
-from torchlb.geometry.neighbors import GraphBalls, mesh_graph, nearest_graph, nearest_neighbors
+from torchlb.geometry.frames import mesh_frames
+from torchlb.geometry.neighbors import GraphBalls, mesh_graph, nearest_neighbors
 from torchlb.surfaces import Ellipsoid, Sphere, Torus
 
 

@@ -6,15 +6,12 @@ import pytest
 import torch
 
 from tolerances import TOLERANCE
-from torchlb.geometry.frames import cloud_frames, complete_frames, face_normals, normals_of_frames
+from torchlb.cloud.frames import cloud_frames
+from torchlb.cloud.orientation import mended_normals, nearest_pairs, orient_normals
+from torchlb.geometry.admission import thin_sides
+from torchlb.geometry.complex import consistently_wound
+from torchlb.geometry.frames import complete_frames, face_normals, normals_of_frames
 from torchlb.geometry.neighbors import nearest_neighbors
-from torchlb.geometry.orientation import (
-    consistently_wound,
-    mended_normals,
-    nearest_pairs,
-    orient_normals,
-    thin_sides,
-)
 from torchlb.surfaces import Ellipsoid, Sphere, StarShaped, Torus
 
 

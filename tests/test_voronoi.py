@@ -7,7 +7,7 @@ import torch
 
 from tolerances import TOLERANCE
 from torchlb import LaplaceBeltrami
-from torchlb.geometry.voronoi import cell_laplacian, cell_volume, largest_gap, natural_neighbors
+from torchlb.cloud.voronoi import cell_laplacian, cell_volume, largest_gap, natural_neighbors
 
 
 def lattice(basis, half=3):

@@ -12,9 +12,9 @@ from torch import Tensor
 from torchlb.galerkin.delaunay import EDGES, Cover
 from torchlb.galerkin.nodes import Nodes
 from torchlb.galerkin.rim import KINK
+from torchlb.geometry.complex import edges_of
 from torchlb.geometry.fit_search import IN_ROWS
 from torchlb.geometry.local_fits import FitPlan
-from torchlb.geometry.manifold import edges_of
 from torchlb.geometry.vectors import at
 
 LYING = cos(radians(120))

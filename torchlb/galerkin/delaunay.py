@@ -15,7 +15,7 @@ from scipy import sparse
 from torch import Tensor
 
 from torchlb.galerkin.assembly import area_element, flat_metric
-from torchlb.geometry.stars import pieces_of
+from torchlb.geometry.complex import pieces_of
 
 EDGES = ((0, 1), (1, 2), (2, 0))
 """Ends of the sides of a triangle, in turn, in the order of `subsets`."""

@@ -96,3 +96,22 @@ def mutually_admissible(
     i, j = torch.arange(len(points)).repeat_interleave(others.shape[1]), others.reshape(-1)
     good = admissible(points, planes, i, j) & admissible(points, planes, j, i)
     return i, j, good.view(others.shape)
+
+
+def thin_sides(
+    points: Float[Tensor, "N n"], oriented: Float[Tensor, "N n"], candidates: Int[Tensor, "N K"]
+) -> Float[Tensor, "N n"]:
+    """The oriented normals in and next to thin places, zero elsewhere.
+
+    Points whose sides have a negative product lie on different sides. It is thin where a near point stands above or
+    below the tangent plane and yet has nearly the same one. Elsewhere a shape may have one side only.
+    """
+    i, j, good = mutually_admissible(points, oriented, candidates)
+    refused = ~good.view(-1)
+    both = torch.stack([i[refused], j[refused]])
+    alike = dot(at(oriented, both[0]), at(oriented, both[1])).abs() >= MIN_ALIGNMENT
+    thin = torch.zeros(len(points), dtype=torch.bool)
+    thin[both[:, alike]] = True
+    beside = thin[i] | thin[j]
+    thin[torch.cat([i[beside], j[beside]])] = True
+    return oriented * thin[:, None]

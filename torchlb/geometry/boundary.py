@@ -13,27 +13,12 @@ from math import cos, radians
 import torch
 from jaxtyping import Bool, Float, Int
 from scipy import sparse
-from scipy.spatial import KDTree
 from torch import Tensor
 
-from torchlb.errors import InputError
 from torchlb.geometry.fit_search import FitSearch
-from torchlb.geometry.frames import cloud_frames, mesh_frames, normals_of_frames
+from torchlb.geometry.frames import mesh_frames, normals_of_frames
 from torchlb.geometry.local_fits import FitPlan, LocalFits
-from torchlb.geometry.neighbors import (
-    AT_ONCE,
-    GraphBalls,
-    mesh_graph,
-    nearest_graph,
-    nearest_neighbors,
-)
-from torchlb.geometry.voronoi import largest_gap
-
-INSIDE = 4
-"""Nearest points off the boundary, on whose side the shape is."""
-OPEN_ANGLE, NEAREST = 2.3, 32
-"""Radians of the tangent plane without any of so many nearest points that make a point of a cloud a boundary point.
-Of 16, two in a hundred random points leave as much open, of 32 none in a thousand."""
+from torchlb.geometry.neighbors import GraphBalls, mesh_graph
 
 SMOOTH = cos(radians(20))
 """Where the mean of the outer normals around a boundary vertex is shorter there is a crease: two that are 40° apart."""
@@ -57,33 +42,27 @@ class Boundary:
 
 @dataclass(frozen=True)
 class BoundaryPlan:
-    """What is decided about the boundary of a shape.
+    """What is decided about the boundary of a mesh.
 
     Attributes
     ----------
     mask
         (N,), where a condition holds.
     members
-        (b,), all points of the boundary; the numbers of the others refer to their places here where they are local.
-    sides, opposite
-        (G, d), (G,), of a mesh: the faces' unpaired sides, and the corners across from them; none for a cloud.
-    inside
-        (b, q), of a cloud: points off the boundary, on whose side the shape is.
-    near
-        (b, K), of a cloud: the nearest boundary points, local, from which the first tangents are.
+        (b,), all points of the boundary.
     fits
-        Of the boundary's own tangents, local; None at the ends of curves.
+        Of the boundary's own tangents, points numbered by their places among `members`; None at the ends of curves.
+    sides, opposite
+        (G, d), (G,): the faces' unpaired sides, and the corners across from them.
     crease
-        (b,), where the boundary of a mesh has one, or a corner.
+        (b,), where the boundary has one, or a corner.
     """
 
     mask: Bool[Tensor, " N"]
     members: Int[Tensor, " b"]
+    fits: FitPlan | None
     sides: Int[Tensor, "G d"]
     opposite: Int[Tensor, " G"]
-    inside: Int[Tensor, "_ q"]
-    near: Int[Tensor, "_ K"]
-    fits: FitPlan | None
     crease: Bool[Tensor, " b"]
 
     def at(self, points: Float[Tensor, "N n"], frames: Float[Tensor, "N n d"]) -> Boundary:
@@ -94,20 +73,26 @@ class BoundaryPlan:
         )
         if self.fits is not None:
             tangents = LocalFits.at(self.fits, own, self.initial(points)).frames
-        if len(self.sides):
-            outward = _outward_sums(points, self.sides, self.opposite)[0][self.members]
-        else:
-            outward = (own[:, None] - points[self.inside]).mean(1)
         conormals = torch.zeros_like(points)
-        conormals[self.members] = _conormals(frames[self.members], tangents, outward, self.crease)
+        rest = self.outward(points), self.crease
+        conormals[self.members] = _conormals(frames[self.members], tangents, *rest)
         return Boundary(self.mask, conormals * self.mask[:, None])
 
     def initial(self, points: Float[Tensor, "N n"]) -> Float[Tensor, "b n d_minus_1"]:
         """The boundary's first tangents."""
-        own = points[self.members]
-        if len(self.sides):
-            return mesh_frames(own, torch.searchsorted(self.members, self.sides))
-        return cloud_frames(own, self.near, self.sides.shape[1] - 1)
+        return mesh_frames(points[self.members], torch.searchsorted(self.members, self.sides))
+
+    def outward(self, points: Float[Tensor, "N n"]) -> Float[Tensor, "b n"]:
+        """Vectors that leave the shape."""
+        return _outward_sums(points, self.sides, self.opposite)[0][self.members]
+
+    def with_fits(
+        self, points: Float[Tensor, "N n"], graph: sparse.csr_array, degree: int
+    ) -> BoundaryPlan:
+        """The same with fits of the boundary's tangents, of this degree or lower ones."""
+        search = FitSearch(GraphBalls(points[self.members], graph, self.initial(points)), degree)
+        search.refine(torch.arange(len(self.members)))
+        return replace(self, fits=search.finish()[0])
 
 
 def boundary_faces(faces: Int[Tensor, "F v"]) -> Int[Tensor, "G w"]:
@@ -154,12 +139,11 @@ def boundary_of_mesh(
     members = mask.nonzero()[:, 0]
     outward, size = _outward_sums(vertices, sides, opposite)
     crease = (outward.norm(dim=1) < SMOOTH * size)[members]
-    none = members.new_zeros(0, 0)
-    plan = BoundaryPlan(mask, members, sides, opposite, none, none, None, crease)
+    plan = BoundaryPlan(mask, members, None, sides, opposite, crease)
     if sides.shape[1] == 1:
         return plan
     graph = mesh_graph(torch.searchsorted(members, sides), len(members))
-    return _with_fits(plan, vertices, graph, degree)
+    return plan.with_fits(vertices, graph, degree)
 
 
 def boundary_creases(
@@ -168,52 +152,6 @@ def boundary_creases(
     """Vertices where the boundary of a mesh turns by 60° and more: at the edges and corners of a cube."""
     outward, size = _outward_sums(vertices, *_open_sides(cells))
     return outward.norm(dim=1) < SHARP * size
-
-
-def boundary_of_cloud(
-    points: Float[Tensor, "N n"], mask: Bool[Tensor, " N"], dim: int, degree: int
-) -> BoundaryPlan | None:
-    """Boundary of a cloud of dimension d from the mask of its boundary points; None if there are none."""
-    if not mask.any():
-        return None
-    members = mask.nonzero()[:, 0]
-    others = (~mask).nonzero()[:, 0] if not mask.all() else members
-    near = min(INSIDE, len(others))
-    _, index = KDTree(points[others].numpy()).query(points[members].numpy(), k=near)
-    inside = others[torch.from_numpy(index.reshape(len(members), near))]
-    none, crease = members.new_zeros(0, dim), torch.zeros_like(members, dtype=torch.bool)
-    plan = BoundaryPlan(mask, members, none, none[:, 0], inside, none, None, crease)
-    if dim == 1:
-        return plan
-    own = points[members]
-    plan = replace(plan, near=nearest_neighbors(own, min(8 * (dim - 1), len(own))))
-    return _with_fits(plan, points, nearest_graph(own, plan.initial(points), plan.near), degree)
-
-
-def _with_fits(
-    plan: BoundaryPlan, points: Float[Tensor, "N n"], graph: sparse.csr_array, degree: int
-) -> BoundaryPlan:
-    """The same with fits of the boundary's tangents."""
-    search = FitSearch(GraphBalls(points[plan.members], graph, plan.initial(points)), degree)
-    search.refine(torch.arange(len(plan.members)))
-    return replace(plan, fits=search.finish()[0])
-
-
-def detect_boundary(
-    points: Float[Tensor, "N n"], frames: Float[Tensor, "N n d"], balls: GraphBalls
-) -> Bool[Tensor, " N"]:
-    """Points of a surface cloud whose 32 nearest leave an angle of 130° or more open in the tangent plane.
-
-    Raises ValueError for other dimensions: give the mask there.
-    """
-    if frames.shape[-1] != 2:
-        raise InputError("boundary: can be detected on surfaces only; give the mask of its points")
-    masks = []
-    for centers in torch.arange(len(points)).split(AT_ONCE):
-        index, count = balls(centers, NEAREST)
-        coords = (points[index[:, 1:]] - points[centers, None]) @ frames[centers]
-        masks.append(largest_gap(coords, torch.arange(1, NEAREST) < count[:, None]) > OPEN_ANGLE)
-    return torch.cat(masks)
 
 
 def _outward_sums(

@@ -13,55 +13,10 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from torchlb.fits.weights import window
-from torchlb.geometry.admission import admissible_neighbors, planes_of
-from torchlb.geometry.neighbors import AT_ONCE
 from torchlb.geometry.vectors import at, dot
 
 NO_NORMAL = 1e-12
 """A sum of normals below this share of the products of the edges is rounding."""
-
-
-def cloud_frames(
-    points: Float[Tensor, "N n"], candidates: Int[Tensor, "N K"], dim: int, rounds: int = 3
-) -> Float[Tensor, "N n d"]:
-    """Initial frames of a cloud: principal components of the nearer half of the candidates, decaying with distance.
-
-    Each further round takes the nearest that the frames before found admissible, so that the other side of a thin
-    sheet drops out. Error O(h) on a smooth surface.
-    """
-    planes = None
-    frames = torch.empty(0)
-    for _ in range(rounds):
-        parts = candidates.split(AT_ONCE)
-        frames = torch.cat([_principal_directions(points, part, planes, dim) for part in parts])
-        planes = planes_of(frames)
-    return frames
-
-
-def _principal_directions(
-    points: Float[Tensor, "N n"],
-    index: Int[Tensor, "B K"],
-    planes: Float[Tensor, "N n d"] | Float[Tensor, "N n"] | None,
-    dim: int,
-) -> Float[Tensor, "B n d"]:
-    """Leading eigenvectors of the weighted covariance of the nearer half of those that `planes` admit.
-
-    Where these are too few for a plane, as where those around a corner stand across it, all count.
-    """
-    offset = points[index] - points[index[:, :1]]
-    distance = offset.norm(dim=-1)
-    good = torch.ones_like(index, dtype=torch.bool)
-    if planes is not None:
-        good = admissible_neighbors(points, planes, index)
-        good |= good.sum(1, keepdim=True) <= dim
-    near = good & (good.cumsum(1) <= (index.shape[1] + 1) // 2)
-    reach = (distance * near).amax(1, keepdim=True).clamp_min(torch.finfo(distance.dtype).tiny)
-    weight = window((distance / reach).clamp_max(1.1)) * near
-    weight = weight / weight.sum(1, keepdim=True)
-    centered = offset - (weight[..., None] * offset).sum(1, keepdim=True)
-    covariance = centered.mT @ (weight[..., None] * centered)
-    return torch.linalg.eigh(covariance).eigenvectors[..., -dim:]
 
 
 def mesh_frames(

@@ -25,15 +25,10 @@ from torchlb.geometry.admission import (
     MAX_SLOPE,
     MIN_ALIGNMENT,
     admissible,
-    mutually_admissible,
     planes_of,
 )
 from torchlb.geometry.vectors import at, dot
-from torchlb.geometry.voronoi import natural_neighbors, rows_at_once
 
-VOID = 1.5
-"""A natural neighbour on a surface or beyond may be this many times farther than the nearest ones; at an open end all
-else would be. A curve has two, and one at its end."""
 AT_ONCE = 2**13
 """Points whose neighbours are looked at together: of small arrays the memory is used again."""
 WALKS_AT_ONCE = 2**22
@@ -61,7 +56,7 @@ def nearest_neighbors(points: Float[Tensor, "N n"], size: int) -> Int[Tensor, "N
     return torch.cat([own, found[others].view(len(points), size - 1)], 1)
 
 
-def _graph(i: np.ndarray, j: np.ndarray, num_points: int) -> sparse.csr_array:
+def adjacency(i: np.ndarray, j: np.ndarray, num_points: int) -> sparse.csr_array:
     """Symmetric 0/1 adjacency with the pairs (i, j), without loops."""
     keep = i != j
     ones = np.ones(int(keep.sum()), dtype=np.float32)
@@ -81,38 +76,7 @@ def mesh_graph(faces: Int[Tensor, "F v"], num_points: int) -> sparse.csr_array:
     pairs = [(a, b) for a in range(corners.shape[1]) for b in range(a)]
     i = np.concatenate([corners[:, a] for a, _ in pairs])
     j = np.concatenate([corners[:, b] for _, b in pairs])
-    return _graph(i, j, num_points)
-
-
-def nearest_graph(
-    points: Float[Tensor, "N n"],
-    frames: Float[Tensor, "N n d"],
-    candidates: Int[Tensor, "N K"],
-) -> sparse.csr_array:
-    """A cloud's stand-in for the edges of a mesh, symmetric (N, N).
-
-    Each point is joined to its 2^(d+1) nearest admissible neighbours (4, 8, 16 for curves, surfaces, solids) and to
-    its natural neighbours in the tangent plane, which bridge the voids of an uneven cloud. `candidates`
-    come from `nearest_neighbors`; an edge must be admissible from both its ends.
-    """
-    dim = frames.shape[-1]
-    wanted = 2 ** (dim + 1)
-    others = candidates[:, 1:]
-    num_rows, size = others.shape
-    if size == 0:  # a single point
-        return sparse.csr_array((num_rows, num_rows), dtype=np.float32)
-    centers, flat, good = mutually_admissible(points, planes_of(frames), candidates)
-    chosen = good & (good.cumsum(1) <= wanted)
-    for rows in torch.arange(num_rows).split(rows_at_once(size, dim)):
-        offset = points[others[rows]] - points[rows, None]
-        distance = offset.norm(dim=-1)
-        near = good[rows]
-        if dim > 1:
-            reach = VOID * (distance * chosen[rows]).amax(1, keepdim=True)
-            near &= distance <= reach
-        chosen[rows] |= natural_neighbors(offset @ frames[rows], near)
-    pick = chosen.reshape(-1).numpy()
-    return _graph(centers.numpy()[pick], flat.numpy()[pick], num_rows)
+    return adjacency(i, j, num_points)
 
 
 def longest_edges(

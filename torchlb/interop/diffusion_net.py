@@ -41,9 +41,11 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from torchlb.cloud.orientation import settled_normals
+from torchlb.cloud.surface import NEAREST
 from torchlb.errors import InputError
+from torchlb.geometry.neighbors import nearest_neighbors
 from torchlb.io.cache import load_or_build
-from torchlb.operator.build import settled_normals
 from torchlb.operator.dispatch import Operator, build_operator
 from torchlb.operator.laplace_beltrami import LaplaceBeltrami
 
@@ -171,13 +173,11 @@ def _tuple(
 
 def _frames(lb: LaplaceBeltrami, side: Tensor | None) -> Float[Tensor, "V 3 3"]:
     """Rows X, Y, normal: X is e₁ in the tangent plane, or e₂ where e₁ is steep, and Y = normal × X."""
-    normal = lb.normals
-    side, known = (
-        (normal, False)
-        if side is None
-        else settled_normals(lb.points, side.detach().cpu().double())
-    )
-    if known:
+    normal, known = lb.normals, False
+    if side is not None:
+        near = nearest_neighbors(lb.points, min(NEAREST, len(normal)))
+        side, known = settled_normals(lb.points, side.detach().cpu().double(), near)
+    if known and side is not None:
         flip = (normal * side).sum(1, keepdim=True) < 0
         normal = torch.where(flip, -normal, normal)
     axes = torch.eye(3, dtype=normal.dtype)

@@ -9,9 +9,9 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from torchlb.cloud.surface import SurfaceSummary
 from torchlb.galerkin.pair import WeakPair
 from torchlb.geometry.numbering import Numbering
-from torchlb.geometry.surface import SurfaceSummary
 from torchlb.stability.certificate import Certificate
 from torchlb.stencils.rows import Rows
 from torchlb.stencils.shape import Shape

@@ -12,16 +12,20 @@ from torch import Tensor
 from torch.nn.functional import pad
 
 from torchlb.baseline.cotangent import cotangent_laplacian
+from torchlb.cloud.doubts import (
+    warn_of_doubts,
+    warn_of_joins,
+    warn_of_layers,
+    warn_of_near_duplicates,
+)
+from torchlb.cloud.surface import CloudSurface, check_spread, cloud_surface
 from torchlb.errors import InputError, first_few, renumbered, warn
 from torchlb.galerkin.coarse import lying_triangles, with_area
 from torchlb.galerkin.flips import flipped
 from torchlb.galerkin.nodes import lagrange_nodes
 from torchlb.galerkin.pair import PairPlan, SparsePair, WeakPair, mesh_pair
 from torchlb.geometry.boundary import boundary_faces
-from torchlb.geometry.neighbors import nearest_neighbors
 from torchlb.geometry.numbering import Numbering
-from torchlb.geometry.orientation import mended_normals
-from torchlb.geometry.surface import NEAREST, cloud_surface
 from torchlb.linalg.threads import threads_for
 from torchlb.operator.assembled import AssembledOperator
 from torchlb.operator.checks import (
@@ -31,12 +35,8 @@ from torchlb.operator.checks import (
     check_faces,
     check_normals,
     check_scale,
-    check_spread,
     mended_faces,
-    warn_of_layers,
-    warn_of_near_duplicates,
 )
-from torchlb.operator.doubts import warn_of_doubts, warn_of_joins
 from torchlb.operator.inputs import ArrayLike, check_points
 from torchlb.operator.options import Options
 from torchlb.operator.plan import Plan, stencils_of
@@ -94,59 +94,42 @@ def build_cloud(
     here = numbering.sorted(points)
     if isinstance(where, Tensor):
         where = numbering.sorted(where)
-    settings = {"num_neighbors": options.num_neighbors, "condition": options.held}
+    settings = {
+        "num_neighbors": options.num_neighbors,
+        "condition": options.held,
+        "progress": progress,
+    }
     with renumbered(numbering.given), threads_for(len(points)):
-        oriented = True
-        if normals is not None:
-            normals, oriented = settled_normals(here, numbering.sorted(normals))
-        settings |= {"normals": normals, "progress": progress}
+        normals = None if normals is None else numbering.sorted(normals)
         if on_surface:
-            built = _build_on_surface(here, options, where, settings, numbering, oriented)
+            surface = cloud_surface(
+                pad(here, (0, 3 - ambient)),
+                normals=normals,
+                boundary=None if isinstance(where, str) else where,
+            )
+            built = _build_on_surface(here, surface, options, where, settings, numbering)
         else:
             options = options.settled(cells=False)
-            shape = cloud_shape(here, d, options.q, boundary=where, **settings)
+            shape = cloud_shape(here, d, options.q, normals=normals, boundary=where, **settings)
             built = _finished(shape, "points", options, REMEDY.format(d), progress)
         if options.condition == "dirichlet" and built.on_boundary is None:
             warn(NOWHERE)
     return built.restored(numbering, points, built.faces)
 
 
-def settled_normals(
-    points: Float[Tensor, "N n"], normals: Float[Tensor, "N n"]
-) -> tuple[Float[Tensor, "N n"], bool]:
-    """Given normals so that neighbours agree, and whether their side is the user's; warnings say what was changed."""
-    candidates = nearest_neighbors(points, min(NEAREST, len(points)))
-    mended, even = mended_normals(points, normals, candidates)
-    turned = (((mended * normals).sum(1) < 0) & ~even).nonzero()[:, 0]
-    if even.any():
-        warn(
-            f"normals: the signs at {int(even.sum())} points contradict those of their neighbours, and neither side "
-            "has a majority; they are turned outward, as without `normals`: orient them first if the side matters"
-        )
-    if len(turned):
-        warn(
-            f"normals: {len(turned)} face the other way than those around them ({first_few(turned)}) and are turned "
-            "round, so that neighbours agree"
-        )
-    return mended, not even.all()
-
-
 def _build_on_surface(
     points: Float[Tensor, "N n"],
+    surface: CloudSurface,
     options: Options,
     boundary: Bool[Tensor, " N"] | str | None,
     settings: dict[str, Any],
     numbering: Numbering,
-    oriented: bool,
 ) -> AssembledOperator:
-    """Operator on a cloud in R² or R³, by the surface through it, which turns normals that are not `oriented`."""
+    """Operator on a cloud in R² or R³, by the surface through it."""
     ambient, where = points.shape[1], None if isinstance(boundary, str) else boundary
-    space = pad(points, (0, 3 - ambient))
-    surface = cloud_surface(space, normals=settings["normals"], oriented=oriented, boundary=where)
     warn_of_near_duplicates(points, surface.neighbors)
     if ambient == 3:
         warn_of_layers(points)
-    settings["normals"] = settings["normals"] if oriented else None
     surface = replace(surface, faces=flipped(surface.points, surface.faces))
     options = options.settled(cells=len(surface.faces) > 0)
     degree, degrees = options.elements

@@ -8,13 +8,11 @@ from typing import Any
 import torch
 from jaxtyping import Bool, Float, Int
 from scipy.spatial import KDTree
-from scipy.special import pdtrc
 from torch import Tensor
 
 from torchlb.errors import InputError, first_few, warn
 from torchlb.fits.polynomials import num_monomials
 from torchlb.galerkin.delaunay import NO_VOLUME
-from torchlb.geometry.noise import in_two_layers
 from torchlb.operator.cleaning import (
     are_quads,
     coincident,
@@ -28,15 +26,6 @@ MAX_EXTENT = 1e30
 """Largest extent of the points, and the inverse of the smallest, with which all that is called keeps its digits."""
 COARSE = 1e-3
 """Step of single precision over the spacing of the points above which Δ is rounding."""
-ON_LINE = 1e-9
-"""Spread of a cloud across its longest direction over that along it, below which it is a line."""
-RING, CROWD, CLUSTER = 8, 256, 1e-2
-"""Neighbour whose distance that to the nearest is compared with; the same where so many crowd into one place that those
-are all within a hundredth of what is usual."""
-EXCESS, CHANCE = 10, 1e-6
-"""Near-duplicates are told where points are so many times as many as at random, which happens by such a chance."""
-LAYERED = 0.1
-"""Share of a cloud in two layers from which on a warning names it: 0.4 and more on plates, 0.001 on noisy shapes."""
 FLAT = 1e-14
 """Squared sine of the angles of triangles that have no area."""
 
@@ -64,58 +53,6 @@ def check_distinct(points: Float[Tensor, "N n"]) -> None:
             f"{first_few(bad)}); remove duplicates with points, kept = torchlb.clean_points(points)"
         )
     _warn_of_rounding(points, spacing)
-
-
-def warn_of_near_duplicates(points: Float[Tensor, "N n"], neighbors: Int[Tensor, "N K"]) -> None:
-    """A warning that names points of a surface which are closer to another than chance explains, as if scanned twice.
-
-    Of points at random the nearest is closer than t times the distance to the one of number m with the probability
-    1 − (1 − t²)^(m − 1), about (m − 1)t², whatever their density.
-    """
-    last = min(RING, neighbors.shape[1] - 1)
-    distance = (points[neighbors[:, 1:]] - points[:, None]).norm(dim=-1)
-    nearest, wide = distance.amin(1), distance.amax(1)
-    squares = (last - 1) * (nearest / distance[:, last - 1]).square()
-    tight = (wide < CLUSTER * wide.median()).nonzero()[:, 0]
-    if len(tight):  # more than K in one place
-        far = min(CROWD, len(points) - 1)
-        reach, _ = KDTree(points.numpy()).query(points[tight].numpy(), k=far + 1)
-        squares[tight] = (far - 1) * (nearest[tight] / torch.from_numpy(reach)[:, -1]).square()
-    ordered, order = squares.sort()
-    number = torch.arange(1, len(points) + 1)
-    expected = len(points) * ordered
-    chance = pdtrc((number // 2 - 1).clamp_min(0).numpy(), expected.numpy() / 2)
-    excess = number - EXCESS * expected
-    excess[(number < 2) | torch.from_numpy(chance > CHANCE)] = 0
-    if excess.max() > 0:
-        close = order[: int(excess.argmax()) + 1]
-        width = float(f"{1.01 * float(nearest[close].max()):.2e}")
-        warn(
-            f"points: {len(close)} are far closer to another than to those around ({first_few(close.sort().values)}), "
-            "as where a part was scanned twice: such points say nothing that the other does not, and Δf may be wrong "
-            f"by any amount there; merge them with points, kept = torchlb.clean_points(points, {width:g})"
-        )
-
-
-def warn_of_layers(points: Float[Tensor, "N 3"]) -> None:
-    """A warning where much of a cloud is two layers so close that they may be taken for one sheet with noise."""
-    layered, looked_at = in_two_layers(points.numpy())
-    if len(layered) > LAYERED * looked_at:
-        warn(
-            f"points: around {len(layered) / looked_at:.0%} of them ({first_few(torch.from_numpy(layered))}) they lie "
-            "in two layers about a spacing apart or closer, as on a thin plate sampled on both sides; the surface may "
-            "be one sheet there, with half of the area. Add points until they are closer than it is thick, keep one "
-            "side alone, or give the mesh if there is one"
-        )
-
-
-def check_spread(points: Float[Tensor, "N n"]) -> None:
-    """InputError for points of a surface that lie on a line."""
-    spread = torch.linalg.svdvals(points - points.mean(0))
-    if spread[1] <= ON_LINE * spread[0]:
-        raise InputError(
-            f"points: all {len(points)} lie on a line, and no surface goes through them; a curve has dim=1"
-        )
 
 
 def _warn_of_rounding(points: Float[Tensor, "N n"], spacing: Float[Tensor, " N"]) -> None:

@@ -12,7 +12,7 @@ from torch import Tensor
 from torch.nn.functional import pad
 
 from torchlb.errors import InputError
-from torchlb.geometry.manifold import edges_of, two_orientations
+from torchlb.geometry.complex import edges_of, two_orientations
 from torchlb.operator.inputs import ArrayLike, as_tensor, check_corners, check_points
 
 COINCIDENT = 1e-12

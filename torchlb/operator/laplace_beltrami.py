@@ -9,10 +9,10 @@ from typing import Any, Literal
 import torch
 from torch import Tensor
 
+from torchlb.cloud.surface import SurfaceSummary
 from torchlb.errors import InputError, InputTypeError, warn
 from torchlb.fits.rules import WeightsName
 from torchlb.geometry.frames import Projection
-from torchlb.geometry.surface import SurfaceSummary
 from torchlb.operator import build
 from torchlb.operator.batching import (
     join_buffers,

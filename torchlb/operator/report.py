@@ -8,9 +8,9 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from torchlb.cloud.surface import SurfaceSummary
 from torchlb.fits.rules import WEIGHT_RULES, reference
 from torchlb.geometry.fit_search import REASONS
-from torchlb.geometry.surface import SurfaceSummary
 from torchlb.stencils.rows import Reason
 
 

@@ -11,8 +11,8 @@ import torch
 from jaxtyping import Bool
 from torch import Tensor, nn
 
+from torchlb.cloud.surface import SurfaceSummary
 from torchlb.errors import InputError, first_few, warn
-from torchlb.geometry.surface import SurfaceSummary
 from torchlb.linalg.sparse import to_scipy, transpose_pattern
 from torchlb.linalg.spectral_bounds import Bounds, interval_bounds, spectral_bounds
 from torchlb.spectral.eigenbasis import Eigenbasis

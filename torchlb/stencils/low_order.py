@@ -15,18 +15,13 @@ from jaxtyping import Bool, Float, Int
 from scipy import sparse
 from torch import Tensor
 
+from torchlb.cloud.voronoi import cell_laplacian, cell_volume, rows_at_once, unrolled
 from torchlb.errors import first_few, warn
 from torchlb.galerkin.assembly import linear_elements
 from torchlb.galerkin.delaunay import delaunay_cover, sound_lengths
 from torchlb.galerkin.nodes import lagrange_nodes
 from torchlb.geometry.boundary import Boundary
 from torchlb.geometry.neighbors import GraphBalls, nearest_neighbors
-from torchlb.geometry.voronoi import (
-    cell_laplacian,
-    cell_volume,
-    rows_at_once,
-    unrolled,
-)
 from torchlb.linalg.sparse import with_diagonal
 
 LEAST_AREA = 1e-12

@@ -12,32 +12,24 @@ from torch import Tensor
 from torch.nn.functional import normalize
 from tqdm import tqdm
 
+from torchlb.cloud.boundary import boundary_of_cloud, detect_boundary
+from torchlb.cloud.frames import cloud_frames
+from torchlb.cloud.orientation import orient_normals, settled_normals
+from torchlb.cloud.surface import CloudSurface
+from torchlb.cloud.voronoi import nearest_graph
 from torchlb.errors import InputError, first_few, warn
-from torchlb.geometry.boundary import (
-    Boundary,
-    BoundaryPlan,
-    boundary_of_cloud,
-    boundary_of_mesh,
-    detect_boundary,
-)
+from torchlb.geometry.admission import thin_sides
+from torchlb.geometry.boundary import Boundary, BoundaryPlan, boundary_of_mesh
+from torchlb.geometry.complex import consistently_wound
 from torchlb.geometry.fit_search import FitSearch
 from torchlb.geometry.frames import (
-    cloud_frames,
     complete_frames,
     mesh_frames,
     normals_of_frames,
     vertex_normals,
 )
 from torchlb.geometry.local_fits import FitPlan, LocalFits
-from torchlb.geometry.neighbors import (
-    AT_ONCE,
-    GraphBalls,
-    mesh_graph,
-    nearest_graph,
-    nearest_neighbors,
-)
-from torchlb.geometry.orientation import consistently_wound, orient_normals, thin_sides
-from torchlb.geometry.surface import CloudSurface
+from torchlb.geometry.neighbors import AT_ONCE, GraphBalls, mesh_graph, nearest_neighbors
 from torchlb.geometry.vectors import dot
 from torchlb.stencils.conditions import Condition, Neumann
 from torchlb.stencils.low_order import CloudLowOrder, MeshLowOrder
@@ -212,13 +204,17 @@ def cloud_shape(
     `boundary` is the mask of its boundary points, or "detect"; `condition` what holds there, None if nothing does.
     """
     candidates = nearest_neighbors(points, min(CANDIDATES.get(dim, 128), len(points)))
-    initial = cloud_frames(points, candidates, dim) if normals is None else complete_frames(normals)
+    sides, oriented = None, False
+    if normals is None:
+        initial = cloud_frames(points, candidates, dim)
+    else:
+        normals, oriented = settled_normals(points, normals, candidates)
+        initial = complete_frames(normals)
     graph = nearest_graph(points, initial, candidates)
-    sides = None
     if dim == points.shape[1] - 1:
-        oriented = orient_normals(points, normals_of_frames(initial), candidates)
-        normals = oriented if normals is None else normals
-        sides = thin_sides(points, oriented, candidates)
+        outward = orient_normals(points, normals_of_frames(initial), candidates)
+        normals = normals if oriented else outward
+        sides = thin_sides(points, outward, candidates)
     balls = GraphBalls(points, graph, initial, sides)
     plan, fits = _searched(balls, normal_order, num_neighbors, progress)
     mask = detect_boundary(points, fits.frames, balls) if isinstance(boundary, str) else boundary
@@ -299,7 +295,6 @@ def surface_shape(
     normal_order: int,
     *,
     num_neighbors: int | None = None,
-    normals: Float[Tensor, "N 3"] | None = None,
     boundary: Bool[Tensor, " N"] | None = None,
     condition: Condition | None = NEUMANN,
     fit_degrees: tuple[int, ...] = (),
@@ -331,8 +326,7 @@ def surface_shape(
             edge = boundary_of_cloud(points, boundary, 2, normal_order)
     side = None
     if not flat:
-        reference = surface.normals if normals is None else normals
-        _, own = _righthanded(fits.frames, reference)
+        _, own = _righthanded(fits.frames, surface.normals)
         assert own is not None
         against = (own * vertex_normals(points, triangles)).sum(1) < 0
         side = torch.where(against, -1, 1).to(torch.int8)

@@ -8,9 +8,10 @@ from __future__ import annotations
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from torchlb.geometry.cocone import FOLD, TILTED, TINY, Cloud, wings
-from torchlb.geometry.manifold import Edges, Faces, boundary_loops, edges_of
-from torchlb.geometry.vectors import inner, largest, lengths, smallest
+from torchlb.cloud.cocone import FOLD, TILTED, Cloud, wings
+from torchlb.cloud.manifold import boundary_loops
+from torchlb.geometry.complex import Edges, Faces, edges_of
+from torchlb.geometry.vectors import TINY, inner, largest, lengths, smallest
 
 ALIGNED = 0.3
 """Least cosine between the normal of a triangle in a gap and those of its corners."""

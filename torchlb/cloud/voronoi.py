@@ -10,9 +10,14 @@ from __future__ import annotations
 from functools import cache
 from math import gamma, pi
 
+import numpy as np
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
+from scipy import sparse
 from torch import Tensor
+
+from torchlb.geometry.admission import mutually_admissible, planes_of
+from torchlb.geometry.neighbors import adjacency
 
 AHEAD = 0.5
 """Least cosine between a neighbour and a direction in which it lies."""
@@ -202,3 +207,39 @@ def _star_cotangents(
     weights.scatter_add_(1, following, torch.where(triangle, at_here, 0.0) / 2)
     result = torch.zeros_like(weights).scatter_(1, order, weights)
     return torch.where(natural, result.clamp_min(0), 0.0)
+
+
+VOID = 1.5
+"""A natural neighbour on a surface or beyond may be this many times farther than the nearest ones; at an open end all
+else would be. A curve has two, and one at its end."""
+
+
+def nearest_graph(
+    points: Float[Tensor, "N n"],
+    frames: Float[Tensor, "N n d"],
+    candidates: Int[Tensor, "N K"],
+) -> sparse.csr_array:
+    """A cloud's stand-in for the edges of a mesh, symmetric (N, N).
+
+    Each point is joined to its 2^(d+1) nearest admissible neighbours (4, 8, 16 for curves, surfaces, solids) and to
+    its natural neighbours in the tangent plane, which bridge the voids of an uneven cloud. `candidates`
+    come from `nearest_neighbors`; an edge must be admissible from both its ends.
+    """
+    dim = frames.shape[-1]
+    wanted = 2 ** (dim + 1)
+    others = candidates[:, 1:]
+    num_rows, size = others.shape
+    if size == 0:  # a single point
+        return sparse.csr_array((num_rows, num_rows), dtype=np.float32)
+    centers, flat, good = mutually_admissible(points, planes_of(frames), candidates)
+    chosen = good & (good.cumsum(1) <= wanted)
+    for rows in torch.arange(num_rows).split(rows_at_once(size, dim)):
+        offset = points[others[rows]] - points[rows, None]
+        distance = offset.norm(dim=-1)
+        near = good[rows]
+        if dim > 1:
+            reach = VOID * (distance * chosen[rows]).amax(1, keepdim=True)
+            near &= distance <= reach
+        chosen[rows] |= natural_neighbors(offset @ frames[rows], near)
+    pick = chosen.reshape(-1).numpy()
+    return adjacency(centers.numpy()[pick], flat.numpy()[pick], num_rows)

@@ -9,16 +9,15 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+import torch
+from jaxtyping import Bool, Int
 from scipy import sparse
 from scipy.sparse import csgraph
+from torch import Tensor
 
 from torchlb import compiled
-from torchlb.geometry.vectors import inner, lengths
 
 Faces = Int[np.ndarray, "_ 3"]
-CLOSED = 1000
-"""A closed fan comes before an open one of up to so many triangles."""
 BY_GRAPH, BY_TREE, BY_KEYS = 1e-7, 4e-7, 2e-7
 """Seconds a pair by a graph, and by its spanning tree; a triangle to find its edges."""
 
@@ -192,121 +191,19 @@ def _by_tree(
     return own > other
 
 
-def patches(faces: Faces, count: int) -> Int[np.ndarray, " F"]:
-    """Number of the patch of each face: faces that hang together by edges of two faces."""
-    one, two = edges_of(faces, count).twins
-    return components(one // 3, two // 3, len(faces))
+def pieces_of(faces: Faces, count: int) -> Int[np.ndarray, " N"]:
+    """Number of the piece of each point: points that hang together by triangles."""
+    i, j = faces[:, [0, 1, 1, 2]].reshape(-1, 2).T
+    return components(i, j, count)
 
 
-def without_specks(faces: Faces, count: int, least: int) -> Faces:
-    """The faces of patches that have at least so many."""
-    patch = patches(faces, count)
-    return faces[np.bincount(patch)[patch] >= least] if len(faces) else faces
+def consistently_wound(faces: Int[Tensor, "F v"]) -> bool:
+    """Whether neighbouring triangles (or segments) agree on which way is out: no directed edge is used twice.
 
-
-def with_single_fans(faces: Faces, count: int) -> Faces:
-    """Faces are left out until those around each point are one fan: the closed one, or else the largest.
-
-    >>> with_single_fans(np.array([[0, 1, 2], [0, 2, 3], [0, 4, 5]]), 6).tolist()
-    [[0, 1, 2], [0, 2, 3]]
+    >>> [consistently_wound(torch.tensor([[0, 1, 2], other])) for other in ([2, 1, 3], [1, 2, 3])]
+    [True, False]
     """
-    looked_at = np.ones(count, dtype=bool)  # points; later those alone that have lost a face
-    while len(around := np.flatnonzero(looked_at.take(faces).any(1))):
-        part = faces[around]
-        one, two = edges_of(part, count).twins
-        corner = part.ravel()
-        left, right = [], []
-        for turn in (1, 2):  # the corners of both faces at the same end of their edge
-            mine = one - one % 3 + (one + turn) % 3
-            near, far = (two - two % 3 + (two + other) % 3 for other in (1, 2))
-            left.append(mine)
-            right.append(np.where(corner[near] == corner[mine], near, far))
-        joined = np.concatenate(left)
-        fan = components(joined, np.concatenate(right), len(corner))
-        size = np.bincount(fan)
-        closed = np.bincount(fan[joined], minlength=len(size)) == size
-        point = np.zeros_like(size)
-        point[fan] = corner
-        order = np.lexsort((size + CLOSED * closed, point))
-        best = ~looked_at[point]
-        best[order[np.append(np.diff(point[order]) > 0, True)]] = True
-        lost = ~best[fan].reshape(-1, 3).all(1)
-        if not lost.any():
-            break
-        looked_at[:] = False
-        looked_at[part[lost]] = True
-        faces = np.delete(faces, around[lost], 0)
-    return faces
-
-
-def face_vectors(points: Float[np.ndarray, "N 3"], faces: Faces) -> Float[np.ndarray, "F 3"]:
-    """Normals of the faces, as long as their areas, ℓ²."""
-    a, b, c = (points.take(corner, 0) for corner in faces.T)
-    return np.cross(b - a, c - a) / 2
-
-
-def wound_alike(
-    points: Float[np.ndarray, "N 3"], faces: Faces
-) -> tuple[Faces, Bool[np.ndarray, " F"]]:
-    """The faces turned so that neighbours agree, carried along the flattest edges; and which lie at a seam.
-
-    At a seam two neighbours still disagree: the surface has one side only, or a wrong triangle makes it seem so.
-    """
-    edges = edges_of(faces, len(points))
-    one, two = edges.twins
-    against = edges.ends[0][one] == edges.ends[0][two]
-    normals = face_vectors(points, faces)
-    normals /= np.maximum(lengths(normals), np.finfo(float).tiny)[:, None]
-    i, j, size = one // 3, two // 3, len(faces)
-    bend = 1.001 - inner(normals.take(i, 0), normals.take(j, 0)) * np.where(against, -1, 1)
-    order = np.argsort(bend, kind="stable")
-    flip = tree_sides(i[order], j[order], against[order], size)
-    seam = against ^ flip[i] ^ flip[j]
-    at_seam = np.zeros(size, dtype=bool)
-    at_seam[i[seam]] = at_seam[j[seam]] = True
-    return np.where(flip[:, None], faces[:, ::-1], faces), at_seam
-
-
-def facing_out(
-    points: Float[np.ndarray, "N 3"], faces: Faces, outward: Float[np.ndarray, "N 3"]
-) -> Faces:
-    """The faces turned to the side of the outward vectors at their corners: those of a patch all the same way."""
-    if len(faces) == 0:
-        return faces
-    vectors, patch = face_vectors(points, faces), patches(faces, len(points))
-    vote = inner(outward.take(faces, 0).sum(1), vectors)
-    turned = (np.bincount(patch, vote) < 0)[patch]
-    return np.where(turned[:, None], faces[:, ::-1], faces)
-
-
-def boundary_loops(faces: Faces, count: int) -> list[list[int]]:
-    """The points of every boundary loop in turn, each walked round from face to face.
-
-    >>> [sorted(loop) for loop in boundary_loops(np.array([[0, 1, 2], [1, 3, 2]]), 4)]
-    [[0, 1, 2, 3]]
-    """
-    edges = edges_of(faces, count)
-    mate = np.full(3 * len(faces), -1)
-    one, two = edges.twins
-    mate[one], mate[two] = two, one
-    tail, head = edges.ends
-    found, seen = [], set()
-    for start in edges.rim.tolist():
-        if start in seen:
-            continue
-        half, at, loop = start, int(head[start]), [int(tail[start])]
-        while half not in seen:
-            seen.add(half)
-            while True:  # the other side of the face at this point, until nothing lies beyond
-                face = half - half % 3
-                half = face + next(
-                    k for k in range(3) if face + k != half and faces[face // 3, k] != at
-                )
-                if mate[half] < 0:
-                    break
-                half = int(mate[half])
-            if half not in seen:
-                loop.append(at)
-                at = int(head[half] if tail[half] == at else tail[half])
-        found.append(loop)
-    return found
+    if faces.shape[1] == 2:
+        return all(len(torch.unique(end)) == len(end) for end in faces.T)
+    edges = torch.cat([faces[:, a] * (faces.max() + 1) + faces[:, a - 2] for a in range(3)])
+    return len(torch.unique(edges)) == len(edges)

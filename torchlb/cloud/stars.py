@@ -9,10 +9,10 @@ import numpy as np
 import torch
 from jaxtyping import Int
 
-from torchlb.geometry.cocone import Cloud
-from torchlb.geometry.gaps import ALIGNED, overlapping
-from torchlb.geometry.manifold import Faces, components, edges_of, spanning_pairs
-from torchlb.geometry.voronoi import natural_neighbors, star_of, unrolled
+from torchlb.cloud.cocone import Cloud
+from torchlb.cloud.gaps import ALIGNED, overlapping
+from torchlb.cloud.voronoi import natural_neighbors, star_of, unrolled
+from torchlb.geometry.complex import Faces, edges_of, pieces_of, spanning_pairs
 
 
 def local_stars(cloud: Cloud, centers: Int[np.ndarray, " B"]) -> Faces:
@@ -33,12 +33,6 @@ def local_stars(cloud: Cloud, centers: Int[np.ndarray, " B"]) -> Faces:
     after = ends.take_along_dim(following, 1)
     found = torch.stack([near[:, :1].expand_as(ends)[use], ends[use], after[use]], 1)
     return cloud.small(found.numpy())
-
-
-def pieces_of(faces: Faces, count: int) -> Int[np.ndarray, " N"]:
-    """Number of the piece of each point: points that hang together by triangles."""
-    i, j = faces[:, [0, 1, 1, 2]].reshape(-1, 2).T
-    return components(i, j, count)
 
 
 def gaps_between(

@@ -21,7 +21,7 @@ SAMPLE = 2000
 ROUNDING = 1e-6
 """Residuals below this share of a neighbourhood's radius are none."""
 RIDGE = 1e-12
-AROUND = 40
+PATCH = 40
 """Points around each whose heights are looked at for two layers."""
 UNIMODAL, LAYERS = 1.6, 0.1
 """Kurtosis of the residuals of quadratics below which they are of two layers: it is 1 for two values, 9/5 and more for
@@ -67,9 +67,9 @@ def in_two_layers(points: Float[np.ndarray, "N 3"]) -> tuple[Int[np.ndarray, " M
     than twice as many points.
     """
     some = np.arange(0, len(points), -(-len(points) // SAMPLE))
-    if len(points) < 2 * AROUND:
+    if len(points) < 2 * PATCH:
         return some[:0], len(some)
-    distance, index = (np.asarray(part) for part in KDTree(points).query(points[some], k=AROUND))
+    distance, index = (np.asarray(part) for part in KDTree(points).query(points[some], k=PATCH))
     offset = points[index] - points[index].mean(1, keepdims=True)
     axes = np.linalg.eigh(offset.transpose(0, 2, 1) @ offset)[1]
     height, v, u = np.moveaxis(offset @ axes / distance[:, -1:, None], -1, 0)
@@ -77,7 +77,7 @@ def in_two_layers(points: Float[np.ndarray, "N 3"]) -> tuple[Int[np.ndarray, " M
     height -= (basis @ (basis.transpose(0, 2, 1) @ height[..., None]))[..., 0]
     square = np.square(height).mean(1)
     layered = (height**4).mean(1) < UNIMODAL * square**2
-    return some[layered & (square > LAYERS**2 * np.pi / AROUND)], len(some)
+    return some[layered & (square > LAYERS**2 * np.pi / PATCH)], len(some)
 
 
 def _residuals(

@@ -10,11 +10,11 @@ from __future__ import annotations
 import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
-from scipy import sparse
-from scipy.sparse import csgraph
 from torch import Tensor
 
-from torchlb.geometry.admission import MIN_ALIGNMENT, mutually_admissible
+from torchlb.errors import first_few, warn
+from torchlb.geometry.admission import MIN_ALIGNMENT
+from torchlb.geometry.complex import components, tree_sides
 from torchlb.geometry.vectors import at, dot
 
 SMOOTH = 0.97
@@ -22,7 +22,7 @@ SMOOTH = 0.97
 FLAT = 0.35
 """Largest share of an edge's length that may be height over the tangent plane at either end of such an edge."""
 
-AROUND = 8
+JUDGES = 8
 """Nearest points that judge the sign of a given normal."""
 CONTRADICTED, ASTRAY = 1 / 8, 3 / 4
 """Shares of them that contradict: on the whole, up to which a field is consistent (2 % on thin or coarse shapes, 50 %
@@ -72,24 +72,18 @@ def _carried(
 
     The root is the extreme point of a component (largest last coordinate); the surest edges of the tree come first.
     """
-    num_points, pairs = len(points), nearest_pairs(candidates)
+    pairs = nearest_pairs(candidates)
     cosine, slope, _ = _across(points, normals, *pairs)
     smooth = (cosine.abs() >= SMOOTH) & (slope <= FLAT)
-    cost = 1.0001 - cosine.abs() + ~smooth  # positive: zeros would be no edges
-    ends = tuple(end.numpy() for end in pairs)
-    weighted = sparse.csr_array((cost.numpy(), ends), shape=(num_points, num_points))
-    tree = csgraph.minimum_spanning_tree(weighted)
-    _, component = csgraph.connected_components(tree, directed=False)
+    order = (1 - cosine.abs() + ~smooth).argsort(stable=True)
+    i, j = (end[order].numpy() for end in pairs)
+    turned = tree_sides(i, j, (cosine[order] < 0).numpy(), len(points))
+    component = components(i, j, len(points))
     # The extreme point of each component, which a lexicographic order puts last.
-    order = np.lexsort((points[:, -1].numpy(), component))
-    roots = torch.from_numpy(order[np.append(np.diff(component[order]) > 0, True)])
-    parent = _parents(tree, roots)
-    away = _across(points, normals, parent, torch.arange(num_points))[0] < 0
-    sign = torch.where(away, -1.0, 1.0).to(points)
-    sign[roots] = 1.0
-    while not torch.equal(parent, parent[parent]):  # products along the paths, by doubling
-        sign, parent = sign * sign[parent], parent[parent]
-    return sign, parent
+    last = np.lexsort((points[:, -1].numpy(), component))
+    root = last[np.append(np.diff(component[last]) > 0, True)][component]
+    sign = np.where(turned ^ turned[root], -1.0, 1.0)
+    return torch.from_numpy(sign).to(points), torch.from_numpy(root)
 
 
 def orient_normals(
@@ -117,7 +111,7 @@ def mended_normals(
     the side that most of a component have, if fewer neighbours contradict each other then, also on smooth edges alone.
     Where many do, and the two sides are as even as chance makes them (three deviations), the component faces out.
     """
-    i, j = nearest_pairs(candidates[:, : AROUND + 1])
+    i, j = nearest_pairs(candidates[:, : JUDGES + 1])
     cosine, slope, arc = _across(points, normals, i, j)
     told = (arc & (cosine.abs() >= MIN_ALIGNMENT)).to(points)
     sure = told * (cosine.abs() >= SMOOTH) * (slope <= FLAT)
@@ -137,7 +131,7 @@ def mended_normals(
 
     side, own = torch.ones_like(sign), torch.arange(len(points))
     many = contradicted(told, side, root) > CONTRADICTED
-    for _ in range(AROUND):
+    for _ in range(JUDGES):
         astray = contradicted(told, side, own) > torch.where(many, 0.5, ASTRAY)
         side = torch.where(astray, -side, side)
     better = torch.ones_like(many)
@@ -152,46 +146,22 @@ def mended_normals(
     return normals * torch.where(better | even, carried, side)[:, None], even
 
 
-def _parents(tree: sparse.csr_array, roots: Int[Tensor, " R"]) -> Int[Tensor, " N"]:
-    """Parent of every point in the forest hung up at `roots`, which are their own."""
-    num_points = len(tree.indptr) - 1
-    edges = sparse.coo_array(tree)
-    above = np.concatenate([edges.coords[0], np.full(len(roots), num_points)])
-    below = np.concatenate([edges.coords[1], roots.numpy()])
-    shape = (num_points + 1, num_points + 1)
-    hung = sparse.csr_array((np.ones(len(above)), (above, below)), shape=shape)
-    _, found = csgraph.breadth_first_order(hung, num_points, directed=False)
-    parent = torch.from_numpy(found[:num_points].astype(np.int64))
-    parent[roots] = roots
-    return parent
-
-
-def thin_sides(
-    points: Float[Tensor, "N n"], oriented: Float[Tensor, "N n"], candidates: Int[Tensor, "N K"]
-) -> Float[Tensor, "N n"]:
-    """The oriented normals in and next to thin places, zero elsewhere.
-
-    Points whose sides have a negative product lie on different sides. It is thin where a near point stands above or
-    below the tangent plane and yet has nearly the same one. Elsewhere a shape may have one side only.
-    """
-    i, j, good = mutually_admissible(points, oriented, candidates)
-    refused = ~good.view(-1)
-    both = torch.stack([i[refused], j[refused]])
-    alike = dot(at(oriented, both[0]), at(oriented, both[1])).abs() >= MIN_ALIGNMENT
-    thin = torch.zeros(len(points), dtype=torch.bool)
-    thin[both[:, alike]] = True
-    beside = thin[i] | thin[j]
-    thin[torch.cat([i[beside], j[beside]])] = True
-    return oriented * thin[:, None]
-
-
-def consistently_wound(faces: Int[Tensor, "F v"]) -> bool:
-    """Whether neighbouring triangles (or segments) agree on which way is out: no directed edge is used twice.
-
-    >>> [consistently_wound(torch.tensor([[0, 1, 2], other])) for other in ([2, 1, 3], [1, 2, 3])]
-    [True, False]
-    """
-    if faces.shape[1] == 2:
-        return all(len(torch.unique(end)) == len(end) for end in faces.T)
-    edges = torch.cat([faces[:, a] * (faces.max() + 1) + faces[:, a - 2] for a in range(3)])
-    return len(torch.unique(edges)) == len(edges)
+def settled_normals(
+    points: Float[Tensor, "N n"],
+    normals: Float[Tensor, "N n"],
+    candidates: Int[Tensor, "N K"],
+) -> tuple[Float[Tensor, "N n"], bool]:
+    """Given normals so that neighbours agree, and whether their side is the user's; warnings say what was changed."""
+    mended, even = mended_normals(points, normals, candidates)
+    turned = (((mended * normals).sum(1) < 0) & ~even).nonzero()[:, 0]
+    if even.any():
+        warn(
+            f"normals: the signs at {int(even.sum())} points contradict those of their neighbours, and neither side "
+            "has a majority; they are turned outward, as without `normals`: orient them first if the side matters"
+        )
+    if len(turned):
+        warn(
+            f"normals: {len(turned)} face the other way than those around them ({first_few(turned)}) and are turned "
+            "round, so that neighbours agree"
+        )
+    return mended, not even.all()

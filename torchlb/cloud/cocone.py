@@ -11,19 +11,13 @@ from dataclasses import dataclass
 from functools import cached_property, reduce
 
 import numpy as np
-import torch
 from jaxtyping import Bool, Float, Int
-from torch import Tensor
-from torch.nn.functional import normalize
 
 from torchlb import compiled
-from torchlb.fits.polynomials import monomial_columns
-from torchlb.fits.weights import window
-from torchlb.geometry.admission import PAIRS_AT_ONCE, admissible_neighbors
-from torchlb.geometry.delaunay import delaunay_tetrahedra
-from torchlb.geometry.frames import complete_frames
-from torchlb.geometry.manifold import Faces, edges_of, face_vectors
-from torchlb.geometry.vectors import dot, inner, largest, lengths, smallest
+from torchlb.cloud.delaunay import delaunay_tetrahedra
+from torchlb.cloud.manifold import face_vectors
+from torchlb.geometry.complex import Faces, edges_of
+from torchlb.geometry.vectors import TINY, inner, largest, lengths, smallest
 
 COCONE = np.sin(np.pi / 8)
 """Sine of the half-angle between a tangent plane and the double cone that a dual edge has to leave."""
@@ -46,8 +40,6 @@ FLAT = 1e-10
 """Tetrahedra of less volume, over the cube of their longest side, have no circumcentre to speak of; triangles alike."""
 IN_ROUNDS = 5e-6
 """Seconds a triangle to choose in rounds."""
-RIDGE = 1e-13
-TINY = np.finfo(float).tiny
 
 
 @dataclass(frozen=True)
@@ -105,48 +97,6 @@ class Cloud:
     def small(self, faces: Faces) -> Faces:
         """Those within the reach of their corners."""
         return faces[self.circles(faces)[0] <= self.limits(faces)]
-
-
-def refined_normals(
-    points: Float[Tensor, "N 3"],
-    normals: Float[Tensor, "N 3"],
-    candidates: Int[Tensor, "N K"],
-    centers: Int[Tensor, " B"] | None = None,
-    rounds: int = 1,
-) -> Float[Tensor, "N 3"]:
-    """Unit normals, those of `centers` from quadratics through their admissible candidates, error O(h²); not oriented.
-
-    The quadratics need not go through the point itself, which lessens what noise does to the slope.
-    """
-    centers = torch.arange(len(points)) if centers is None else centers
-    parts = centers.split(max(PAIRS_AT_ONCE // candidates.shape[1], 1))
-    for _ in range(rounds):
-        found = [_slopes_removed(points, normals, candidates[part]) for part in parts]
-        normals = normals.index_put((centers,), torch.cat(found))
-    return normals
-
-
-def _slopes_removed(
-    points: Float[Tensor, "N 3"], normals: Float[Tensor, "N 3"], index: Int[Tensor, "B K"]
-) -> Float[Tensor, "B 3"]:
-    """The normals of the first of each row, turned by the slope of a quadratic through the others."""
-    own = normals[index[:, 0]]
-    frames = complete_frames(own)
-    offset = points[index] - points[index[:, :1]]
-    distance = offset.norm(dim=-1)
-    good = admissible_neighbors(points, normals, index)
-    good[:, 0] = True
-    reach = (distance * good).amax(1, keepdim=True).clamp_min(TINY)
-    weight = window((distance / reach).clamp_max(1.1)) * good
-    terms = monomial_columns(offset @ frames / reach[..., None], 2).mT
-    terms = torch.cat([torch.ones_like(terms[:, :1]), terms], 1) * weight[:, None]
-    heights = weight * dot(offset, own[:, None]) / reach
-    square = terms @ terms.mT
-    trace = square.diagonal(dim1=-2, dim2=-1).sum(-1)
-    square += RIDGE * trace[:, None, None] * torch.eye(6, dtype=points.dtype)
-    slope = torch.linalg.solve(square, terms @ heights[..., None])[:, 1:3]
-    sound = (good.sum(1) > 7) & (slope[..., 0].norm(dim=1) < 1)
-    return torch.where(sound[:, None], normalize(own - (frames @ slope)[..., 0]), own)
 
 
 @dataclass(frozen=True)

@@ -18,8 +18,9 @@ from jaxtyping import Float, Int
 from scipy.spatial import Delaunay, QhullError
 from torch import Tensor
 
+from torchlb.cloud.manifold import boundary_loops
 from torchlb.geometry.admission import mutually_admissible, planes_of
-from torchlb.geometry.manifold import Faces, boundary_loops, edges_of
+from torchlb.geometry.complex import Faces, edges_of
 from torchlb.geometry.vectors import lengths
 
 REACH, NEAR = 3.0, 6

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from torchlb.geometry.manifold import components
+from torchlb.geometry.complex import components
 from torchlb.geometry.vectors import lengths
 
 Places = tuple[tuple[float, float, float], ...]

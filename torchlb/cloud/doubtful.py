@@ -16,19 +16,18 @@ from scipy import sparse
 from scipy.linalg import eigh
 from torch import Tensor
 
+from torchlb.cloud.manifold import face_vectors
+from torchlb.cloud.outliers import RING, spacing_at
+from torchlb.cloud.surface import CloudSurface
 from torchlb.geometry.admission import admissible_neighbors
+from torchlb.geometry.complex import Faces, edges_of, pieces_of
 from torchlb.geometry.frames import complete_frames
-from torchlb.geometry.manifold import Faces, edges_of, face_vectors
-from torchlb.geometry.stars import pieces_of
-from torchlb.geometry.surface import CloudSurface
 from torchlb.geometry.vectors import inner, largest, lengths
 
 AROUND, GAP = 12, 2 * np.pi / 3
 """Nearest admissible neighbours that surround a point, and the widest gap between their directions if they do."""
 STEEP = 0.7
 """Sine of the angle to the tangent plane from which on an edge leaves it."""
-RING = 6
-"""The spacing at a point is the distance to its neighbour of this number."""
 STEEP_EDGE, LONG_EDGE, LONGEST = 1.2, 2.2, 3.5
 """Lengths from which on edges are in doubt: steep ones and others over the larger spacing of their ends, and any over
 the smaller one."""
@@ -64,10 +63,7 @@ def in_doubt(surface: CloudSurface, faces: Faces) -> Bool[np.ndarray, " F"]:
     i, j = edges.keys // count, edges.keys % count
     edge = points[j] - points[i]
     length = lengths(edge)
-    spacing, narrow = (
-        lengths(points[near[:, min(number, near.shape[1] - 1)]] - points)
-        for number in (RING, RING // 2)
-    )
+    spacing, narrow = (spacing_at(points, near, number) for number in (RING, RING // 2))
     small, large = np.minimum(spacing[i], spacing[j]), np.maximum(spacing[i], spacing[j])
     found = length > np.minimum(LONG_EDGE * large, LONGEST * small)
     steep_i, steep_j = (np.abs(inner(edge, normals[k])) > STEEP * length for k in (i, j))

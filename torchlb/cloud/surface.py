@@ -13,25 +13,27 @@ from scipy.spatial import Delaunay
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from torchlb.geometry.admission import mutually_admissible
-from torchlb.geometry.cocone import REACH, Candidates, Cloud, Tetrahedra, refined_normals
-from torchlb.geometry.frames import cloud_frames, vertex_normals
-from torchlb.geometry.gaps import closed, filled, with_left_points
-from torchlb.geometry.manifold import (
-    Faces,
+from torchlb.cloud.cocone import REACH, Candidates, Cloud, Tetrahedra
+from torchlb.cloud.frames import cloud_frames, refined_normals
+from torchlb.cloud.gaps import closed, filled, with_left_points
+from torchlb.cloud.manifold import (
     boundary_loops,
-    components,
     facing_out,
     with_single_fans,
     without_specks,
     wound_alike,
 )
+from torchlb.cloud.noise import denoised
+from torchlb.cloud.orientation import settled_normals
+from torchlb.cloud.outliers import lone_points, put_beside
+from torchlb.cloud.places import Places, in_words, places_of
+from torchlb.cloud.poles import Poles, corrected_normals
+from torchlb.cloud.stars import gaps_between, stars_in_gaps
+from torchlb.errors import InputError
+from torchlb.geometry.admission import mutually_admissible
+from torchlb.geometry.complex import Faces, components, pieces_of
+from torchlb.geometry.frames import vertex_normals
 from torchlb.geometry.neighbors import mesh_graph, nearest_neighbors
-from torchlb.geometry.noise import denoised
-from torchlb.geometry.outliers import lone_points, put_beside
-from torchlb.geometry.places import Places, in_words, places_of
-from torchlb.geometry.poles import Poles, corrected_normals
-from torchlb.geometry.stars import gaps_between, pieces_of, stars_in_gaps
 from torchlb.geometry.vectors import lengths
 
 NEAREST = 24
@@ -44,6 +46,8 @@ ASKEW = 0.7
 """Cosine with the normal of the faces below which another one is none: those of points in a row are any across it."""
 SPECK = 4
 """Patches of fewer triangles are left out."""
+ON_LINE = 1e-9
+"""Spread of a cloud across its longest direction over that along it, below which it is a line."""
 FLAT = 1e-6
 """Thickness over width of a cloud that lies in a plane."""
 
@@ -135,14 +139,16 @@ def cloud_surface(
     points: Float[Tensor, "N 3"],
     *,
     normals: Float[Tensor, "N 3"] | None = None,
-    oriented: bool = True,
     boundary: Bool[Tensor, " N"] | None = None,
 ) -> CloudSurface:
     """The surface through all points, as far as they resolve one; `boundary` marks points of a real boundary.
 
-    Given normals say which side is out where they are `oriented`.
+    Given normals say which side is out where most of them agree.
     """
-    start = _start(points, normals, boundary)
+    candidates, oriented = nearest_neighbors(points, min(NEAREST, len(points))), False
+    if normals is not None:
+        normals, oriented = settled_normals(points, normals, candidates)
+    start = _start(points, candidates, normals, boundary)
     cloud, found, given, count = start.cloud, start.found, normals, len(points)
     places = cloud.points
     outward = given.numpy() if given is not None and oriented else found.outward
@@ -183,11 +189,11 @@ class _Start(NamedTuple):
 
 def _start(
     points: Float[Tensor, "N 3"],
+    candidates: Int[Tensor, "N K"],
     given: Float[Tensor, "N 3"] | None,
     boundary: Bool[Tensor, " N"] | None,
 ) -> _Start:
     """Normals, those of the plane if the points are in one, else refined; and candidates from Delaunay's triangles."""
-    candidates = nearest_neighbors(points, min(NEAREST, len(points)))
     lone = lone_points(points.numpy(), candidates.numpy())
     if lone.any():
         points = torch.from_numpy(put_beside(points.numpy(), lone))
@@ -381,3 +387,12 @@ def _kin(cloud: Cloud) -> tuple[np.ndarray, np.ndarray]:
     lone = (np.bincount(piece) < NEAREST)[piece]
     near |= (lone[:, None] & (np.arange(good.shape[1]) < SPACING)).ravel()
     return i[near], j[near]
+
+
+def check_spread(points: Float[Tensor, "N n"]) -> None:
+    """InputError for points of a surface that lie on a line."""
+    spread = torch.linalg.svdvals(points - points.mean(0))
+    if spread[1] <= ON_LINE * spread[0]:
+        raise InputError(
+            f"points: all {len(points)} lie on a line, and no surface goes through them; a curve has dim=1"
+        )

@@ -17,9 +17,10 @@ from scipy import sparse
 from scipy.sparse.linalg import cg
 from torch import Tensor
 
-from torchlb.geometry.cocone import FLAT, TINY, Tetrahedra, refined_normals
-from torchlb.geometry.manifold import edges_of, tree_sides
-from torchlb.geometry.vectors import at, dot, inner, lengths
+from torchlb.cloud.cocone import FLAT, Tetrahedra
+from torchlb.cloud.frames import refined_normals
+from torchlb.geometry.complex import edges_of, tree_sides
+from torchlb.geometry.vectors import TINY, at, dot, inner, lengths
 
 LONG = 1.4
 """A Voronoi cell that reaches so many times as far as along the normal has another one."""

@@ -23,12 +23,19 @@ FLAT, HIGH = 0.3, 0.2
 stands above the plane of its neighbours, over its distance from their midst."""
 
 
+def spacing_at(
+    points: Float[np.ndarray, "N 3"], near: Int[np.ndarray, "N K"], number: int = RING
+) -> Float[np.ndarray, " N"]:
+    """How far the points around each are apart: the distance to its neighbour of this number, ℓ."""
+    return lengths(points[near[:, min(number, near.shape[1] - 1)]] - points)
+
+
 def lone_points(
     points: Float[np.ndarray, "N 3"], near: Int[np.ndarray, "N K"]
 ) -> Bool[np.ndarray, " N"]:
     """Which points are far from all others by the spacing of these, above their plane, and in none with their like."""
     lone = np.zeros(len(points), dtype=bool)
-    spacing = lengths(points[near[:, min(RING, near.shape[1] - 1)]] - points)
+    spacing = spacing_at(points, near)
     usual = np.partition(spacing[near[:, 1:]], near.shape[1] // 4, axis=1)[:, near.shape[1] // 4]
     far = np.flatnonzero(spacing > LONE * usual)
     if len(far) == 0:
