@@ -154,7 +154,7 @@ def test_components_of_two_scales_are_judged_each_by_its_own(scale):
     sphere = Sphere().random_points(750)
     torus = Torus().random_points(250) + torch.tensor([9.0, 0.0, 0.0], dtype=torch.float64)
 
-    faces = torch.cat([cloud_surface(sphere).faces, cloud_surface(torus).faces + 750])
+    faces = torch.cat([cloud_surface(sphere).cells, cloud_surface(torus).cells + 750])
 
     def build(factor):
         return stencil_of_mesh(torch.cat([factor * sphere, torus]), faces, order=3)

@@ -356,14 +356,15 @@ def test_the_pair_travels(dtype):
 
 
 def test_where_there_can_be_no_pair():
-    """Clouds of curves: a clear error where it is asked for, none where it is left open."""
+    """Clouds in four dimensions: a clear error where it is asked for, none where it is left open."""
     around = torch.arange(20, dtype=torch.float64) * torch.pi / 10
     circle = torch.stack([around.cos(), around.sin()], 1)
+    torus = torch.cat([circle.repeat(20, 1), circle.repeat_interleave(20, 0)], 1)
     with pytest.raises(InputError, match="weak_form"):
-        LaplaceBeltrami.from_points(circle, order=1, weak_form=True)
+        LaplaceBeltrami.from_points(torus, dim=2, order=1, weak_form=True)
     with pytest.raises(InputError, match="3 points are fewer"):
         LaplaceBeltrami.from_mesh(torch.eye(3), torch.tensor([[0, 1, 2]]))
-    cloud = LaplaceBeltrami.from_points(circle, order=1)
+    cloud = LaplaceBeltrami.from_points(torus, dim=2, order=1)
     assert not cloud.has_weak_form
     assert cloud.certificate.holds
     with pytest.raises(InputError, match="no weak pair"):

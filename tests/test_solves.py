@@ -504,12 +504,18 @@ def test_swapped_arguments_are_named(unchecked):
             function(lb.mass, lb, 0.1)
 
 
-def test_boundary_data_on_curves_and_solids_get_true_advice():
-    """As clouds, which have no pair."""
-    arc = torch.linspace(0, 1, 30, dtype=torch.float64)[:, None] * torch.tensor([1.0, 0.0])
-    ends = (arc[:, 0] == 0) | (arc[:, 0] == 1)
-    lb = LaplaceBeltrami.from_points(arc, dim=1, order=1, boundary=ends, condition="dirichlet")
+def test_boundary_data_without_a_pair_get_true_advice():
+    """A cloud in four dimensions can have none, a curve without one is told to have it."""
+    x, y = torch.rand(2, 60, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
+    flat = torch.stack([x, y, x, y], 1)
+    lb = LaplaceBeltrami.from_points(flat, dim=2, order=1, boundary="detect", condition="dirichlet")
     with pytest.raises(
-        ValueError, match=r"only a weak pair .*dimension 1 in R\^2.*by a system of the stencil"
+        ValueError, match=r"only a weak pair .*dimension 2 in R\^4.*by a system of the stencil"
     ):
+        poisson_solve(lb, x, boundary_values=1.0)
+    arc = torch.linspace(0, 1, 30, dtype=torch.float64)[:, None] * torch.tensor([1.0, 0.0])
+    lb = LaplaceBeltrami.from_points(
+        arc, order=1, dim=1, boundary="detect", condition="dirichlet", weak_form=False
+    )
+    with pytest.raises(ValueError, match="build without weak_form=False"):
         poisson_solve(lb, arc[:, 0], boundary_values=1.0)

@@ -39,7 +39,7 @@ def test_closed_shapes_get_closed_surfaces(name, kind):
     """V − E + F = 2 − 2g, every edge has two faces that run along it in opposite directions, all points are reached."""
     points = cloud(name, kind)
     surface = cloud_surface(points)
-    faces = surface.faces.numpy()
+    faces = surface.cells.numpy()
     edges = edges_of(faces, len(points))
     assert (edges.uses == 2).all()
     assert len(np.unique(faces)) == len(points)
@@ -92,7 +92,7 @@ def test_a_hole_is_left_open_and_gaps_are_not():
     points = Sphere().random_points(2000)
     points = points[points[:, 2] < np.cos(0.6)]
     surface = cloud_surface(points)
-    (loop,) = boundary_loops(surface.faces.numpy(), len(points))
+    (loop,) = boundary_loops(surface.cells.numpy(), len(points))
     assert (points[loop, 2] > np.cos(0.8)).all()
     area = 2 * np.pi * (1 + np.cos(0.6))
     assert float(LaplaceBeltrami.from_points(points).mass.sum()) == pytest.approx(area, rel=0.02)
@@ -105,7 +105,7 @@ def test_a_band_with_one_side_stays_one_band():
     ring = 1 + v * (u / 2).cos()
     points = torch.stack([ring * u.cos(), ring * u.sin(), v * (u / 2).sin()], 1)
     surface = cloud_surface(points)
-    faces = surface.faces.numpy()
+    faces = surface.cells.numpy()
     edges = edges_of(faces, len(points))
     assert surface.summary.components == surface.summary.boundary_loops == 1
     assert len(points) - len(edges.keys) + len(faces) == 0
@@ -120,7 +120,7 @@ def test_a_band_of_random_points_is_not_torn_at_its_seam():
     ring = 1 + v * (u / 2).cos()
     points = torch.stack([ring * u.cos(), ring * u.sin(), v * (u / 2).sin()], 1)
     surface = cloud_surface(points)
-    assert euler(surface.faces.numpy()) == 0
+    assert euler(surface.cells.numpy()) == 0
     assert surface.summary.boundary_loops == 1
     assert surface.summary.contacts == 0
 
@@ -132,9 +132,9 @@ def test_a_sudden_change_of_density_is_no_boundary(ratio):
     points = torch.nn.functional.normalize(torch.randn(20000, 3, generator=generator).double())
     chance = torch.rand(len(points), generator=generator)
     points = points[chance < torch.where(points[:, 2] > 0.3, 0.3, 0.3 / ratio)]
-    assert euler(cloud_surface(points).faces.numpy()) == 2
+    assert euler(cloud_surface(points).cells.numpy()) == 2
     half = cloud_surface(points[points[:, 0] > 0])
-    assert half.summary.boundary_loops == euler(half.faces.numpy()) == 1
+    assert half.summary.boundary_loops == euler(half.cells.numpy()) == 1
 
 
 def test_spheres_apart_stay_apart_and_an_outlier_joins_nothing():
@@ -276,13 +276,13 @@ def test_rings_far_apart_are_one_tube(size):
         rings.append(((end + side) * axis)[None])
     points = torch.cat(rings)
     surface = cloud_surface(points)
-    edges = edges_of(surface.faces.numpy(), len(points))
+    edges = edges_of(surface.cells.numpy(), len(points))
     assert (edges.uses == 2).all()
-    assert len(points) - len(edges.keys) + len(surface.faces) == 2
+    assert len(points) - len(edges.keys) + len(surface.cells) == 2
     assert surface.summary.contacts == 0
     out = points - points[:, 2:].clamp(0, 8) * axis
     assert ((surface.normals * out).sum(1) > 0.9).all()
-    a, b, c = points[surface.faces].unbind(1)
+    a, b, c = points[surface.cells].unbind(1)
     area = float(torch.linalg.cross(b - a, c - a).norm(dim=1).sum() / 2)
     assert area == pytest.approx(2 * np.pi * 8 + 4 * np.pi, rel=0.02)
 
@@ -299,7 +299,7 @@ def test_circles_of_latitude_are_one_sphere():
     for seed in (40, 85, 101):
         order = torch.randperm(len(points), generator=torch.Generator().manual_seed(seed))
         found = cloud_surface(points[order])
-        assert (len(found.faces), found.summary.boundary_loops) == (2 * len(points) - 4, 0)
+        assert (len(found.cells), found.summary.boundary_loops) == (2 * len(points) - 4, 0)
     lb = LaplaceBeltrami.from_points(points)
     assert len(lb.faces) == 2 * len(points) - 4
     assert (edges_of(lb.faces.numpy(), len(points)).uses == 2).all()
@@ -373,7 +373,7 @@ def test_an_open_surface_has_two_sides_of_its_own(waves):
     assert ((surface.normals * normals).sum(1) > 0).double().mean() > 0.99
     assert surface.summary.reached >= 2999
     assert surface.summary.boundary_loops == 1
-    assert euler(surface.faces.numpy()) == 1
+    assert euler(surface.cells.numpy()) == 1
 
 
 def euler(faces):
@@ -387,7 +387,7 @@ def test_bodies_that_nearly_touch_are_closed_each_for_itself(seed):
     surface = cloud_surface(row_of_ellipsoids(1000, 2.03, seed)[0])
     assert surface.summary.reached == 3000
     assert surface.summary.boundary_loops == 0
-    assert euler(surface.faces.numpy()) >= 4
+    assert euler(surface.cells.numpy()) >= 4
 
 
 @pytest.mark.parametrize(("radius", "seed"), [(0.05, 3), (0.06, 0), (0.08, 1)])
@@ -411,7 +411,7 @@ def test_normals_that_are_given_keep_their_side():
     with pytest.warns(UserWarning, match="200 face the other way"):
         surface = cloud_surface(points, normals=given)
     assert ((surface.normals * -points).sum(1) > 0.9).all()
-    a, b, c = points[surface.faces].unbind(1)
+    a, b, c = points[surface.cells].unbind(1)
     assert ((torch.linalg.cross(b - a, c - a) * a).sum(1) < 0).all()
 
 
@@ -492,7 +492,7 @@ def test_the_surface_turns_with_the_points_and_follows_the_unit():
     turn = turn * turn.det()
 
     def corners(surface):
-        return {tuple(sorted(face)) for face in surface.faces.tolist()}
+        return {tuple(sorted(face)) for face in surface.cells.tolist()}
 
     plain = corners(cloud_surface(points))
     assert corners(cloud_surface(1024 * points @ turn.T)) == plain
@@ -556,7 +556,7 @@ def test_rings_far_denser_than_apart_are_one_sphere():
     t, phi = (x.flatten() for x in torch.meshgrid(polar, angle, indexing="ij"))
     points = torch.stack([t.sin() * phi.cos(), t.sin() * phi.sin(), t.cos()], 1)
     surface = cloud_surface(points)
-    assert euler(surface.faces.numpy()) == 2
+    assert euler(surface.cells.numpy()) == 2
     assert surface.summary.reached == len(points)
     assert surface.summary.components == 1
 
@@ -591,7 +591,7 @@ def test_a_declared_boundary_that_was_closed_is_told():
     distance = np.hypot(points[:, 0] - 0.5, points[:, 1] - 0.5) * 29
     points, distance = points[distance > 1.6], distance[distance > 1.6]
     edge = (points[:, :2] < 1e-9).any(1) | (points[:, :2] > 1 - 1e-9).any(1)
-    with pytest.warns(UserWarning, match="lie inside the surface"):
+    with pytest.warns(UserWarning, match="lie inside the shape"):
         LaplaceBeltrami.from_points(
             points, order=1, boundary=torch.from_numpy(edge | (distance < 2.6))
         )

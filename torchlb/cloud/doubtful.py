@@ -91,7 +91,7 @@ def spectral_change(surface: CloudSurface) -> tuple[float, Bool[np.ndarray, " N"
     An eigenvalue would be lower by their share of the energy ∫|∇φ|² of its mode if they did not conduct: scattered
     triangles have as much of every mode; a bridge has nearly all of a mode that it alone bounds.
     """
-    points, parts = surface.points.numpy(), (surface.faces.numpy(), surface.stars.numpy())
+    points, parts = surface.points.numpy(), (surface.cells.numpy(), surface.stars.numpy())
     faces = np.concatenate(parts)
     weight = np.array([1.0, 1 / 3]).repeat([len(part) for part in parts])
     doubtful, marked = in_doubt(surface, faces), np.zeros(len(points), dtype=bool)

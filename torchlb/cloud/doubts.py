@@ -39,7 +39,7 @@ ASTRAY = 0.02
 
 def warn_of_doubts(surface: CloudSurface, plan: FitPlan, mass: Float[Tensor, " N"]) -> None:
     """Warnings that name points where a cloud does not resolve its surface, if they are many or hold much of it."""
-    apart = ~torch.isin(torch.arange(len(surface.points)), surface.faces)
+    apart = ~torch.isin(torch.arange(len(surface.points)), surface.cells)
     doubtful = (plan.reason == REASONS.index("points do not resolve the surface")) | apart
     flat = (plan.degree == 0) | apart
     large = float(mass[flat].sum() / mass.sum()) >= DOUBTFUL
@@ -53,9 +53,9 @@ def warn_of_doubts(surface: CloudSurface, plan: FitPlan, mass: Float[Tensor, " N
         )
 
 
-def warn_of_joins(surface: CloudSurface, boundary: Bool[Tensor, " N"] | None) -> None:
-    """Warnings where triangles may join what is apart, or close what is open, also around a declared boundary."""
-    points, faces = surface.points, surface.faces
+def warn_of_joins(surface: CloudSurface) -> None:
+    """A warning where triangles may join what is apart, or close what is open."""
+    points = surface.points
     change, marked = spectral_change(surface)
     if change > CHANGE:
         places = in_words(places_of(points.numpy(), surface.neighbors.numpy(), marked))
@@ -65,15 +65,23 @@ def warn_of_joins(surface: CloudSurface, boundary: Bool[Tensor, " N"] | None) ->
             "join what only touches there, or wall up a gap between parts. Add points there, build each part by "
             "itself (LaplaceBeltrami.batch), or give the mesh if there is one"
         )
-    if boundary is not None:
-        rim = torch.zeros_like(boundary).index_fill(0, boundary_faces(faces).flatten(), True)
-        inside = (boundary & ~rim & torch.isin(torch.arange(len(points)), faces)).nonzero()[:, 0]
-        if len(inside) > ASTRAY * int(boundary.sum()):
-            warn(
-                f"boundary: {len(inside)} of its points ({first_few(inside)}) lie inside the surface through the "
-                "cloud, as around a hole that was closed because it is hardly wider than the spacing; add points "
-                "around it, or give the mesh"
-            )
+
+
+def on_rim(cells: Int[Tensor, "F corners"], count: int) -> Bool[Tensor, " N"]:
+    """Which points lie on the boundary of a complex."""
+    return torch.zeros(count, dtype=torch.bool).index_fill(0, boundary_faces(cells).flatten(), True)
+
+
+def warn_of_buried(cells: Int[Tensor, "F corners"], boundary: Bool[Tensor, " N"]) -> None:
+    """A warning where points of a declared boundary lie inside."""
+    within = torch.isin(torch.arange(len(boundary)), cells) & ~on_rim(cells, len(boundary))
+    inside = (boundary & within).nonzero()[:, 0]
+    if len(inside) > ASTRAY * int(boundary.sum()):
+        warn(
+            f"boundary: {len(inside)} of its points ({first_few(inside)}) lie inside the shape through the cloud, as "
+            "around a hole that was closed because it is hardly wider than the spacing; add points around it, or give "
+            "the mesh"
+        )
 
 
 def warn_of_near_duplicates(points: Float[Tensor, "N n"], neighbors: Int[Tensor, "N K"]) -> None:

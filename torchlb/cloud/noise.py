@@ -29,21 +29,24 @@ whatever has one mode and is symmetric, 3 for a normal law; and their least size
 
 
 def denoised(
-    points: Float[Tensor, "N 3"], normals: Float[Tensor, "N 3"], candidates: Int[Tensor, "N K"]
-) -> tuple[Float[Tensor, "N 3"], float]:
-    """Where the surface is, and how far the points are from it, root mean square, ℓ; the points and 0 if it is clean.
+    points: Float[Tensor, "N n"],
+    planes: Float[Tensor, "N n"] | Float[Tensor, "N n d"],
+    candidates: Int[Tensor, "N K"],
+) -> tuple[Float[Tensor, "N n"], float]:
+    """Where the shape is, and how far the points are from it, root mean square, ℓ; the points and 0 if it is clean.
 
-    A smooth surface that quadratics do not follow is followed by quartics: F, the variance that the quartic terms take
-    out over that which they leave, is large. Noise has as much in every term. Noisy points move along their normals
-    onto the quadratics through their neighbourhoods.
+    A smooth shape that quadratics do not follow is followed by quartics: F, the variance that the quartic terms take
+    out over that which they leave, is large. Noise has as much in every term. Noisy points move across the shape, along
+    the normals of a surface or orthogonally to tangent frames, onto the quadratics through their neighbourhoods.
     """
-    size = candidates.shape[1]
-    if size < num_monomials(2, 4) + 3:
+    dim = points.shape[1] - 1 if planes.ndim == 2 else planes.shape[2]
+    size, terms = candidates.shape[1], [num_monomials(dim, degree) for degree in (2, 4)]
+    if size < terms[1] + 3:
         return points, 0.0
     some = torch.arange(0, len(points), -(-len(points) // SAMPLE))
-    radius, counts, two, _ = _residuals(points, normals, candidates, some, 2)
-    _, _, four, _ = _residuals(points, normals, candidates, some, 4)
-    free = counts - num_monomials(2, 2), counts - num_monomials(2, 4)
+    radius, counts, two, _ = _residuals(points, planes, candidates, some, 2)
+    _, _, four, _ = _residuals(points, planes, candidates, some, 4)
+    free = counts - terms[0], counts - terms[1]
     use = (free[1] > 2) & (two > free[0] * (ROUNDING * radius) ** 2)
     if use.double().mean() < 0.5:
         return points, 0.0
@@ -52,10 +55,10 @@ def denoised(
         return points, 0.0
     moved, squares = points.clone(), []
     for part in torch.arange(len(points)).split(AT_ONCE):
-        _, counts, left, offset = _residuals(points, normals, candidates, part, 2)
-        known = counts > num_monomials(2, 2) + 2
-        moved[part] += torch.where(known, offset, 0.0)[:, None] * normals[part]
-        squares.append((left / (counts - num_monomials(2, 2)))[known])
+        _, counts, left, offset = _residuals(points, planes, candidates, part, 2)
+        known = counts > terms[0] + 2
+        moved[part] += torch.where(known[:, None], offset, 0.0)
+        squares.append((left / (counts - terms[0]))[known])
     return moved, float(torch.cat(squares).median().sqrt())
 
 
@@ -81,24 +84,31 @@ def in_two_layers(points: Float[np.ndarray, "N 3"]) -> tuple[Int[np.ndarray, " M
 
 
 def _residuals(
-    points: Float[Tensor, "N 3"],
-    normals: Float[Tensor, "N 3"],
+    points: Float[Tensor, "N n"],
+    planes: Float[Tensor, "N n"] | Float[Tensor, "N n d"],
     candidates: Int[Tensor, "N K"],
     centers: Int[Tensor, " B"],
     degree: int,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Radius, number of admissible neighbours, sum of squares that polynomials through them leave, height at 0."""
-    index = candidates[centers]
-    offset, frames = points[index] - points[centers, None], complete_frames(normals[centers])
-    good = admissible_neighbors(points, normals, index)
+    index, plane = candidates[centers], planes[centers]
+    offset = points[index] - points[centers, None]
+    good = admissible_neighbors(points, planes, index)
     good[:, 0] = True
     radius = (offset.norm(dim=-1) * good).amax(1)
-    heights = dot(offset, normals[centers, None]) * good
+    if planes.ndim == 2:
+        coords = offset @ complete_frames(plane)
+        heights = dot(offset, plane[:, None])[..., None]
+    else:
+        coords = offset @ plane
+        heights = offset - coords @ plane.mT
+    heights = heights * good[..., None]
     scale = radius.clamp_min(torch.finfo(radius.dtype).tiny)[:, None, None]
-    terms = monomial_columns(offset @ frames / scale, degree).mT
+    terms = monomial_columns(coords / scale, degree).mT
     terms = torch.cat([torch.ones_like(terms[:, :1]), terms], 1) * good[:, None]
     square = terms @ terms.mT
     square += RIDGE * good.sum(1)[:, None, None] * torch.eye(square.shape[-1]).to(square)
-    coefficients = torch.linalg.solve(square, terms @ heights[..., None])
-    left = heights - (terms.mT @ coefficients)[..., 0]
-    return radius, good.sum(1), left.square().sum(1), coefficients[:, 0, 0]
+    coefficients = torch.linalg.solve(square, terms @ heights)
+    left = heights - terms.mT @ coefficients
+    middle = coefficients[:, 0] * plane if planes.ndim == 2 else coefficients[:, 0]
+    return radius, good.sum(1), left.square().sum((1, 2)), middle

@@ -8,18 +8,18 @@ from jaxtyping import Bool, Float, Int
 from torchlb.geometry.complex import components
 from torchlb.geometry.vectors import lengths
 
-Places = tuple[tuple[float, float, float], ...]
+Places = tuple[tuple[float, ...], ...]
 PLACES, PLACE = 8, 0.1
 """Places that are named where something is in doubt; and how large one is, over the width of the cloud."""
 
 
 def in_words(places: Places) -> str:
-    """As (x, y, z), one after the other."""
-    return ", ".join(f"({x:g}, {y:g}, {z:g})" for x, y, z in places)
+    """As (x, y, …), one after the other."""
+    return ", ".join(f"({', '.join(f'{x:g}' for x in place)})" for place in places)
 
 
 def places_of(
-    points: Float[np.ndarray, "N 3"], near: Int[np.ndarray, "N K"], marked: Bool[np.ndarray, " N"]
+    points: Float[np.ndarray, "N n"], near: Int[np.ndarray, "N K"], marked: Bool[np.ndarray, " N"]
 ) -> Places:
     """Where most of the marked points are, up to `PLACES` points, ℓ."""
     i, j = np.arange(len(points)).repeat(near.shape[1] - 1), near[:, 1:].ravel()
@@ -34,4 +34,4 @@ def places_of(
         number[around] = 0
     digits = 3 - int(np.floor(np.log10(width)))
     found = [(np.round(mean, digits) + 0.0).tolist() for mean in means]  # and no −0
-    return tuple((x, y, z) for x, y, z in found)
+    return tuple(map(tuple, found))

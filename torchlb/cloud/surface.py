@@ -14,6 +14,7 @@ from torch import Tensor
 from torch.nn.functional import normalize
 
 from torchlb.cloud.cocone import REACH, Candidates, Cloud, Tetrahedra
+from torchlb.cloud.complexes import Complex
 from torchlb.cloud.frames import cloud_frames, refined_normals
 from torchlb.cloud.gaps import closed, filled, with_left_points
 from torchlb.cloud.manifold import (
@@ -109,14 +110,12 @@ class SurfaceSummary:
         )
 
 
-@dataclass(frozen=True)
-class CloudSurface:
-    """Triangles through a cloud.
+@dataclass(frozen=True, kw_only=True)
+class CloudSurface(Complex):
+    """Triangles through a cloud, of one sheet: edges have at most two, and all are wound so that it faces out.
 
     Attributes
     ----------
-    points : (N, 3), ℓ: where the surface is at each point, the point itself if the cloud has no noise.
-    faces : (F, 3), a surface of one sheet: edges have at most two, and all are wound so that it faces out.
     stars : (S, 3), local triangles where it has gaps, of which a third counts.
     normals : (N, 3), unit, on the side of the faces.
     frames : (N, 3, 2), orthonormal, under the normals; they turn with the points.
@@ -125,8 +124,6 @@ class CloudSurface:
     summary : how that was found.
     """
 
-    points: Float[Tensor, "N 3"]
-    faces: Int[Tensor, "F 3"]
     stars: Int[Tensor, "S 3"]
     normals: Float[Tensor, "N 3"]
     frames: Float[Tensor, "N 3 2"]
@@ -171,9 +168,10 @@ def cloud_surface(
     found_of_it = *figures, start.noise, int(touched.sum()), where, int(start.lone.sum())
     summary = SurfaceSummary(count, *found_of_it)
     parts = (places, faces, stars, cloud.normals, cloud.neighbors, start.lone)
-    at, triangles, local, normals, near, lone = (torch.from_numpy(part) for part in parts)
-    frames = _upright(start.frames, normals)
-    return CloudSurface(at, triangles, local, normals, frames, near, lone, summary)
+    names = "points", "cells", "stars", "normals", "neighbors", "lone"
+    found: Any = {name: torch.from_numpy(part) for name, part in zip(names, parts, strict=True)}
+    frames = _upright(start.frames, found["normals"])
+    return CloudSurface(**found, frames=frames, summary=summary)
 
 
 class _Start(NamedTuple):

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import sys
 from dataclasses import asdict, replace
-from typing import Any
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -12,13 +11,6 @@ from torch import Tensor
 from torch.nn.functional import pad
 
 from torchlb.baseline.cotangent import cotangent_laplacian
-from torchlb.cloud.doubts import (
-    warn_of_doubts,
-    warn_of_joins,
-    warn_of_layers,
-    warn_of_near_duplicates,
-)
-from torchlb.cloud.surface import CloudSurface, check_spread, cloud_surface
 from torchlb.errors import InputError, first_few, renumbered, warn
 from torchlb.galerkin.coarse import lying_triangles, with_area
 from torchlb.galerkin.flips import flipped
@@ -30,131 +22,32 @@ from torchlb.linalg.threads import threads_for
 from torchlb.operator.assembled import AssembledOperator
 from torchlb.operator.checks import (
     check_boundary,
-    check_dimension,
-    check_distinct,
     check_faces,
-    check_normals,
     check_scale,
     mended_faces,
 )
 from torchlb.operator.inputs import ArrayLike, check_points
 from torchlb.operator.options import Options
 from torchlb.operator.plan import Plan, stencils_of
-from torchlb.operator.storage import OperatorStorage
 from torchlb.stability.enforce import certify
 from torchlb.stencils.assemble import assemble
 from torchlb.stencils.conditions import CONDITIONS
 from torchlb.stencils.low_order import MeshLowOrder
 from torchlb.stencils.rows import Reason, matrix_rows
-from torchlb.stencils.shape import Shape, cloud_shape, mesh_shape, surface_shape
+from torchlb.stencils.shape import Shape, mesh_shape
 
 NOWHERE = "condition='dirichlet' holds nowhere: no boundary, or `boundary` has none of it; leave the condition out"
 LONG_BOUNDARY = 0.1
 """Share of the boundary's length at long triangles from which on a warning names them."""
 MANY = 0.5
 """Share of low-order rows from which on a warning names them."""
-REMEDY = "do the points lie on a manifold of dimension {}? If not, pass its dimension as `dim`; else add points"
+REMEDIES = {
+    "mesh": "A finer mesh, or one without noise, has better ones",
+    "points": "Do the points lie on a manifold of dimension {}? If not, pass its dimension as `dim`; else add points",
+}
 
 
-def build_cloud(
-    points: ArrayLike,
-    dim: int | None,
-    options: Options,
-    *,
-    normals: ArrayLike | None,
-    boundary: ArrayLike | str | None,
-    progress: bool,
-) -> AssembledOperator:
-    """Operator on a point cloud; arguments as for `LaplaceBeltrami.from_points`."""
-    points = check_points(points)
-    check_scale(points)
-    ambient = points.shape[1]
-    d = check_dimension(points, dim, hypersurface=normals is not None)
-    options.check(len(points), ambient, d)
-    check_distinct(points)
-    where = check_boundary(boundary, len(points))
-    if where is None and options.condition == "dirichlet":
-        raise InputError(
-            "boundary: condition='dirichlet' holds at boundary points; pass a mask of them, or 'detect'"
-        )
-    if normals is not None:
-        if d != ambient - 1:
-            raise InputError(f"normals: only hypersurfaces have them, not dim={d} in R^{ambient}")
-        normals = check_normals(normals, points)
-    progress = progress and sys.stderr.isatty()
-    on_surface = d == 2 and ambient <= 3 and len(points) > 3
-    if d == ambient and where is None and not on_surface:
-        warn(
-            f"boundary: a shape of {d} dimensions in R^{d} ends somewhere, and without the mask of its boundary points "
-            "areas and Δ are wrong there; pass boundary=mask"
-        )
-    if on_surface:
-        check_spread(points)
-    numbering = Numbering.along_tree(points)
-    here = numbering.sorted(points)
-    if isinstance(where, Tensor):
-        where = numbering.sorted(where)
-    settings = {
-        "num_neighbors": options.num_neighbors,
-        "condition": options.held,
-        "progress": progress,
-    }
-    with renumbered(numbering.given), threads_for(len(points)):
-        normals = None if normals is None else numbering.sorted(normals)
-        if on_surface:
-            surface = cloud_surface(
-                pad(here, (0, 3 - ambient)),
-                normals=normals,
-                boundary=None if isinstance(where, str) else where,
-            )
-            built = _build_on_surface(here, surface, options, where, settings, numbering)
-        else:
-            options = options.settled(cells=False)
-            shape = cloud_shape(here, d, options.q, normals=normals, boundary=where, **settings)
-            built = _finished(shape, "points", options, REMEDY.format(d), progress)
-        if options.condition == "dirichlet" and built.on_boundary is None:
-            warn(NOWHERE)
-    return built.restored(numbering, points, built.faces)
-
-
-def _build_on_surface(
-    points: Float[Tensor, "N n"],
-    surface: CloudSurface,
-    options: Options,
-    boundary: Bool[Tensor, " N"] | str | None,
-    settings: dict[str, Any],
-    numbering: Numbering,
-) -> AssembledOperator:
-    """Operator on a cloud in R² or R³, by the surface through it."""
-    ambient, where = points.shape[1], None if isinstance(boundary, str) else boundary
-    warn_of_near_duplicates(points, surface.neighbors)
-    if ambient == 3:
-        warn_of_layers(points)
-    surface = replace(surface, faces=flipped(surface.points, surface.faces))
-    options = options.settled(cells=len(surface.faces) > 0)
-    degree, degrees = options.elements
-    places = surface.points[:, :ambient]
-    shape = surface_shape(
-        places, surface, options.q, boundary=where, fit_degrees=degrees, **settings
-    )
-    pair = plan = None
-    if degree > 0:
-        assert shape.plan is not None
-        assert shape.fits is not None
-        own = surface.faces, shape.plan.fits, shape.fits, degree, degrees
-        plan, pair = mesh_pair(places, *own, surface.stars, shape.held)
-        assert pair.mass is not None
-        shape = replace(shape, areas=pair.mass)
-        warn_of_doubts(surface, plan.fits, pair.mass)
-    warn_of_joins(surface, where)
-    built = _finished(shape, "points", options, REMEDY.format(2), settings["progress"], pair, plan)
-    faces = numbering.given[surface.faces]
-    built = replace(built, faces=faces, surface=surface.summary)
-    moved = (places != points).any(1).nonzero()[:, 0]
-    return _with_plan(built, shape, plan, options, numbering, torch.arange(len(faces)), moved)
-
-
-def _with_plan(
+def with_plan(
     built: AssembledOperator,
     shape: Shape,
     pair: PairPlan | None,
@@ -204,9 +97,7 @@ def build_mesh(
     check_scale(vertices)
     corners = check_faces(faces, len(vertices))
     options.check(len(vertices), vertices.shape[1], corners.shape[1] - 1)
-    corners = given = mended_faces(vertices, corners)
-    options = options.settled(cells=True)
-    degree, degrees = options.elements
+    corners = mended_faces(vertices, corners)
     if isinstance(boundary, str) and boundary in CONDITIONS:
         raise InputError(
             f"boundary: expected where the condition holds, a mask of the vertices, got {boundary!r}; what holds there "
@@ -214,20 +105,33 @@ def build_mesh(
         )
     where = check_boundary(boundary, len(vertices))
     progress = progress and sys.stderr.isatty()
-    numbering, here, corners, order = numbered_mesh(vertices, corners, flip=degree > 0)
+    return on_cells(vertices, vertices, corners, options, where, "mesh", progress)
+
+
+def on_cells(
+    given: Float[Tensor, "N n"],
+    vertices: Float[Tensor, "N n"],
+    cells: Int[Tensor, "F corners"],
+    options: Options,
+    boundary: Bool[Tensor, " N"] | str | None,
+    source: str,
+    progress: bool,
+) -> AssembledOperator:
+    """Operator of `given` points on a complex that reaches all vertices, which stand where it is."""
+    options = options.settled(cells=True)
+    degree, degrees = options.elements
+    numbering, here, corners, order = numbered_mesh(vertices, cells, flip=degree > 0)
     with renumbered(numbering.given), threads_for(len(vertices)):
         shape = mesh_shape(
             here,
             corners,
             options.q,
             num_neighbors=options.num_neighbors,
-            boundary=numbering.sorted(where) if isinstance(where, Tensor) else None,
+            boundary=numbering.sorted(boundary) if isinstance(boundary, Tensor) else None,
             condition=options.held,
             fit_degrees=degrees,
             progress=progress,
         )
-        if options.condition == "dirichlet" and shape.boundary is None:
-            warn(NOWHERE)
         pair = plan = None
         if degree > 0:
             assert shape.plan is not None
@@ -236,23 +140,10 @@ def build_mesh(
             plan, pair = mesh_pair(here, corners, *own, held=shape.held)
             assert pair.mass is not None
             shape = replace(shape, areas=pair.mass)
-        remedy = "a finer mesh, or one without noise, has better ones"
-        built = _finished(shape, "mesh", options, remedy, progress, pair, plan)
-        built = replace(built, faces=given)
-        none = order.new_zeros(0)
-        built = _with_plan(built, shape, plan, options, numbering, order, none)
-    return built.restored(numbering, vertices, given)
-
-
-def built_again(lb: OperatorStorage) -> AssembledOperator:
-    """The operator of a mesh or a cloud, from what is stored of it."""
-    points, options = lb.points.detach().cpu().double(), Options(**lb.options)
-    boundary = None if lb.boundary is None else lb.boundary.cpu()
-    settings: dict[str, Any] = {"boundary": boundary, "progress": False}
-    if lb.source == "mesh":
-        return build_mesh(points, lb.faces.cpu(), options, **settings)
-    normals = lb.normals.cpu() if len(lb.normals) else None
-    return build_cloud(points, lb.dim, options, normals=normals, **settings)
+        built = replace(finished(shape, source, options, progress, pair, plan), faces=cells)
+        moved = (vertices != given).any(1).nonzero()[:, 0]
+        built = with_plan(built, shape, plan, options, numbering, order, moved)
+    return built.restored(numbering, given, cells)
 
 
 def build_cotangent(vertices: ArrayLike, faces: ArrayLike) -> AssembledOperator:
@@ -299,11 +190,10 @@ def _warn_of_long_triangles(vertices: Float[Tensor, "N n"], faces: Int[Tensor, "
         )
 
 
-def _finished(
+def finished(
     shape: Shape,
     source: str,
     options: Options,
-    remedy: str,
     progress: bool,
     pair: WeakPair | None = None,
     plan: PairPlan | None = None,
@@ -321,11 +211,15 @@ def _finished(
             progress=progress,
         )
         shape = replace(shape, areas=mass)
+    if options.condition == "dirichlet" and shape.boundary is None:
+        warn(NOWHERE)
     low, counts = rows.order == 0, None if plan is None else plan.counts
     share = float(low.double().mean())
     if share >= MANY:
         reason = Reason(int(rows.reason[low].mode().values)).text
-        reason += f". {remedy[:1].upper()}{remedy[1:]}; `print(lb.report)` says more"
+        reason += (
+            f". {REMEDIES[source].format(shape.frames.shape[-1])}; `print(lb.report)` says more"
+        )
         if counts is not None:
             _, _, edges, curved = counts.sum(1).tolist()
             share_curved = f"{curved / max(edges, 1):.0%} of its edges curved"

@@ -58,6 +58,11 @@ def complete_options(builder: Builder, options: dict[str, Any]) -> dict[str, Any
     """All options with their defaults, but `progress`, which changes nothing; InputTypeError for another."""
     known = _defaults(builder)
     _check_names(builder.__name__, options, known)
+    if options.get("reconstruct") is not None:
+        raise InputError(
+            "reconstruct: a function has no name in a cache; build with LaplaceBeltrami.from_points, and store the "
+            "operator with save_operator"
+        )
     return known | options
 
 

@@ -20,6 +20,7 @@ from torchlb.operator.batching import (
     remember_shapes,
     split_buffers,
 )
+from torchlb.operator.build_cloud import Reconstruction, build_cloud, built_again
 from torchlb.operator.inputs import ArrayLike, check_points, float_type, warn_of_gradients
 from torchlb.operator.options import Options
 from torchlb.operator.plan import Plan, evaluate
@@ -84,6 +85,7 @@ class LaplaceBeltrami(StencilFace, WeakFace):
         normals: ArrayLike | None = None,
         boundary: ArrayLike | Literal["detect"] | None = None,
         condition: ConditionName | None = "neumann",
+        reconstruct: Reconstruction | None = None,
         weak_form: bool | None = None,
         certify: bool | None = None,
         progress: bool = True,
@@ -94,23 +96,23 @@ class LaplaceBeltrami(StencilFace, WeakFace):
         ----------
         points : (N, n) tensor or array, length ℓ, without duplicates. Computed in float64 on the CPU, without
             gradients, as a warning says where they are required; the result has the floating type of the points.
-        dim : d of the manifold; n − 1 by default. Curves, surfaces in R⁴, S³ in R⁴ take the same path.
+        dim : d of the manifold; n − 1 by default.
         order : p ≥ 1 of the Laplacian: the error falls like h^p.
         normal_order : q of the tangent frames, p + 1 by default; 0 keeps the initial ones (or those of `normals`).
         projection : "tangent" (more accurate) or "normal" (the note's), see `method.md`, section 3.
         weights : "least_squares" (robust) or "polyharmonic" (far more accurate on evenly spread points).
         num_neighbors : size K of every stencil, itself included, instead of the sizes of the candidates.
-        normals : (N, n), if known (d = n − 1): the first guess of the tangent frames, and their orientation, in which
-            neighbours are made to agree; a warning says where they did not.
-        boundary : (N,) mask of the points on the boundary. By default, or for "detect", that of the surface through a
-            cloud in R² or R³; elsewhere None is a closed shape, and surfaces alone can "detect" one.
+        normals : (N, n), if known (d = n − 1): which way is out, where neighbours agree; a warning says where not.
+        boundary : (N,) mask of the points on the boundary. By default, or for "detect", that of the complex through the
+            cloud; where there is none, None is a closed shape, and surfaces alone can "detect" one.
         condition : there: "neumann", ∂_ν f = 0, or "dirichlet", f = 0. With the latter the values of f at boundary
             points are not used elsewhere, and have rows of their own, −4d f/h² with h the distance to the nearest, at
             least a tenth of that to the farthest of the row. None uses no datum. That, and a boundary that is not
             declared, leaves stencils there one-sided; hardly one passes, and the low-order rows in their place have
             ∂_ν f = 0 at first order: Δx at the boundary of a disk is of size 1/h then, not 0.
-        weak_form : whether to build the weak pair (K, M); by default where there can be one: on meshes and on
-            clouds of surfaces in R² and R³, by the surface through them (`lb.faces`, `method.md`, section 12).
+        reconstruct : from points (N, n) to cells through them, (F, d + 1), or a `torchlb.cloud.Complex`. By default
+            `torchlb.cloud.reconstruct`: of curves, of surfaces in R² and R³ and of solids in R³ (`lb.faces`).
+        weak_form : whether to build the weak pair (K, M); by default where there are cells.
         certify : whether rows of the stencil are lowered until the certificate of stability holds, whose π is then the
             mass; by default where there is no weak pair. With neither of them the operator may blow up under diffusion.
         progress : whether to show a bar, on a terminal, for what takes longer than two seconds.
@@ -125,9 +127,8 @@ class LaplaceBeltrami(StencilFace, WeakFace):
         )
         warn_of_gradients(points, "points")
         with torch.inference_mode(False):  # what is kept serves a training, too
-            built = build.build_cloud(
-                points, dim, options, normals=normals, boundary=boundary, progress=progress
-            )
+            given = {"normals": normals, "boundary": boundary, "reconstruction": reconstruct}
+            built = build_cloud(points, dim, options, **given, progress=progress)
             return cls._from_assembled(built, points)
 
     @classmethod
@@ -228,7 +229,7 @@ class LaplaceBeltrami(StencilFace, WeakFace):
         Raises InputError for batches, the cotangent operator, and operators with a certificate or without a weak pair.
         """
         if self._plan is None and self.source in ("mesh", "points") and self.has_weak_form:
-            self._plan = build.built_again(self).plan
+            self._plan = built_again(self).plan
         if self._plan is None:
             raise InputError(
                 f"plan: an operator of kind {self.source!r} has none, nor has one with a certificate or without a weak "

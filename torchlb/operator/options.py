@@ -45,8 +45,8 @@ class Options:
         """With the choices that were left open: a pair where there can be one, the certificate where there is none."""
         if self.weak_form and not cells:
             raise InputError(
-                "weak_form: only meshes, and clouds of surfaces in R² and R³, have one; leave it out, and the "
-                "certificate makes the stencil stable instead"
+                "weak_form: only meshes, and clouds of curves, of surfaces in R² and R³ and of solids in R³, have one; "
+                "leave it out, and the certificate makes the stencil stable instead"
             )
         weak = cells if self.weak_form is None else self.weak_form
         if (

@@ -212,7 +212,7 @@ def _poured(lb: LaplaceBeltrami, free: Tensor) -> Tensor:
 
 def _without_pair(lb: LaplaceBeltrami) -> str:
     """Why there is no place for boundary data, and what to do."""
-    if lb.source == "mesh" or (lb.dim == 2 and lb.points.shape[1] <= 3):
+    if len(lb.faces) > 0:
         return "the stencil has no place for them, the weak pair has; build without weak_form=False"
     return (
         f"only a weak pair has a place for them, and a shape of dimension {lb.dim} in R^{lb.points.shape[1]} has none; "

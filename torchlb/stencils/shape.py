@@ -306,7 +306,7 @@ def surface_shape(
     neighbourhood but their own.
     """
     flat = points.shape[1] == 2
-    triangles = torch.cat([surface.faces, surface.stars])
+    triangles = torch.cat([surface.cells, surface.stars])
     sides = None if flat else thin_sides(points, surface.normals, surface.neighbors)
     graph = mesh_graph(triangles, len(points))
     if surface.lone.any():
@@ -318,7 +318,7 @@ def surface_shape(
     plan, fits = _searched(balls, normal_order, num_neighbors, progress, fit_degrees)
     edge = None
     if condition is not None:
-        edge = boundary_of_mesh(points, surface.faces, normal_order)
+        edge = boundary_of_mesh(points, surface.cells, normal_order)
         if edge is not None and len(surface.stars):
             edge = _part(edge, edge.mask & ~torch.isin(torch.arange(len(points)), surface.stars))
         found = torch.zeros(len(points), dtype=torch.bool) if edge is None else edge.mask

@@ -1,0 +1,317 @@
+"""Chains of segments through points of curves in any Rⁿ.
+
+T. K. Dey and P. Kumar, *A simple provable algorithm for curve reconstruction*, 1999: each point is joined to the
+nearest one and to the nearest on its other side, here where both ends agree. What is left loose is joined by the
+shortest segments. A segment longer than the gaps between random points is no part of the curve, which ends there.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Int
+from scipy.spatial import KDTree
+from torch import Tensor
+
+from torchlb.cloud.complexes import Complex
+from torchlb.cloud.frames import cloud_frames
+from torchlb.cloud.noise import denoised
+from torchlb.cloud.orientation import settled_normals
+from torchlb.cloud.places import in_words, places_of
+from torchlb.errors import InputError, first_few, warn
+from torchlb.geometry.admission import MAX_SLOPE
+from torchlb.geometry.neighbors import nearest_neighbors
+from torchlb.geometry.vectors import TINY, inner, lengths
+
+NEAREST = 16
+"""Nearest points among which those beside a point are; and segments on either side that tell how long one is."""
+LOOSE = 8
+"""Nearest loose points that one of them is held against."""
+BESIDE = 0.5
+"""Largest cosine of the angle between the two segments of a point: corners are of 60° and more."""
+NOISY = 0.35
+"""Noise over the spacing, from which on it is none, but another part of the curve beside."""
+STRAY = 4.0
+"""Times the noise that the points beside another may lie off its tangent."""
+GAP, RANDOM = 3.0, 2.0
+"""A segment is a gap that is GAP + v (ln N + RANDOM) times as long as those around, with v = 0 of points at even steps
+and 1 of random ones: of exponential gaps one in N e⁵ is, then, so that one curve in 150 is cut."""
+BACK, TURN = 1.5, np.radians(120)
+"""Or so many times as long, where the curve would turn by so much at its two ends together."""
+CLOSE, STEPS = 1.5, 4.0
+"""Points are close to another part of the curve that are so many times as far apart as those around, and in doubt; and
+how much farther along the curve that part is."""
+
+Links = Int[np.ndarray, "N 2"]
+
+
+def cloud_curve(
+    points: Float[Tensor, "N n"],
+    *,
+    normals: Float[Tensor, "N n"] | None = None,
+    boundary: Bool[Tensor, " N"] | None = None,
+) -> Complex:
+    """The curve through all points: closed and open chains.
+
+    Parameters
+    ----------
+    normals
+        In R²: which side is out, where most of them agree. Closed curves face outward without.
+    boundary
+        Which points are ends, whatever lies beyond.
+
+    Raises
+    ------
+    InputError
+        For points that are far from all others.
+    """
+    size = min(NEAREST + 1, len(points))
+    near, oriented = nearest_neighbors(points, size), False
+    if normals is not None:
+        normals, oriented = settled_normals(points, normals, near)
+    single = np.zeros(len(points), dtype=bool) if boundary is None else boundary.numpy()
+    moved, noise = denoised(points, cloud_frames(points, near, 1), near)
+    usual = 2 * float((points[near[:, -1]] - points).norm(dim=1).median()) / (size - 1)
+    noise = noise if noise < NOISY * usual else 0.0
+    if noise:
+        points, near = moved, nearest_neighbors(moved, size)
+    tangents = cloud_frames(points, near, 1)[..., 0].numpy() if noise else None
+    places, index = points.numpy(), near.numpy()
+    links = _joined(places, _links(places, index, single, noise, tangents), single, noise)
+    chains, gaps = _cut(places, _in_turn(_with_passed_by(places, index, links)), noise)
+    alone = [int(chain.points[0]) for chain in chains if len(chain.points) == 1]
+    if alone:
+        raise InputError(
+            f"points: {len(alone)} ({first_few(torch.tensor(alone))}) are farther from all others than points of a "
+            "curve are apart, and no segment reaches them; leave them out, or add points between"
+        )
+    _warn(places, index, chains, noise, gaps)
+    cells = np.concatenate([chain.segments for chain in chains])
+    if points.shape[1] == 2:
+        given = normals.numpy() if oriented and normals is not None else None
+        cells = np.concatenate([_facing_out(places, chain, given) for chain in chains])
+    return Complex(points=points, cells=torch.from_numpy(cells))
+
+
+class Chain(NamedTuple):
+    """Points in turn, the first after the last again if it is closed; and how far those around each are apart, ℓ."""
+
+    points: Int[np.ndarray, " M"]
+    closed: bool
+    spacing: Float[np.ndarray, " M"]
+
+    @property
+    def segments(self) -> Int[np.ndarray, "S 2"]:
+        """Of each its two ends."""
+        pairs = np.stack([self.points, np.roll(self.points, -1)], 1)
+        return pairs if self.closed else pairs[:-1]
+
+
+def _links(
+    points: Float[np.ndarray, "N n"],
+    near: Int[np.ndarray, "N K"],
+    single: Bool[np.ndarray, " N"],
+    noise: float,
+    tangents: Float[np.ndarray, "N n"] | None,
+) -> Links:
+    """The points beside each, −1 for none, where these say the same; those that are `single` have one at most.
+
+    Noisy points are ordered along the tangent, by those that the noise may have moved off it.
+    """
+    rows = np.arange(len(points))
+    offset = points[near[:, 1:]] - points[:, None]
+    distance = lengths(offset)
+    if tangents is not None:
+        along = inner(offset, tangents[:, None])
+        across = np.sqrt(np.maximum(distance**2 - along**2, 0))
+        offset, distance = along[..., None] * tangents[:, None], np.abs(along)
+        distance[across > np.maximum(STRAY * noise, MAX_SLOPE * distance)] = np.inf
+    first = distance.argmin(1)
+    cosine = inner(offset, offset[rows, first][:, None])
+    cosine /= np.maximum(lengths(offset) * lengths(offset[rows, first])[:, None], TINY)
+    distance[(cosine >= BESIDE) | single[:, None]] = np.inf
+    distance *= (2 + cosine) ** 2  # straight on before sideways
+    second = distance.argmin(1)
+    some = np.isfinite(distance[rows, second])
+    i = np.concatenate([rows, rows[some]])
+    j = np.concatenate([near[rows, 1 + first], near[rows, 1 + second][some]])
+    key = np.unique(i * len(points) + j)
+    i, j = np.divmod(key, len(points))
+    agreed = np.isin(j * len(points) + i, key)
+    i, j = i[agreed], j[agreed]
+    links = np.full((len(points), 2), -1)
+    again = np.append(False, i[1:] == i[:-1]).astype(np.int64)
+    links[i, again] = j
+    return links
+
+
+def _joined(
+    points: Float[np.ndarray, "N n"], links: Links, single: Bool[np.ndarray, " N"], noise: float
+) -> Links:
+    """Loose points joined to each other by the shortest segments that do not turn back, but for noise."""
+    free = np.where(single, 1, 2) - (links >= 0).sum(1)
+    loose = np.flatnonzero(free > 0)
+    if len(loose) < 2:
+        return links
+    size = min(LOOSE + 1, len(loose))
+    near = np.asarray(KDTree(points[loose]).query(points[loose], k=size)[1])
+    i, j = loose.repeat(size), loose[near].ravel()
+    i, j = i[i < j], j[i < j]
+    order = np.argsort(lengths(points[i] - points[j]), kind="stable")
+
+    def open_to(here: int, there: int) -> Any:
+        other = links[here].max()
+        if other < 0 or free[here] == 0:
+            return free[here]
+        back, onward = points[[other, there]] - points[here]
+        return back @ onward <= 0 or min(back @ back, onward @ onward) < (STRAY * noise) ** 2
+
+    for one, two in zip(i[order].tolist(), j[order].tolist(), strict=True):
+        if two not in links[one] and open_to(one, two) and open_to(two, one):
+            for here, there in ((one, two), (two, one)):
+                links[here, links[here].argmin()] = there
+                free[here] -= 1
+    return links
+
+
+def _with_passed_by(
+    points: Float[np.ndarray, "N n"], near: Int[np.ndarray, "N K"], links: Links
+) -> Links:
+    """Points that were passed by are put into the segment of a neighbour that grows least, if it does not double."""
+    for i in np.flatnonzero((links < 0).all(1)).tolist():
+        best, ends = 1.0, None
+        for a in near[i, 1:].tolist():
+            for b in links[a][links[a] >= 0].tolist():
+                old, *new = lengths(points[[a, a, b]] - points[[b, i, i]])
+                if sum(new) - old < best * old:
+                    best, ends = sum(new) / old - 1, (a, b)
+        if ends is not None:
+            for here, there in (ends, ends[::-1]):
+                links[here, links[here] == there] = i
+            links[i] = ends
+    return links
+
+
+def _in_turn(links: Links) -> list[tuple[np.ndarray, bool]]:
+    """The points of every chain in turn, from an end if there is one, and whether it is closed."""
+    beside = links.tolist()
+    first = np.argsort((links >= 0).all(1), kind="stable").tolist()  # ends before all others
+    seen, chains = np.zeros(len(links), dtype=bool), []
+    for start in first:
+        if seen[start]:
+            continue
+        chain, here = [], start
+        while here >= 0 and not seen[here]:
+            seen[here] = True
+            chain.append(here)
+            one, two = beside[here]
+            here = one if one >= 0 and not seen[one] else two
+        chains.append((np.array(chain), start in beside[chain[-1]] and len(chain) > 2))
+    return chains
+
+
+def _cut(
+    points: Float[np.ndarray, "N n"], chains: list[tuple[np.ndarray, bool]], noise: float
+) -> tuple[list[Chain], Int[np.ndarray, " G"]]:
+    """The chains without gaps; and the ends of those gaps that are hardly longer than what is none."""
+    uneven, found = [], []
+    for chain, closed in chains:
+        ends = points[np.append(chain, chain[:1])] if closed else points[chain]
+        length = lengths(np.diff(ends, axis=0))
+        uneven.append(np.abs(np.diff(length)) / np.maximum(length[1:] + length[:-1], TINY))
+    spread = np.concatenate(uneven)
+    random = min(1.0, 2 * float(np.median(spread))) if len(spread) else 0.0
+    limit = GAP + random * (np.log(len(points)) + RANDOM)
+    doubtful: list[int] = []
+    for chain, closed in chains:
+        ends = points[np.append(chain, chain[:1])] if closed else points[chain]
+        step = np.diff(ends, axis=0)
+        length = lengths(step)
+        usual = _usual(length, closed)
+        cosine = inner(step, np.roll(step, 1, 0)) / np.maximum(length * np.roll(length, 1), TINY)
+        turn = np.arccos(np.clip(cosine, -1, 1))
+        if not closed:
+            turn[:1] = 0
+        back = turn + np.append(turn[1:], turn[:1] if closed else 0) > TURN
+        back &= noise == 0  # whose short segments have any direction
+        share = length / np.maximum(np.where(back, BACK, limit) * usual, TINY)
+        gap = np.flatnonzero(share > 1)
+        for k in gap[(share[gap] < 2) & ~back[gap]].tolist():
+            doubtful += [int(chain[k]), int(chain[(k + 1) % len(chain)])]
+        spacing = usual if closed else np.append(usual, usual[-1:] if len(usual) else 0.0)
+        if closed and len(gap):
+            chain, spacing = (np.roll(x, -gap[0] - 1) for x in (chain, spacing))
+            gap = gap[1:] - gap[0] - 1
+            closed = False
+        parts = [np.split(x, gap + 1) for x in (chain, spacing)]
+        found += [Chain(part, closed, width) for part, width in zip(*parts, strict=True)]
+    return found, np.array(doubtful, dtype=np.int64)
+
+
+def _usual(length: Float[np.ndarray, " S"], closed: bool) -> Float[np.ndarray, " S"]:
+    """The mean of the segments before each, or of those after it, whichever is larger: density may change at once."""
+    count, width = len(length), min(NEAREST, len(length) - 1) if closed else 0
+    around = np.concatenate([length[count - width :], length, length[:width]])
+    total, place = np.append(0, np.cumsum(around)), np.arange(count) + width
+    means = []
+    for first, last in ((place - NEAREST, place), (place + 1, place + 1 + NEAREST)):
+        first, last = (np.clip(end, 0, len(around)) for end in (first, last))
+        means.append((total[last] - total[first]) / np.maximum(last - first, 1))
+    return np.maximum(*means)
+
+
+def _facing_out(
+    points: Float[np.ndarray, "N 2"], chain: Chain, normals: Float[np.ndarray, "N 2"] | None
+) -> Int[np.ndarray, "S 2"]:
+    """Segments of a plane curve so that it faces as the normals do; outward if it is closed, or else up."""
+    a, b = points[chain.segments].swapaxes(0, 1)
+    normal = (b - a)[:, ::-1] * [1, -1]
+    if normals is not None:
+        outward = normals[chain.segments].sum(1)
+    else:
+        outward = (a + b) / 2 - points[chain.points].mean(0) if chain.closed else np.array([0.0, 1])
+    return chain.segments if np.sum(normal * outward) >= 0 else chain.segments[:, ::-1]
+
+
+def _warn(
+    points: Float[np.ndarray, "N n"],
+    near: Int[np.ndarray, "N K"],
+    chains: list[Chain],
+    noise: float,
+    gaps: Int[np.ndarray, " G"],
+) -> None:
+    """Warnings with the places where points of two parts are close, and gaps are hardly any; and of noise."""
+    number, place, size, spacing = np.zeros((4, len(points)))
+    for k, chain in enumerate(chains):
+        steps = lengths(np.diff(points[chain.segments], axis=1)[:, 0])
+        number[chain.points], spacing[chain.points] = k, chain.spacing
+        place[chain.points] = np.append(0, np.cumsum(steps))[: len(chain.points)]
+        size[chain.points] = steps.sum() if chain.closed else np.inf
+    way = np.abs(place[near] - place[:, None])
+    way = np.minimum(way, np.abs(size[:, None] - way))
+    other = (way > STEPS * spacing[:, None]) | (number[near] != number[:, None])
+    apart = lengths(points[near] - points[:, None])
+    close = (other & (apart < CLOSE * spacing[:, None])).any(1)
+
+    def where(marked: np.ndarray) -> str:
+        return in_words(places_of(points, near, marked))
+
+    if close.any():
+        warn(
+            f"points: {int(close.sum())} are nearer to another part of the curve than its points are apart, most of "
+            f"them near {where(close)}; it may go over to the other part there. Add points there, build each part by "
+            "itself (LaplaceBeltrami.batch), or give the segments to from_mesh"
+        )
+    if len(gaps):
+        at_gap = np.isin(np.arange(len(points)), gaps)
+        warn(
+            f"points: the curve ends at gaps hardly longer than those between its points, near {where(at_gap)}; add "
+            "points where it goes on, or give the segments to from_mesh"
+        )
+    if noise:
+        warn(
+            f"points: they lie beside the curve by {noise:.2g} (root mean square), and are moved onto a smooth one for "
+            "all that is computed; give the segments to from_mesh if they lie on it"
+        )

@@ -1,0 +1,78 @@
+"""A complex through a cloud, by its dimension and that of the space."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from torch import Tensor
+from torch.nn.functional import pad
+
+from torchlb.cloud.complexes import Complex
+from torchlb.cloud.curve import cloud_curve
+from torchlb.cloud.solid import cloud_solid
+from torchlb.cloud.surface import check_spread, cloud_surface
+from torchlb.errors import InputError, first_few
+
+
+def has_complex(dim: int, ambient: int) -> bool:
+    """Whether clouds of this dimension have one: curves in any Rⁿ, surfaces in R² and R³, solids in R³."""
+    return dim == 1 or (dim == 2 and ambient in (2, 3)) or dim == ambient == 3
+
+
+def reconstruct(
+    points: Any, dim: int | None = None, *, normals: Any = None, boundary: Any = None
+) -> Complex:
+    """Cells through a cloud of points: what `LaplaceBeltrami.from_points` builds on.
+
+    Curves become chains of segments (Dey and Kumar 1999), solids Delaunay tetrahedra without those outside (an alpha
+    shape), surfaces triangles by the cocone and the poles of Amenta and Bern (`method.md`, section 12).
+
+    Parameters
+    ----------
+    points
+        (N, n) tensor or array, ℓ, without duplicates.
+    dim
+        d of the shape, n − 1 by default.
+    normals
+        (N, n), if known: which way is out. For surfaces in R³ and curves in R².
+    boundary
+        (N,) mask of points where the shape ends, whatever lies beyond.
+
+    Returns
+    -------
+    Complex
+        Of a surface a `CloudSurface`: with normals, local stars where it has gaps, and how it was found.
+
+    Raises
+    ------
+    InputError
+        For points that are not finite, coincide with no shape of this dimension, or are far from all others.
+
+    Examples
+    --------
+    >>> points = [[0.0, 0.0], [1.0, 0.0], [2.0, 0.1], [3.0, 0.3], [4.0, 0.7]]
+    >>> reconstruct(points, dim=1).cells.sort(1).values.tolist()
+    [[0, 1], [1, 2], [2, 3], [3, 4]]
+    """
+    space: Tensor = torch.as_tensor(points).detach().to("cpu", torch.float64)
+    if space.ndim != 2:
+        raise InputError(f"points: expected shape (N, n), got {tuple(space.shape)}")
+    bad = (~space.isfinite()).any(1).nonzero()[:, 0]
+    if len(bad):
+        raise InputError(f"points: {len(bad)} are NaN or infinite ({first_few(bad)})")
+    count, ambient = space.shape
+    dim = max(ambient - 1, 1) if dim is None else dim
+    if not has_complex(dim, ambient) or count < dim + 1:
+        raise InputError(
+            "dim: clouds of curves, of surfaces in R² and R³, and of solids in R³ have a complex, not "
+            f"{count} points of dimension {dim} in R^{ambient}; LaplaceBeltrami.from_points takes others, too"
+        )
+    given = None if normals is None else torch.as_tensor(normals).to("cpu", torch.float64)
+    mask = None if boundary is None else torch.as_tensor(boundary).to("cpu")
+    if dim == 1:
+        return cloud_curve(space, normals=given, boundary=mask)
+    if dim == 3:
+        return cloud_solid(space)
+    check_spread(space)
+    return cloud_surface(pad(space, (0, 3 - ambient)), normals=given, boundary=mask)

@@ -1,0 +1,92 @@
+"""Delaunay tetrahedra of the points of a solid in R³, without those outside of it.
+
+Of random points with the density ρ a ball of the volume V holds none with the probability e^{−ρV}. So the spheres
+around the tetrahedra of a solid, which hold no point, are no larger than chance makes one in the cloud; those across a
+notch, a hole or a cavity are (an *alpha shape*, Edelsbrunner and Mücke 1994, with a length by the points around).
+"""
+
+from __future__ import annotations
+
+from itertools import combinations
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from torchlb.cloud.complexes import Complex
+from torchlb.cloud.delaunay import delaunay_tetrahedra
+from torchlb.errors import InputError, first_few
+from torchlb.geometry.complex import components
+from torchlb.geometry.neighbors import nearest_neighbors
+from torchlb.geometry.vectors import TINY, inner, lengths
+
+NEAREST = 16
+"""Points by which the density around each is known."""
+CELLS, SURE = 7, 5.0
+"""Tetrahedra a point, nearly; and e to which power as many clouds have a wrong cavity by chance."""
+NO_VOLUME = 1e-6
+"""Volume over the cube of the longest edge, below which a tetrahedron is a sliver that goes if it is outermost."""
+SHEAR = np.eye(3) + 1e-3 * np.array([[0, 0.9, 0.7], [0, 0, 0.8], [0, 0, 0]])
+"""By which points are mapped before they are triangulated: the cells of a grid are then all cut alike."""
+DENT = 8
+"""Cavities and dents of fewer tetrahedra are none."""
+
+
+def cloud_solid(points: Float[Tensor, "N 3"]) -> Complex:
+    """The solid that the points fill.
+
+    Raises
+    ------
+    InputError
+        For points in a plane, and for those that are far from all others.
+    """
+    places = points.numpy()
+    spread = np.linalg.svd(places - places.mean(0), compute_uv=False)
+    if spread[2] <= NO_VOLUME * spread[0]:
+        raise InputError(
+            f"points: all {len(points)} lie in a plane, and fill no solid; a surface has dim=2"
+        )
+    near = nearest_neighbors(points, min(NEAREST + 1, len(points))).numpy()
+    reach = lengths(places[near[:, -1]] - places)
+    cells, beside = delaunay_tetrahedra(places @ SHEAR)
+    radius, flat = _spheres(places, cells)
+    chance = (np.log(CELLS * len(points)) + SURE) / (near.shape[1] - 1)
+    kept = ~_outside(flat | (radius <= chance ** (1 / 3) * np.sort(reach[cells], 1)[:, 1]), beside)
+    beyond = np.append(kept, False)  # of the last, which −1 is, nothing is kept
+    while (peeled := kept & flat & ~beyond[beside].all(1)).any():
+        kept &= ~peeled
+        beyond[:-1] = kept
+    alone = np.setdiff1d(np.arange(len(points)), cells[kept])
+    if len(alone):
+        raise InputError(
+            f"points: {len(alone)} ({first_few(torch.from_numpy(alone))}) are farther from all others than points of "
+            "a solid are apart, and no tetrahedron reaches them; leave them out, or add points between"
+        )
+    return Complex(points=points, cells=torch.from_numpy(cells[kept]))
+
+
+def _spheres(
+    points: Float[np.ndarray, "N 3"], cells: Int[np.ndarray, "T 4"]
+) -> tuple[Float[np.ndarray, " T"], Bool[np.ndarray, " T"]]:
+    """Circumradii, ℓ, and which have no volume."""
+    origin = points[cells[:, 0]]
+    u, v, w = (points[cells[:, k]] - origin for k in (1, 2, 3))
+    crosses = np.cross(v, w), np.cross(w, u), np.cross(u, v)
+    six = inner(u, crosses[0])
+    total = np.sum([inner(x, x)[:, None] * c for x, c in zip((u, v, w), crosses, strict=True)], 0)
+    radius = lengths(total) / np.maximum(2 * np.abs(six), TINY)
+    edges = [
+        lengths(points[cells[:, i]] - points[cells[:, j]]) for i, j in combinations(range(4), 2)
+    ]
+    return radius, np.abs(six) / 6 <= NO_VOLUME * np.max(edges, axis=0) ** 3
+
+
+def _outside(
+    kept: Bool[np.ndarray, " T"], beside: Int[np.ndarray, "T 4"]
+) -> Bool[np.ndarray, " T"]:
+    """Which of those that are not kept hang together in such a number that they are no dent."""
+    i, j = np.arange(len(kept)).repeat(4), beside.ravel()
+    both = (j >= 0) & ~kept[i] & ~kept[j]
+    piece = components(i[both], j[both], len(kept))
+    return ~kept & (np.bincount(piece)[piece] >= DENT)

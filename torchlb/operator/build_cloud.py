@@ -1,0 +1,202 @@
+"""From a cloud of points to a finished operator: checks, a complex through it, and what is built on that."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from torchlb.cloud.complexes import Complex
+from torchlb.cloud.doubts import (
+    on_rim,
+    warn_of_buried,
+    warn_of_doubts,
+    warn_of_joins,
+    warn_of_layers,
+    warn_of_near_duplicates,
+)
+from torchlb.cloud.reconstruction import has_complex, reconstruct
+from torchlb.cloud.surface import CloudSurface
+from torchlb.errors import InputError, renumbered, warn
+from torchlb.galerkin.flips import flipped
+from torchlb.galerkin.pair import mesh_pair
+from torchlb.geometry.numbering import Numbering
+from torchlb.linalg.threads import threads_for
+from torchlb.operator.assembled import AssembledOperator
+from torchlb.operator.build import finished, on_cells, with_plan
+from torchlb.operator.checks import (
+    check_boundary,
+    check_dimension,
+    check_distinct,
+    check_faces,
+    check_normals,
+    check_scale,
+    mended_faces,
+)
+from torchlb.operator.inputs import ArrayLike, check_points
+from torchlb.operator.options import Options
+from torchlb.operator.storage import OperatorStorage
+from torchlb.stencils.shape import cloud_shape, surface_shape
+
+Reconstruction = Callable[[Tensor], ArrayLike | Complex]
+"""From points, (N, n) float64, to cells through them."""
+
+
+def build_cloud(
+    points: ArrayLike,
+    dim: int | None,
+    options: Options,
+    *,
+    normals: ArrayLike | None,
+    boundary: ArrayLike | str | None,
+    reconstruction: Reconstruction | None,
+    progress: bool,
+) -> AssembledOperator:
+    """Operator on a point cloud; arguments as for `LaplaceBeltrami.from_points`."""
+    points = check_points(points)
+    check_scale(points)
+    check_distinct(points)
+    ambient, found = points.shape[1], None
+    if reconstruction is None:
+        d = check_dimension(points, dim, hypersurface=normals is not None)
+    else:
+        found = _given_complex(points, reconstruction, dim)
+        d = found.cells.shape[1] - 1
+    options.check(len(points), ambient, d)
+    where = check_boundary(boundary, len(points))
+    if where is None and options.condition == "dirichlet":
+        raise InputError(
+            "boundary: condition='dirichlet' holds at boundary points; pass a mask of them, or 'detect'"
+        )
+    if normals is not None:
+        if d != ambient - 1:
+            raise InputError(f"normals: only hypersurfaces have them, not dim={d} in R^{ambient}")
+        normals = check_normals(normals, points)
+    index, progress = torch.arange(len(points)), progress and sys.stderr.isatty()
+    numbering = Numbering.along_tree(points) if found is None else Numbering(index, index)
+    here = numbering.sorted(points)
+    mask = numbering.sorted(where) if isinstance(where, Tensor) else None
+    normals = None if normals is None else numbering.sorted(normals)
+    with renumbered(numbering.given), threads_for(len(points)):
+        if found is None and has_complex(d, ambient):
+            found = reconstruct(here, d, normals=normals, boundary=mask)
+        if found is not None and mask is not None:
+            warn_of_buried(found.cells, mask)
+        if found is None or isinstance(found, CloudSurface):
+            if found is None:
+                built = _on_points(
+                    here, d, options, normals, where if mask is None else mask, progress
+                )
+            else:
+                built = _on_surface(here, found, options, mask, numbering, progress)
+            return built.restored(numbering, points, built.faces)
+    cells, edge = numbering.given[found.cells], None
+    if isinstance(where, Tensor):
+        edge = where & on_rim(cells, len(points))
+    places = numbering.restored(found.points)
+    return on_cells(points, places, cells, options, edge, "points", progress)
+
+
+def _given_complex(
+    points: Float[Tensor, "N n"], reconstruction: Reconstruction, dim: int | None
+) -> Complex:
+    """What a user's function makes of the points."""
+    found = reconstruction(points.clone())
+    if isinstance(found, CloudSurface):
+        return found
+    places, cells = (found.points, found.cells) if isinstance(found, Complex) else (points, found)
+    places = check_points(places)
+    cells = mended_faces(places, check_faces(cells, len(points)))
+    if places.shape != points.shape or dim not in (None, cells.shape[1] - 1):
+        raise InputError(
+            f"reconstruct: expected cells through the {len(points)} points, of dimension {dim or 'any'}, got some of "
+            f"shape {tuple(cells.shape)} through {tuple(places.shape)}"
+        )
+    return Complex(points=places, cells=cells)
+
+
+def _on_points(
+    points: Float[Tensor, "N n"],
+    dim: int,
+    options: Options,
+    normals: Float[Tensor, "N n"] | None,
+    boundary: Bool[Tensor, " N"] | str | None,
+    progress: bool,
+) -> AssembledOperator:
+    """Operator on a cloud that no complex goes through, by stencils alone."""
+    if dim == points.shape[1] and boundary is None:
+        warn(
+            f"boundary: a shape of {dim} dimensions in R^{dim} ends somewhere, and without the mask of its boundary "
+            "points areas and Δ are wrong there; pass boundary=mask"
+        )
+    options = options.settled(cells=False)
+    shape = cloud_shape(
+        points,
+        dim,
+        options.q,
+        num_neighbors=options.num_neighbors,
+        normals=normals,
+        boundary=boundary,
+        condition=options.held,
+        progress=progress,
+    )
+    return finished(shape, "points", options, progress)
+
+
+def _on_surface(
+    points: Float[Tensor, "N n"],
+    surface: CloudSurface,
+    options: Options,
+    boundary: Bool[Tensor, " N"] | None,
+    numbering: Numbering,
+    progress: bool,
+) -> AssembledOperator:
+    """Operator on a cloud in R² or R³, by the surface through it."""
+    ambient = points.shape[1]
+    warn_of_near_duplicates(points, surface.neighbors)
+    if ambient == 3:
+        warn_of_layers(points)
+    surface = replace(surface, cells=flipped(surface.points, surface.cells))
+    options = options.settled(cells=len(surface.cells) > 0)
+    degree, degrees = options.elements
+    places = surface.points[:, :ambient]
+    shape = surface_shape(
+        places,
+        surface,
+        options.q,
+        num_neighbors=options.num_neighbors,
+        boundary=boundary,
+        condition=options.held,
+        fit_degrees=degrees,
+        progress=progress,
+    )
+    pair = plan = None
+    if degree > 0:
+        assert shape.plan is not None
+        assert shape.fits is not None
+        own = surface.cells, shape.plan.fits, shape.fits, degree, degrees
+        plan, pair = mesh_pair(places, *own, surface.stars, shape.held)
+        assert pair.mass is not None
+        shape = replace(shape, areas=pair.mass)
+        warn_of_doubts(surface, plan.fits, pair.mass)
+    warn_of_joins(surface)
+    built = finished(shape, "points", options, progress, pair, plan)
+    faces = numbering.given[surface.cells]
+    built = replace(built, faces=faces, surface=surface.summary)
+    moved = (places != points).any(1).nonzero()[:, 0]
+    return with_plan(built, shape, plan, options, numbering, torch.arange(len(faces)), moved)
+
+
+def built_again(lb: OperatorStorage) -> AssembledOperator:
+    """The operator of a mesh or a cloud, from what is stored of it."""
+    points, options = lb.points.detach().cpu().double(), Options(**lb.options)
+    boundary, cells = None if lb.boundary is None else lb.boundary.cpu(), lb.faces.cpu()
+    if lb.surface is None:
+        return on_cells(points, points, cells, options, boundary, lb.source, progress=False)
+    given: Any = {"normals": lb.normals.cpu() if len(lb.normals) else None, "boundary": boundary}
+    return build_cloud(points, lb.dim, options, **given, reconstruction=None, progress=False)
