@@ -8,10 +8,8 @@ import pytest
 import torch
 from scipy.sparse import csgraph
 
-from torchlb import compiled
 from torchlb.cloud.frames import cloud_frames
 from torchlb.cloud.voronoi import nearest_graph
-from torchlb.geometry import neighbors
 from torchlb.geometry.admission import admissible
 from torchlb.geometry.frames import mesh_frames
 from torchlb.geometry.neighbors import GraphBalls, mesh_graph, nearest_neighbors
@@ -224,52 +222,6 @@ def test_no_ball_crosses_between_parallel_sheets(size):
     assert torch.equal(row < n, others < n)
     plain = nearest_neighbors(points, 24)
     assert ((plain < n) != (plain[:, :1] < n)).any(1).double().mean() > 0.5
-
-
-def test_balls_around_a_fan_are_grown_a_few_at_a_time(monkeypatch):
-    """300 triangles at one apex: two steps lead from any vertex to all, and no more than 2¹² such ends are held."""
-    angle = torch.arange(300).double() * math.tau / 300
-    points = torch.stack([angle.cos(), angle.sin()], 1)
-    points = torch.cat([points, torch.zeros(1, 2).double()])
-    rim = torch.arange(300)
-    faces = torch.stack([rim, (rim + 1) % 300, torch.full((300,), 300)], 1)
-    graph, frames = mesh_graph(faces, 301), mesh_frames(points, faces)
-    whole = GraphBalls(points, graph, frames)(torch.arange(301), 20)
-    monkeypatch.setattr(compiled, "PATIENCE", math.inf)
-    monkeypatch.setattr(neighbors, "WALKS_AT_ONCE", 2**12)
-    balls, sizes = GraphBalls(points, graph, frames), []
-    walked = balls._walked
-    monkeypatch.setattr(balls, "_walked", lambda c, size: sizes.append(len(c)) or walked(c, size))
-    assert torch.equal(balls(torch.arange(301), 20)[0], whole[0])
-    assert max(sizes) <= 2**12 / 300 + 1
-
-
-@pytest.mark.parametrize("case", ["cloud", "coincident", "thin", "flat"])
-def test_compiled_balls_are_the_same_to_the_bit(case, monkeypatch):
-    """Which of the two walks is taken depends on what the process has done before."""
-    pytest.importorskip("numba")
-    points = Sphere().random_points(400)
-    if case == "coincident":  # and a ball that ends before it is full
-        points = torch.cat([points, points[:40], points[:5] + 100.0])
-    if case == "thin":
-        points = points * points.new_tensor([1.0, 1.0, 0.05])
-    balls = cloud_balls(points)
-    if case == "thin":
-        balls = GraphBalls(points, balls.graph, balls.frames, points * points.new_tensor([0, 0, 1]))
-    if case == "flat":
-        points = square_grid(20)  # of equal distances
-        frames = torch.eye(2).double().repeat(400, 1, 1)
-        graph = nearest_graph(points, frames, nearest_neighbors(points, 20))
-        balls = GraphBalls(points, graph, frames)
-    every, found = torch.arange(len(points)), {}
-    for patience in (0, math.inf):
-        monkeypatch.setattr(compiled, "PATIENCE", patience)
-        balls._kept = []
-        found[patience] = [balls(every, size) for size in (5, 24, 300)]
-        assert (compiled.kernel("graph_balls") is None) == (patience > 0)
-    for one, other in zip(*found.values(), strict=True):
-        assert torch.equal(one[0], other[0])
-        assert torch.equal(one[1], other[1])
 
 
 def test_balls_do_not_depend_on_the_chunk():

@@ -14,7 +14,7 @@ from torchlb.cloud import doubtful
 from torchlb.cloud.doubts import warn_of_layers
 from torchlb.cloud.manifold import boundary_loops, with_single_fans, wound_alike
 from torchlb.cloud.surface import cloud_surface
-from torchlb.geometry.complex import _ascending, edges_of
+from torchlb.geometry.complex import edges_of
 from torchlb.surfaces import (
     Ellipsoid,
     Hemisphere,
@@ -595,13 +595,6 @@ def test_a_declared_boundary_that_was_closed_is_told():
         LaplaceBeltrami.from_points(
             points, order=1, boundary=torch.from_numpy(edge | (distance < 2.6))
         )
-
-
-def test_keys_too_large_to_be_sorted_with_their_places_are_sorted_alike():
-    key = np.random.default_rng(0).integers(0, 50, 400)
-    for one, other in zip(_ascending(key, 50), _ascending(key, 2**62), strict=True):
-        assert np.array_equal(one, other)
-    assert all(len(part) == 0 for part in _ascending(key[:0], 50))
 
 
 def test_values_at_lone_points_are_in_no_other_row():

@@ -12,9 +12,8 @@ from functools import cached_property, reduce
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
+from scipy.spatial import Delaunay
 
-from torchlb import compiled
-from torchlb.cloud.delaunay import delaunay_tetrahedra
 from torchlb.cloud.manifold import face_vectors
 from torchlb.geometry.complex import Faces, edges_of
 from torchlb.geometry.vectors import TINY, inner, largest, lengths, smallest
@@ -38,8 +37,6 @@ RAISED = 1e-2
 """Of that, along the normals: points on a circle then have one layer of triangles, not several that mix."""
 FLAT = 1e-10
 """Tetrahedra of less volume, over the cube of their longest side, have no circumcentre to speak of; triangles alike."""
-IN_ROUNDS = 5e-6
-"""Seconds a triangle to choose in rounds."""
 
 
 @dataclass(frozen=True)
@@ -136,7 +133,8 @@ class Tetrahedra:
         random = np.random.default_rng(0).standard_normal(points.shape)
         random -= (1 - RAISED) * inner(random, normals)[:, None] * normals
         moved = points + MOVED * spacing[:, None] * random
-        cells, beyond = delaunay_tetrahedra(moved)
+        found = Delaunay(moved - moved.mean(0))  # far from the origin it merges what is apart
+        cells, beyond = (x.astype(np.int64) for x in (found.simplices, found.neighbors))
         centers = _circumcenters(moved, cells)
         faces, here, there, apex = [], [], [], []
         for k in range(4):
@@ -250,31 +248,27 @@ def wings(
 
 
 def best_manifold(points: Float[np.ndarray, "N 3"], faces: Faces) -> Faces:
-    """Of triangles, best first, each that leaves no edge with three faces or two that fold back."""
+    """Of triangles, best first, each that leaves no edge with three faces or two that fold back.
+
+    One by one; but where all at an edge may stay nothing has to be decided.
+    """
     edges = edges_of(faces, len(points))
-    of = edges.of.reshape(-1, 3)
     tail, head = (end.reshape(-1, 3) for end in edges.ends)
-    wing = wings(points, tail, head, faces)
-    one_by_one = compiled.kernel("best_manifold", IN_ROUNDS * len(faces)) or _in_rounds
-    return faces[one_by_one(of, wing, len(edges.keys), FOLD)]
-
-
-@compiled.standing_in()
-def _in_rounds(
-    of: Int[np.ndarray, "F 3"], wing: Float[np.ndarray, "F 3 3"], count: int, fold: float
-) -> Bool[np.ndarray, " F"]:
-    """Those first that are the best at all their edges: the result is that of taking them one by one."""
-    uses, first = np.zeros(count, dtype=int), np.zeros((count, 3))
-    left, taken = np.arange(len(of)), np.zeros(len(of), dtype=bool)
-    while len(left):
-        best = np.full(count, len(of))
-        np.minimum.at(best, of[left].ravel(), left.repeat(3))
-        now = (best[of[left]] == left[:, None]).all(1)
-        chosen, left = left[now], left[~now]
-        taken[chosen] = True
-        uses[of[chosen].ravel()] += 1
-        first[of[chosen].ravel()] = wing[chosen].reshape(-1, 3)
-        folds = (first[of[left]] * wing[left]).sum(-1) > fold
-        there = uses[of[left]]
-        left = left[~((there > 1) | ((there == 1) & folds)).any(1)]
-    return taken
+    wing = wings(points, tail, head, faces).reshape(-1, 3)
+    one, two = edges.twins
+    contested = edges.uses > 2
+    contested[edges.of[one[inner(wing[one], wing[two]) > FOLD]]] = True
+    doubt, taken = contested[edges.of], np.ones(len(faces), dtype=bool)
+    uses, first = np.zeros_like(edges.uses).tolist(), np.zeros_like(edges.uses).tolist()
+    x, y, z, of, doubtful = (part.tolist() for part in (*wing.T, edges.of, doubt))
+    for face in np.flatnonzero(doubt.reshape(-1, 3).any(1)).tolist():
+        halves = [half for half in range(3 * face, 3 * face + 3) if doubtful[half]]
+        for a in halves:
+            b = first[of[a]]
+            if uses[of[a]] > 1 or (uses[of[a]] and x[a] * x[b] + y[a] * y[b] + z[a] * z[b] > FOLD):
+                taken[face] = False
+                break
+        else:
+            for a in halves:
+                uses[of[a]], first[of[a]] = uses[of[a]] + 1, a
+    return faces[taken]

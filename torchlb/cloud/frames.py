@@ -7,7 +7,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from torchlb.fits.polynomials import monomial_columns
+from torchlb.fits.polynomials import monomials
 from torchlb.fits.weights import window
 from torchlb.geometry.admission import PAIRS_AT_ONCE, admissible_neighbors, planes_of
 from torchlb.geometry.frames import complete_frames
@@ -90,7 +90,7 @@ def _slopes_removed(
     good[:, 0] = True
     reach = (distance * good).amax(1, keepdim=True).clamp_min(TINY)
     weight = window((distance / reach).clamp_max(1.1)) * good
-    terms = monomial_columns(offset @ frames / reach[..., None], 2).mT
+    terms = monomials(offset @ frames / reach[..., None], 2).mT
     terms = torch.cat([torch.ones_like(terms[:, :1]), terms], 1) * weight[:, None]
     heights = weight * dot(offset, own[:, None]) / reach
     square = terms @ terms.mT

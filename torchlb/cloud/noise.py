@@ -8,7 +8,7 @@ from jaxtyping import Float, Int
 from scipy.spatial import KDTree
 from torch import Tensor
 
-from torchlb.fits.polynomials import monomial_columns, num_monomials
+from torchlb.fits.polynomials import monomials, num_monomials
 from torchlb.geometry.admission import admissible_neighbors
 from torchlb.geometry.frames import complete_frames
 from torchlb.geometry.neighbors import AT_ONCE
@@ -104,7 +104,7 @@ def _residuals(
         heights = offset - coords @ plane.mT
     heights = heights * good[..., None]
     scale = radius.clamp_min(torch.finfo(radius.dtype).tiny)[:, None, None]
-    terms = monomial_columns(coords / scale, degree).mT
+    terms = monomials(coords / scale, degree).mT
     terms = torch.cat([torch.ones_like(terms[:, :1]), terms], 1) * good[:, None]
     square = terms @ terms.mT
     square += RIDGE * good.sum(1)[:, None, None] * torch.eye(square.shape[-1]).to(square)

@@ -12,10 +12,10 @@ from itertools import combinations
 import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
+from scipy.spatial import Delaunay
 from torch import Tensor
 
 from torchlb.cloud.complexes import Complex
-from torchlb.cloud.delaunay import delaunay_tetrahedra
 from torchlb.errors import InputError, first_few
 from torchlb.geometry.complex import components
 from torchlb.geometry.neighbors import nearest_neighbors
@@ -49,7 +49,8 @@ def cloud_solid(points: Float[Tensor, "N 3"]) -> Complex:
         )
     near = nearest_neighbors(points, min(NEAREST + 1, len(points))).numpy()
     reach = lengths(places[near[:, -1]] - places)
-    cells, beside = delaunay_tetrahedra(places @ SHEAR)
+    found = Delaunay(places @ SHEAR)
+    cells, beside = (x.astype(np.int64) for x in (found.simplices, found.neighbors))
     radius, flat = _spheres(places, cells)
     chance = (np.log(CELLS * len(points)) + SURE) / (near.shape[1] - 1)
     kept = ~_outside(flat | (radius <= chance ** (1 / 3) * np.sort(reach[cells], 1)[:, 1]), beside)

@@ -12,12 +12,9 @@ from functools import lru_cache
 from itertools import combinations_with_replacement
 from math import comb
 
-import numpy as np
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
-
-from torchlb import compiled
 
 
 def num_monomials(dim: int, degree: int) -> int:
@@ -66,28 +63,6 @@ def monomials(coords: Float[Tensor, "*batch d"], degree: int) -> Float[Tensor, "
         columns += current
         previous, first = current, starts
     return torch.stack(columns, dim=-2).mT if coords.ndim > 1 else torch.stack(columns)
-
-
-def monomial_columns(coords: Float[Tensor, "B K d"], degree: int) -> Float[Tensor, "B K M"]:
-    """The same in float64 and without derivatives, faster where K is ten or more.
-
-    >>> monomial_columns(torch.tensor([[[2.0, 3.0]]], dtype=torch.float64), 2).tolist()
-    [[[2.0, 3.0, 4.0, 6.0, 9.0]]]
-    """
-    kernel = compiled.kernel("monomials")
-    if kernel is None:
-        with compiled.standing_in():
-            return monomials(coords, degree)
-    found = kernel(coords.contiguous().numpy(), _factors(coords.shape[-1], degree))
-    return torch.from_numpy(found).mT
-
-
-@lru_cache(maxsize=64)
-def _factors(dim: int, degree: int) -> Int[np.ndarray, "M 2"]:
-    """The first variable of every monomial, and the place of what is left without it."""
-    first = (exponents(dim, degree) > 0).int().argmax(1, keepdim=True)
-    rest = _lowered(dim, degree)[1].gather(1, first) - 1
-    return torch.cat([first, rest], 1).numpy()
 
 
 def monomial_derivatives(

@@ -16,7 +16,6 @@ from torchlb.fits.least_squares import left_inverse
 from torchlb.fits.polynomials import (
     gradient_functional,
     laplacian_functional,
-    monomial_columns,
     monomial_derivatives,
     monomials,
 )
@@ -145,7 +144,7 @@ def scaled_system(
     radius = (distance if keep is None else distance * keep).amax(-1)
     scaled = coords / radius[:, None, None]
     root = _root_window(distance / radius[:, None])
-    values = monomial_columns(scaled, degree)
+    values = monomials(scaled, degree)
     return radius, scaled, values, root if keep is None else root * keep
 
 

@@ -2,13 +2,10 @@
 
 from __future__ import annotations
 
-from contextlib import nullcontext
-
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from torchlb import compiled
 from torchlb.geometry.vectors import at, dot
 
 MIN_ALIGNMENT = 0.5
@@ -41,6 +38,18 @@ def planes_of(frames: Float[Tensor, "N n d"]) -> Float[Tensor, "N n d"] | Float[
     return torch.linalg.cross(*frames.unbind(-1)) if frames.shape[1:] == (3, 2) else frames
 
 
+def normal_frames(frames: Float[Tensor, "N n d"]) -> Float[Tensor, "N n m"]:
+    """Orthonormal frames of the normal spaces, m = n − d.
+
+    >>> normal_frames(torch.eye(3)[None, :, :2])[0].T
+    tensor([[0., 0., 1.]])
+    """
+    n, dim = frames.shape[1:]
+    if (n, dim) == (3, 2):
+        return planes_of(frames)[..., None]
+    return torch.linalg.qr(frames, mode="complete")[0][..., dim:]
+
+
 def admissible(
     points: Float[Tensor, "N n"],
     planes: Float[Tensor, "N n d"] | Float[Tensor, "N n"],
@@ -53,13 +62,8 @@ def admissible(
     below the centre's plane (height ≤ 0.5 of the distance). `planes` are frames E, or the unit normals of a
     hypersurface, which tell the same in less time: σ_min(E_kᵀE_i) = |n_k·n_i|. Orientation is irrelevant.
     """
-    kernel = compiled.kernel("admissible") if planes.ndim == 2 else None
-    if kernel is not None:
-        arrays = (x.contiguous().numpy() for x in (points, planes, centers, others))
-        return torch.from_numpy(kernel(*arrays, MAX_SLOPE, MIN_ALIGNMENT))
     parts = zip(centers.split(PAIRS_AT_ONCE), others.split(PAIRS_AT_ONCE), strict=True)
-    with compiled.standing_in() if planes.ndim == 2 else nullcontext():
-        return torch.cat([_admissible_part(points, planes, *part) for part in parts])
+    return torch.cat([_admissible_part(points, planes, *part) for part in parts])
 
 
 def _admissible_part(points: Tensor, planes: Tensor, centers: Tensor, others: Tensor) -> Tensor:

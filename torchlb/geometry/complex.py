@@ -10,16 +10,12 @@ from functools import cached_property
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Int
+from jaxtyping import Bool, Int, Shaped
 from scipy import sparse
 from scipy.sparse import csgraph
 from torch import Tensor
 
-from torchlb import compiled
-
 Faces = Int[np.ndarray, "_ 3"]
-BY_GRAPH, BY_TREE, BY_KEYS = 1e-7, 4e-7, 2e-7
-"""Seconds a pair by a graph, and by its spanning tree; a triangle to find its edges."""
 
 
 @dataclass(frozen=True)
@@ -77,22 +73,24 @@ class Edges:
         return place, np.where(there, self.uses[place] if len(self.uses) else 0, 0)
 
 
-def _ascending(
-    key: Int[np.ndarray, " K"], bound: int
-) -> tuple[Int[np.ndarray, " K"], Int[np.ndarray, " K"]]:
-    """The stable order of keys below a bound, and the keys in it.
+def _order(key: Int[np.ndarray, " K"], count: int) -> Int[np.ndarray, " K"]:
+    """The stable order of keys below `count`: transposing a sparse matrix counts, which is quicker than sorting.
 
-    >>> _ascending(np.array([5, 3, 5, 0]), 6)
-    (array([3, 1, 0, 2]), array([0, 3, 5, 5]))
+    >>> _order(np.array([5, 3, 5, 0]), 6).tolist()
+    [3, 1, 0, 2]
     """
-    if bound * len(key) < 2**63:
-        # With the place as one number, that is sorted in a sixth of the time.
-        both = key * len(key) + np.arange(len(key))
-        both.sort()
-        ascending = both // max(len(key), 1)
-        return both - ascending * len(key), ascending
-    order = key.argsort(kind="stable")
-    return order, key[order]
+    size = len(key)
+    rows = sparse.csr_array((np.ones(size, np.int8), key, np.arange(size + 1)), (size, count))
+    return rows.tocsc().indices.astype(np.int64)
+
+
+def _joined(
+    i: np.ndarray, j: np.ndarray, data: Shaped[np.ndarray, " P"], count: int
+) -> sparse.csr_array:
+    """The graph of the pairs (i, j), those that are there twice apart."""
+    order = _order(i, count)
+    ends = np.append(0, np.bincount(i, minlength=count).cumsum())
+    return sparse.csr_array((data[order], j[order], ends), (count, count))
 
 
 def edges_of(faces: Faces, count: int) -> Edges:
@@ -101,43 +99,22 @@ def edges_of(faces: Faces, count: int) -> Edges:
     >>> edges_of(np.array([[0, 1, 2], [1, 3, 2]]), 4).uses.tolist()
     [1, 1, 2, 1, 1]
     """
-    found = compiled.kernel("edges", BY_KEYS * len(faces)) or _by_keys
-    return Edges(faces, count, *found(np.require(faces, np.int64, ["C", "W"]), count))
-
-
-@compiled.standing_in()
-def _by_keys(
-    faces: Faces, count: int
-) -> tuple[
-    Int[np.ndarray, " E"], Int[np.ndarray, " H"], Int[np.ndarray, " E"], Int[np.ndarray, " H"]
-]:
     tail, head = np.roll(faces, -1, 1).ravel(), np.roll(faces, -2, 1).ravel()
-    key = np.minimum(tail, head) * count + np.maximum(tail, head)
-    order, ascending = _ascending(key, count**2)
+    low, high = np.minimum(tail, head), np.maximum(tail, head)
+    order = _order(high, count)
+    order = order[_order(low[order], count)]
+    ascending = (low * count + high)[order]
     first = np.flatnonzero(np.diff(ascending, prepend=-1))
-    uses = np.diff(first, append=len(key))
+    uses = np.diff(first, append=len(order))
     of = np.empty_like(order)
     of[order] = np.arange(len(first)).repeat(uses)
-    return ascending[first], of, uses, order
+    return Edges(faces, count, ascending[first], of, uses, order)
 
 
 def components(i: np.ndarray, j: np.ndarray, count: int) -> Int[np.ndarray, " count"]:
     """Number of the connected component of each of `count` nodes joined by the pairs (i, j); that of node 0 is 0."""
-    kernel = compiled.kernel("components", BY_GRAPH * len(i))
-    if kernel is None:
-        return _by_graph(i, j, count)
-    return kernel(*_in_turn(i, j), np.zeros(len(i), dtype=bool), count)[0]
-
-
-@compiled.standing_in()
-def _by_graph(i: np.ndarray, j: np.ndarray, count: int) -> Int[np.ndarray, " count"]:
-    graph = sparse.coo_array((np.ones(len(i), dtype=np.int8), (i, j)), shape=(count, count))
+    graph = _joined(i, j, np.ones(len(i)), count)
     return csgraph.connected_components(graph, directed=False)[1].astype(np.int64)
-
-
-def _in_turn(*ends: np.ndarray) -> tuple[Int[np.ndarray, " P"], ...]:
-    """As kernels take them."""
-    return tuple(np.require(end, np.int64, ["C", "W"]) for end in ends)
 
 
 def spanning_pairs(i: np.ndarray, j: np.ndarray, count: int) -> Int[np.ndarray, " T"]:
@@ -146,9 +123,7 @@ def spanning_pairs(i: np.ndarray, j: np.ndarray, count: int) -> Int[np.ndarray, 
     >>> spanning_pairs(np.array([0, 0, 1, 2]), np.array([1, 1, 2, 0]), 4).tolist()
     [0, 2]
     """
-    low, high = np.minimum(i, j), np.maximum(i, j)
-    _, first = np.unique(low * count + high, return_index=True)
-    ranks = sparse.csr_array((first + 1.0, (low[first], high[first])), shape=(count, count))
+    ranks = _joined(i, j, np.arange(1.0, len(i) + 1), count)
     return csgraph.minimum_spanning_tree(ranks).data.astype(np.int64) - 1
 
 
@@ -176,16 +151,6 @@ def tree_sides(
     >>> tree_sides(np.array([0, 1, 2]), np.array([1, 2, 0]), against, 3).tolist()
     [False, True, True]
     """
-    kernel = compiled.kernel("components", BY_TREE * len(i))
-    if kernel is None:
-        return _by_tree(i, j, against, count)
-    return kernel(*_in_turn(i, j), np.ascontiguousarray(against), count)[1]
-
-
-@compiled.standing_in()
-def _by_tree(
-    i: np.ndarray, j: np.ndarray, against: Bool[np.ndarray, " P"], count: int
-) -> Bool[np.ndarray, " count"]:
     chosen = spanning_pairs(i, j, count)
     own, other = two_orientations(i[chosen], j[chosen], against[chosen], count)
     return own > other

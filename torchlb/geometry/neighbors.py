@@ -8,35 +8,27 @@ pool, ordered by distance. A path across a crease is cut there, where the tangen
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from functools import cached_property
 from math import ceil
-from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 from scipy import sparse
 from scipy.spatial import KDTree
 from torch import Tensor
 
-from torchlb import compiled
 from torchlb.geometry.admission import (
     MAX_SLOPE,
     MIN_ALIGNMENT,
-    admissible,
-    planes_of,
+    normal_frames,
 )
-from torchlb.geometry.vectors import at, dot
+from torchlb.geometry.vectors import at
 
 AT_ONCE = 2**13
 """Points whose neighbours are looked at together: of small arrays the memory is used again."""
-WALKS_AT_ONCE = 2**22
-"""Walks of two edges whose ends are looked at together: through the middle of a fan of n triangles there are n²."""
 EDGES = 6
 """The longest edges of a point, in whose middles its fit is judged."""
-BY_MATRICES = 1.5e-6
-"""Seconds a point of a ball without a kernel, those of larger balls that follow included."""
 BALL_SURPLUS = 1.5
 """A graph ball holds this many times the points asked for, so that its round core lies inside the ragged edge."""
 
@@ -145,7 +137,6 @@ class GraphBalls:
         self.graph = graph
         self.frames = frames
         self.sides = sides
-        self._planes = planes_of(frames)
         self._kept: list[_Level] = []
 
     @property
@@ -162,18 +153,13 @@ class GraphBalls:
         return balls
 
     @cached_property
-    def _arrays(self) -> tuple[np.ndarray, ...]:
-        """What the compiled walk takes; normals are zero in a flat space, where all is in the plane."""
-        flat = self.frames.shape[1] == self.frames.shape[2]
-        normals = torch.zeros_like(self.points) if flat else self._planes
-        sides = normals[:0] if self.sides is None else self.sides
-        shape = (x.contiguous().numpy() for x in (self.points, normals, sides))
-        return *shape, self.graph.indptr.astype(np.int32), self.graph.indices.astype(np.int32)
-
-    @cached_property
-    def _walks(self) -> Int[Tensor, " N"]:
-        """Of how many walks of two edges every point is the start."""
-        return torch.from_numpy(self.graph @ np.diff(self.graph.indptr).astype(np.int64)).long()
+    def _arrays(self) -> dict[str, np.ndarray]:
+        """What the compiled walk takes."""
+        sides = torch.zeros_like(self.points) if self.sides is None else self.sides
+        shape = {"points": self.points, "normals": normal_frames(self.frames), "sides": sides}
+        rows = {"indptr": self.graph.indptr, "indices": self.graph.indices}
+        arrays = {name: x.contiguous().numpy() for name, x in shape.items()}
+        return arrays | {name: x.astype(np.int32) for name, x in rows.items()}
 
     @cached_property
     def longest(self) -> Int[Tensor, "N edges"]:
@@ -201,94 +187,27 @@ class GraphBalls:
             self._kept.append(level)
         missing = centers[level.place[centers] < 0]
         if len(missing):
-            for found in self._grown(missing, level.size):
-                level.add(*found)
+            level.add(missing, *self._grown(missing, level.size))
         place = level.place[centers]
         return level.index[place, :size].long(), level.count[place].long().clamp_max(size)
 
     def _grown(
         self, centers: Int[Tensor, " B"], size: int
-    ) -> Iterator[tuple[Int[Tensor, " b"], Int[Tensor, "b K"], Int[Tensor, " b"]]]:
-        """In turn some of the centres, their balls, and how many points these hold."""
-        dim, codimension = self.frames.shape[2], self.points.shape[1] - self.frames.shape[2]
-        curved = codimension and self._planes.ndim == 3  # for which nothing is compiled
-        seconds = BY_MATRICES * size * len(self.points)
-        kernel = None if curved else compiled.kernel("graph_balls", seconds)
-        if kernel is None:
-            number = self._walks[centers].cumsum(0) // WALKS_AT_ONCE
-            for part in centers.split(number.unique_consecutive(return_counts=True)[1].tolist()):
-                yield part, *self._walked(part, size)
-            return
-        wanted = BALL_SURPLUS * size
-        bounds = wanted, ceil(wanted ** (1 / dim)), MAX_SLOPE, MIN_ALIGNMENT if codimension else 0.0
-        index, count = kernel(*self._arrays, centers.numpy(), size, *bounds)
-        yield centers, torch.from_numpy(index), torch.from_numpy(count)
-
-    @compiled.standing_in()
-    def _walked(
-        self, centers: Int[Tensor, " B"], size: int
     ) -> tuple[Int[Tensor, "B K"], Int[Tensor, " B"]]:
-        """The same by sparse matrices, for all codimensions, and where nothing is compiled."""
-        local, others = self._reach(centers, size)
-        center = at(centers, local)
-        offset = at(self.points, others) - at(self.points, center)
-        square = dot(offset, offset)
-        square[others == center] = -1.0  # before all that coincide with it
-        total = torch.bincount(local, minlength=len(centers))
-        place = torch.arange(len(local)) - (total.cumsum(0) - total)[local]
-        shape = len(centers), max([size, *total.tolist()])
-        distance = square.new_full(shape, torch.inf).index_put((local, place), square)
-        index = centers[:, None].repeat(1, shape[1]).index_put((local, place), others)
-        order = distance.argsort(dim=1, stable=True)  # equal ones stay in the order of the points
-        return index.gather(1, order[:, :size]), total.clamp_max(size)
-
-    def _admissible(
-        self, centers: Int[Tensor, " P"], others: Int[Tensor, " P"]
-    ) -> Bool[Tensor, " P"]:
-        good = admissible(self.points, self._planes, centers, others)
-        if self.sides is not None:
-            good &= dot(at(self.sides, centers), at(self.sides, others)) >= 0
-        return good
-
-    def _reach(
-        self, centers: Int[Tensor, " B"], size: int
-    ) -> tuple[Int[Tensor, " P"], Int[Tensor, " P"]]:
-        """Pairs (row of `centers`, point) of the graph balls, sorted; they grow ring by ring until they are large.
+        """The balls, and how many points they hold.
 
         A round ball has about half as many rings as they have at most: what grows along a strip alone is none.
         """
-        width, known, wanted = len(self.points), np.float32(2**20), BALL_SURPLUS * size
-        active = np.arange(len(centers))  # rows that still grow: no others are looked at
-        total = np.ones(len(centers), dtype=int)
-        start = np.ones(len(centers), np.float32), centers.numpy(), np.arange(len(centers) + 1)
-        frontier = recent = sparse.csr_array(start, shape=(len(centers), width))
-        found = [(active, centers.numpy())]
-        for _ in range(ceil(wanted ** (1 / self.frames.shape[-1]))):
-            ring: Any = frontier @ self.graph + recent * known
-            row = np.arange(len(active)).repeat(np.diff(ring.indptr))
-            new = ring.data < known
-            row, col = row[new], ring.indices[new].astype(np.int64)
-            rows = torch.from_numpy(active[row])
-            good = self._admissible(centers[rows], torch.from_numpy(col)).numpy()
-            row, col = row[good], col[good]
-            found.append((active[row], col))
-            number = np.bincount(row, minlength=len(active))
-            entries = np.ones(len(row), np.float32), col, np.append(0, number.cumsum())
-            before, frontier = frontier, sparse.csr_array(entries, shape=(len(active), width))
-            total += number
-            grows = (total < wanted) & (number > 0)
-            if not grows.any():
-                break
-            if not grows.all():
-                active, total = active[grows], total[grows]
-                before, frontier = before[grows], frontier[grows]
-            # Neighbours are in this ring, the last, or the next.
-            recent = sparse.csr_array(before + frontier)
-        where = tuple(np.concatenate(ends) for ends in zip(*found, strict=True))
-        balls = sparse.csr_array((np.ones(len(where[0]), np.int8), where), (len(centers), width))
-        balls.sort_indices()
-        pairs = sparse.coo_array(balls)
-        return (
-            torch.from_numpy(pairs.coords[0].astype(np.int64)),
-            torch.from_numpy(pairs.coords[1].astype(np.int64)),
+        from torchlb.linalg import kernels
+
+        wanted = BALL_SURPLUS * size
+        index, count = kernels.graph_balls(
+            **self._arrays,
+            centers=centers.numpy(),
+            size=size,
+            wanted=wanted,
+            rings=ceil(wanted ** (1 / self.dim)),
+            slope=MAX_SLOPE,
+            alignment=MIN_ALIGNMENT,
         )
+        return torch.from_numpy(index), torch.from_numpy(count)

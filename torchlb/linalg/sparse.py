@@ -20,8 +20,6 @@ from scipy import sparse
 from torch import Tensor
 from torch.nn.functional import embedding_bag
 
-from torchlb import compiled
-
 
 def transpose_pattern(
     crow: Int[Tensor, " rows_plus_1"], col: Int[Tensor, " nnz"], num_cols: int
@@ -113,26 +111,6 @@ def multiply(
 def on_one_pattern(one: sparse.csr_array, other: sparse.csr_array) -> bool:
     """Whether two CSR matrices have their entries at the same places, in the same order."""
     return np.array_equal(one.indptr, other.indptr) and np.array_equal(one.indices, other.indices)
-
-
-def both_products(
-    one: sparse.csr_array, other: sparse.csr_array, x: Float[np.ndarray, "M C"]
-) -> tuple[Float[np.ndarray, "N C"], Float[np.ndarray, "N C"]]:
-    """The products of two matrices with the same x, in float64; in half of the time where they are on one pattern.
-
-    >>> both_products(sparse.csr_array([[2.0]]), sparse.csr_array([[3.0]]), np.ones((1, 2)))
-    (array([[2., 2.]]), array([[3., 3.]]))
-    """
-    kernel = compiled.kernel("both_products") if on_one_pattern(one, other) else None
-    if kernel is None:
-        return _one_by_one(one, other, x)
-    pattern = (part.astype(np.int32, copy=False) for part in (one.indptr, one.indices))
-    return kernel(*pattern, one.data, other.data, np.ascontiguousarray(x))
-
-
-@compiled.standing_in()
-def _one_by_one(one: Any, other: Any, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    return one @ x, other @ x
 
 
 class _Symmetric(torch.autograd.Function):

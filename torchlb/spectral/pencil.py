@@ -24,7 +24,7 @@ from torch import Tensor
 from torchlb.errors import EigenbasisError, warn
 from torchlb.linalg.krylov import prefers_krylov
 from torchlb.linalg.lanczos import Inverse, lanczos_of_pair
-from torchlb.linalg.sparse import both_products, multiply, on_one_pattern
+from torchlb.linalg.sparse import multiply, on_one_pattern
 from torchlb.linalg.two_levels import Matrix, absolute_row_sums, main_entries, two_levels
 from torchlb.spectral.eigenbasis import Eigenbasis
 from torchlb.spectral.eigensolver import GAP, constants, members
@@ -273,7 +273,7 @@ def _swept(
             w = np.column_stack([u, w])
         else:
             w = u - w * size
-        new = (w, *both_products(*whole, w))
+        new = (w, *(a @ w for a in whole))
         if sweep:
             new = tuple(np.column_stack(both) for both in zip(known, new, strict=True))
         values, known = _ritz(new, count)

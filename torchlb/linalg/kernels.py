@@ -1,0 +1,295 @@
+"""The two loops that NumPy, SciPy and torch have no fast form of, compiled by numba.
+
+Whoever needs one imports it where it is called, so that numba is not loaded by an import of the package. The signatures
+are the only types that are ever compiled for; what is compiled is kept beside this file, or in the user's cache.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, no_type_check
+
+import numpy as np
+from numba import njit
+
+LANES = 64
+"""Left inverses at a time; 16 to 128 take about as long."""
+
+
+def _kept(signature: str) -> Callable[[Any], Any]:
+    """Compile for one signature, and keep that on disk for later processes, if there is a place to write to."""
+
+    def compiled(function: Any) -> Any:
+        options = {"error_model": "numpy", "nogil": True}
+        try:
+            return njit(signature, cache=True, **options)(function)
+        except RuntimeError:  # numba's, for want of such a place
+            return njit(signature, **options)(function)
+
+    return compiled
+
+
+@njit(error_model="numpy")
+@no_type_check
+def _product(x: np.ndarray, y: np.ndarray, total: np.ndarray) -> None:
+    """Inner products of columns."""
+    size, lanes = x.shape
+    for a in range(lanes):
+        total[a] = x[0, a] * y[0, a]
+    for k in range(1, size):
+        for a in range(lanes):
+            total[a] += x[k, a] * y[k, a]
+
+
+@njit(error_model="numpy")
+@no_type_check
+def _subtract(factor: np.ndarray, x: np.ndarray, y: np.ndarray) -> None:
+    """Take so much of one column from another."""
+    size, lanes = x.shape
+    for k in range(size):
+        for a in range(lanes):
+            y[k, a] -= factor[a] * x[k, a]
+
+
+@njit(error_model="numpy")
+@no_type_check
+def _scale(x: np.ndarray, factor: np.ndarray) -> None:
+    size, lanes = x.shape
+    for k in range(size):
+        for a in range(lanes):
+            x[k, a] *= factor[a]
+
+
+def left_inverse(columns: np.ndarray, root: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """C = R⁻¹Qᵀ√ω of √ω V = QR by the modified Gram–Schmidt process, and the norms of R⁻¹.
+
+    `LANES` matrices at a time lie one beside the other in memory, so that one instruction serves several.
+
+    Parameters
+    ----------
+    columns : (B, M, K)
+        The columns of every V, one after the other.
+    root : (B, K)
+        √ω.
+    """
+    batch, terms, size = columns.shape
+    lanes = max(min(LANES, batch), 1)
+    found, condition = np.empty_like(columns), np.empty(batch)
+    room = np.ones((terms, size, lanes)), np.empty((terms, terms, lanes)), np.empty((terms, lanes))
+    _left_inverse(columns, root, *room, found, condition)
+    return found, condition
+
+
+# Whatever is allocated in compiled code takes a tenth of a second to compile. @no_type_check keeps checkers off.
+@_kept(
+    "void(float64[:, :, ::1], float64[:, ::1], float64[:, :, ::1], float64[:, :, ::1], float64[:, ::1], "
+    "float64[:, :, ::1], float64[::1])"
+)
+@no_type_check
+def _left_inverse(
+    columns: np.ndarray,
+    root: np.ndarray,
+    a: np.ndarray,
+    r: np.ndarray,
+    square: np.ndarray,
+    found: np.ndarray,
+    condition: np.ndarray,
+) -> None:
+    batch, terms, size = columns.shape
+    lanes = a.shape[2]
+    for first in range(0, batch, lanes):
+        count = min(lanes, batch - first)
+        for j in range(terms):
+            for k in range(size):
+                for b in range(count):
+                    a[j, k, b] = columns[first + b, j, k] * root[first + b, k]
+        for j in range(terms):
+            _product(a[j], a[j], square[j])
+        for j in range(terms):
+            _product(a[j], a[j], r[j, j])
+            for b in range(lanes):
+                r[j, j, b] = 1 / np.sqrt(r[j, j, b])
+            _scale(a[j], r[j, j])
+            for i in range(j + 1, terms):
+                _product(a[i], a[j], r[j, i])
+                _subtract(r[j, i], a[j], a[i])
+        for j in range(terms - 1, -1, -1):
+            _scale(a[j], r[j, j])
+            for i in range(j):
+                _subtract(r[i, j], a[j], a[i])
+        for b in range(count):
+            condition[first + b] = 0.0
+        for j in range(terms):
+            _product(a[j], a[j], r[j, j])
+            for b in range(count):
+                condition[first + b] += r[j, j, b] * square[j, b]
+        for b in range(count):
+            condition[first + b] = np.sqrt(condition[first + b])
+        for j in range(terms):
+            for k in range(size):
+                for b in range(count):
+                    found[first + b, j, k] = a[j, k, b] * root[first + b, k]
+
+
+@njit
+@no_type_check
+def _distance(
+    points: np.ndarray,
+    normals: np.ndarray,
+    center: int,
+    other: int,
+    slope: float,
+    alignment: float,
+    room: np.ndarray,
+) -> float:
+    """Square of the distance, ℓ², or −1 where `geometry.admission.admissible` refuses the other.
+
+    C = AᵀB of the frames A, B of the normal spaces has those angles that the tangent spaces have; and σ_min(C) is as
+    large as the alignment a if CᵀC − a²I = LDLᵀ with D > 0. There is `room` for C and CᵀC.
+    """
+    dim, codimension = normals.shape[1:]
+    square, height, cosine = 0.0, 0.0, 0.0
+    for x in range(dim):
+        square += (points[other, x] - points[center, x]) ** 2
+    for a in range(codimension):
+        along = 0.0
+        for x in range(dim):
+            along += (points[other, x] - points[center, x]) * normals[center, x, a]
+        height += along * along
+    if height > slope**2 * square:
+        return -1.0
+    if codimension == 1:
+        for x in range(dim):
+            cosine += normals[other, x, 0] * normals[center, x, 0]
+        return square if abs(cosine) >= alignment else -1.0
+    c, g = room[0], room[1]
+    for a in range(codimension):
+        for b in range(codimension):
+            c[a, b] = 0.0
+            for x in range(dim):
+                c[a, b] += normals[other, x, a] * normals[center, x, b]
+    for a in range(codimension):
+        for b in range(a, codimension):
+            g[a, b] = -(alignment**2) if a == b else 0.0
+            for k in range(codimension):
+                g[a, b] += c[k, a] * c[k, b]
+    for a in range(codimension):
+        if g[a, a] <= 0:
+            return -1.0
+        for b in range(a + 1, codimension):
+            for k in range(b, codimension):
+                g[b, k] -= g[a, b] * g[a, k] / g[a, a]
+    return square
+
+
+@njit
+@no_type_check
+def _nearest_first(square: np.ndarray, ball: np.ndarray, total: int, size: int) -> int:
+    """Sort so that the `size` nearest come first, equal ones by their number; how many these are."""
+    kept = 0
+    for a in range(total):
+        key, point, place = square[a], ball[a], kept
+        while place > 0 and (
+            square[place - 1] > key or (square[place - 1] == key and ball[place - 1] > point)
+        ):
+            place -= 1
+        if place < size:
+            kept = min(kept + 1, size)
+            for b in range(kept - 1, place, -1):
+                square[b], ball[b] = square[b - 1], ball[b - 1]
+            square[place], ball[place] = key, point
+    return kept
+
+
+def graph_balls(
+    points: np.ndarray,
+    normals: np.ndarray,
+    sides: np.ndarray,
+    indptr: np.ndarray,
+    indices: np.ndarray,
+    centers: np.ndarray,
+    size: int,
+    wanted: float,
+    rings: int,
+    slope: float,
+    alignment: float,
+) -> tuple[np.ndarray, np.ndarray]:
+    """The `size` nearest points of each graph ball, padded by the centre, and how many are real.
+
+    Parameters
+    ----------
+    points : (N, n)
+    normals : (N, n, n − d)
+        Orthonormal frames of the normal spaces.
+    sides : (N, n)
+        A point is refused whose vector is opposed to the centre's; zero where no sides are known.
+    indptr, indices
+        The graph's rows, without loops.
+    centers : (B,)
+    wanted, rings
+        A ball grows ring by ring until it holds so many points, or is so many rings wide.
+    slope, alignment
+        Bounds of `admissible`.
+    """
+    num_points, _, m = normals.shape
+    index, count = np.empty((len(centers), size), np.int32), np.empty(len(centers), np.int32)
+    seen, ball = np.zeros((2, num_points), np.int32)
+    room = seen, ball, np.empty(num_points), np.empty((2, m, m))
+    inputs = points, normals, sides, indptr, indices, centers
+    _graph_balls(*inputs, wanted, rings, slope, alignment, *room, index, count)
+    return index, count
+
+
+@_kept(
+    "void(float64[:, ::1], float64[:, :, ::1], float64[:, ::1], int32[::1], int32[::1], int64[::1], float64, int64, "
+    "float64, float64, int32[::1], int32[::1], float64[::1], float64[:, :, ::1], int32[:, ::1], int32[::1])"
+)
+@no_type_check
+def _graph_balls(
+    points: np.ndarray,
+    normals: np.ndarray,
+    sides: np.ndarray,
+    indptr: np.ndarray,
+    indices: np.ndarray,
+    centers: np.ndarray,
+    wanted: float,
+    rings: int,
+    slope: float,
+    alignment: float,
+    seen: np.ndarray,
+    ball: np.ndarray,
+    square: np.ndarray,
+    room: np.ndarray,
+    index: np.ndarray,
+    count: np.ndarray,
+) -> None:
+    """A point was `seen` in the last row, plus one, that it came by in."""
+    size = index.shape[1]
+    for row in range(len(centers)):
+        center = centers[row]
+        seen[center] = row + 1
+        ball[0], square[0] = center, -1.0  # before all that coincide with it
+        total, first = 1, 0
+        for _ in range(rings):
+            ring = total
+            for a in range(first, ring):
+                for edge in range(indptr[ball[a]], indptr[ball[a] + 1]):
+                    other = indices[edge]
+                    if seen[other] == row + 1:
+                        continue
+                    seen[other] = row + 1
+                    side = 0.0
+                    for x in range(sides.shape[1]):
+                        side += sides[other, x] * sides[center, x]
+                    distance = -1.0
+                    if side >= 0:
+                        distance = _distance(points, normals, center, other, slope, alignment, room)
+                    if distance >= 0:
+                        ball[total], square[total] = other, distance
+                        total += 1
+            first = ring
+            if total >= wanted or first == total:
+                break
+        count[row] = _nearest_first(square, ball, total, size)
+        for a in range(size):
+            index[row, a] = ball[a] if a < count[row] else center
