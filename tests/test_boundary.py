@@ -7,16 +7,12 @@ from functools import cache
 import numpy as np
 import pytest
 import torch
-from scipy import special
 
 from builders import stencil_of_cloud, stencil_of_mesh
-from torchlb import InputError, LaplaceBeltrami, heat_flow, implicit_step, poisson_solve
+from torchlb import LaplaceBeltrami
 from torchlb.geometry.boundary import boundary_of_mesh
 from torchlb.geometry.frames import mesh_frames
-from torchlb.linalg.sparse import to_scipy
-from torchlb.stencils.assemble import Stencils, assemble
-from torchlb.stencils.conditions import CONDITIONS, Dirichlet, Neumann
-from torchlb.stencils.shape import cloud_shape, mesh_shape
+from torchlb.stencils.shape import cloud_shape
 from torchlb.surfaces import Hemisphere, Sphere, Torus, UnitDisk
 
 
@@ -311,82 +307,6 @@ def test_bad_boundaries_are_refused(bad):
 def test_bad_boundary_of_a_mesh_is_refused():
     with pytest.raises(ValueError, match="boundary"):
         stencil_of_mesh(*UnitDisk().mesh(300), boundary="robin")
-
-
-class Robin(Neumann):
-    """∂_ν f + a f = 0."""
-
-    conserves = False
-
-    def __init__(self, share):
-        self.share = share
-
-
-def robin_eigenvalues(a):
-    """Of the unit disk, ten: the zeros of √λ J_n'(√λ) + a J_n(√λ), each twice for n > 0."""
-    root = torch.linspace(0.1, 8, 10_000, dtype=torch.float64).numpy()
-    exact = []
-    for n in range(6):
-        value = root * special.jvp(n, root) + a * special.jv(n, root)
-        (at,) = np.nonzero(value[:-1] * value[1:] < 0)
-        step = value[at] / (value[at] - value[at + 1])  # linear in between: to 1e-8
-        exact += [*(root[at] + step * (root[1] - root[0])) ** 2] * (2 if n else 1)
-    return torch.tensor(sorted(exact)[:10])
-
-
-@pytest.mark.parametrize("order", [3, 5])
-def test_a_robin_condition_is_one_class(order):
-    a = 2.0
-    exact = robin_eigenvalues(a)
-    shape = mesh_shape(*UnitDisk().mesh(700), order + 1, condition=Robin(a), progress=False)
-    rows = assemble(Stencils(shape, order), progress=False)
-    assert (rows.order == order).double().mean() > 0.95
-    matrix = to_scipy(rows.crow, rows.col, rows.laplacian, (700, 700)).toarray()
-    values = torch.linalg.eigvals(-torch.from_numpy(matrix))
-    assert values.real.min() > 0
-    values = values[values.real.argsort()][:10].real
-    assert ((values - exact) / exact).abs().max() < {3: 1e-3, 5: 1e-4}[order]
-
-
-def test_a_condition_that_the_pair_has_not_is_refused_beside_it(monkeypatch, unchecked):
-    """The rows would be Robin's, eigenvalues, heat and solves of the same operator Neumann's."""
-    monkeypatch.setitem(CONDITIONS, "robin", Robin(2.0))
-    vertices, faces = UnitDisk().mesh(700)
-    for build in (
-        lambda **options: LaplaceBeltrami.from_mesh(vertices, faces, condition="robin", **options),
-        lambda **options: LaplaceBeltrami.from_points(
-            vertices[:, :2], dim=2, condition="robin", **options
-        ),
-    ):
-        for options in ({}, {"weak_form": True}):
-            with pytest.raises(InputError, match="would ignore 'robin'; weak_form=False"):
-                build(**options)
-    monkeypatch.setitem(CONDITIONS, "zero", Dirichlet())  # by whose name nothing is fixed
-    with pytest.raises(InputError, match="would ignore 'zero'"):
-        LaplaceBeltrami.from_mesh(vertices, faces, condition="zero")
-    monkeypatch.setitem(CONDITIONS, "neumann", Robin(2.0))
-    with pytest.raises(InputError, match="would ignore 'neumann'"):
-        LaplaceBeltrami.from_mesh(vertices, faces)
-    with pytest.raises(InputError, match=r"expected one of .*'zero'.*, got 'mixed'"):
-        LaplaceBeltrami.from_mesh(vertices, faces, condition="mixed")
-
-
-def test_a_stencil_with_a_robin_condition_is_robins_in_all_that_it_does(monkeypatch, unchecked):
-    """∂_ν u + a u = 0 on the unit disk: −Δu = 1 has u = (1 − r²)/4 + 1/(2a), and J₀(√λ r) decays by e^{−λt}."""
-    a, t = 2.0, 0.1
-    monkeypatch.setitem(CONDITIONS, "robin", Robin(a))
-    vertices, faces = UnitDisk().mesh(700)
-    lb = stencil_of_mesh(vertices, faces, condition="robin")
-    exact = robin_eigenvalues(a)
-    assert ((lb.eigenbasis(10).eigenvalues - exact) / exact).abs().max() < 2e-3
-    r = vertices.norm(dim=1)
-    u = poisson_solve(lb, torch.ones_like(r))
-    assert (u - (1 - r**2) / 4 - 1 / (2 * a)).abs().max() < 1e-3
-    f = torch.special.bessel_j0(exact[0].sqrt() * r)
-    assert (implicit_step(lb, f, t) - f / (1 + exact[0] * t)).abs().max() < 1e-3
-    for method in ("deflated", "chebyshev"):
-        flow = heat_flow(lb, f, t, method=method, k=10)
-        assert (flow - torch.exp(-exact[0] * t) * f).abs().max() < 1e-3
 
 
 @pytest.mark.parametrize("condition", ["neumann", "dirichlet", None])

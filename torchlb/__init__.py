@@ -49,6 +49,7 @@ from torchlb.spectral.signatures import (
     wave_kernel_signature,
 )
 from torchlb.stability.certificate import Certificate
+from torchlb.stencils.conditions import Robin
 from torchlb.version import __version__
 
 __all__ = [
@@ -70,6 +71,7 @@ __all__ = [
     "PoissonBlock",
     "PoissonFeatures",
     "PrecomputeReport",
+    "Robin",
     "ShapeResult",
     "SpectralConv",
     "StabilityError",

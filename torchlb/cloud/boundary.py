@@ -10,7 +10,7 @@ from scipy.spatial import KDTree
 from torch import Tensor
 
 from torchlb.cloud.frames import cloud_frames
-from torchlb.cloud.voronoi import largest_gap, nearest_graph
+from torchlb.cloud.voronoi import cell_volume, largest_gap, nearest_graph, unrolled
 from torchlb.errors import InputError
 from torchlb.geometry.boundary import BoundaryPlan
 from torchlb.geometry.neighbors import AT_ONCE, GraphBalls, nearest_neighbors
@@ -43,9 +43,17 @@ class CloudBoundaryPlan(BoundaryPlan):
         """The boundary's first tangents."""
         return cloud_frames(points[self.members], self.near, self.sides.shape[1] - 1)
 
-    def outward(self, points: Float[Tensor, "N n"]) -> Float[Tensor, "b n"]:
-        """Vectors that leave the shape."""
-        return (points[self.members][:, None] - points[self.inside]).mean(1)
+    def measures(
+        self, points: Float[Tensor, "N n"]
+    ) -> tuple[Float[Tensor, "b n"], Float[Tensor, " b"], Float[Tensor, " b"]]:
+        """Vectors that leave the shape; volumes of the boundary's own Voronoi cells, and no folds."""
+        own, size = points[self.members], torch.ones_like(points[self.members, 0])
+        if self.sides.shape[1] > 1:
+            offset = own[self.near[:, 1:]] - own[:, None]
+            valid = torch.ones_like(self.near[:, 1:], dtype=torch.bool)
+            size = cell_volume(unrolled(offset, self.initial(points)), valid)
+        outward = (own[:, None] - points[self.inside]).mean(1)
+        return outward, size, torch.ones_like(size)
 
 
 def boundary_of_cloud(

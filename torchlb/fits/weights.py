@@ -221,7 +221,7 @@ def least_squares_weights(
     degree: int,
     keep: Bool[Tensor, "B neighbors"] | None = None,
     flux: Float[Tensor, "B K d"] | None = None,
-    share: float = 0.0,
+    share: float | Float[Tensor, "B K"] = 0.0,
     heights: Float[Tensor, "B neighbors n"] | None = None,
 ) -> Weights:
     r"""Centre-constrained moving least squares.
@@ -245,7 +245,7 @@ def least_squares_weights(
         (centre first), zero at the others. Each adds an unknown v_b: minimise Σ w²/ω + Σ v²/ω subject to
         Σ w_j y_j^α + Σ v_b (∂_ν + a) y^α(y_b) = (D y^α)(0), and w_i = −Σ w_j − a Σ v_b (`method.md`, section 6). Only
         w is returned.
-    share : a, 1/ℓ.
+    share : a, 1/ℓ, a number or of each point of the stencil.
     heights : (B, K − 1, n), ℓ, of the neighbours over the tangent plane; not together with `flux`.
 
     >>> line = torch.tensor([[[-1.0], [1.0]]], dtype=torch.float64)
@@ -257,7 +257,8 @@ def least_squares_weights(
         root = root * keep
     constant = torch.ones_like(root)
     if flux is not None:
-        values, constant, root = _with_data(scaled, values, root, flux, share * radius, degree)
+        share = torch.as_tensor(share).to(coords).expand(flux.shape[:2]) * radius[:, None]
+        values, constant, root = _with_data(scaled, values, root, flux, share, degree)
     functionals = functionals_of(coords.shape[-1], degree).to(coords)
     coefficients, condition = left_inverse(values, root)
     rows = functionals.mT @ coefficients
@@ -280,7 +281,7 @@ def _with_data(
     values: Float[Tensor, "B neighbors M"],
     root: Float[Tensor, "B neighbors"],
     flux: Float[Tensor, "B K d"],
-    share: Float[Tensor, " B"],
+    share: Float[Tensor, "B K"],
     degree: int,
 ) -> tuple[Tensor, Tensor, Tensor]:
     """The system with rows (∂_ν + a) y^α for the boundary points of a stencil; what the rows make of 1; and √ω.
@@ -293,7 +294,7 @@ def _with_data(
     place = on_boundary.byte().argsort(dim=1, descending=True, stable=True)[:, :most]
     nodes, flux = (x.take_along_dim(place[..., None], dim=1) for x in (nodes, flux))
     on_boundary = on_boundary.gather(1, place)
-    share = share[:, None] * on_boundary
+    share = share.gather(1, place) * on_boundary
     data = (monomial_derivatives(nodes, degree) * flux[:, :, None]).sum(-1)
     data = data + share[..., None] * monomials(nodes, degree)
     weight = torch.cat([torch.ones_like(root[:, :1]), root], dim=1).gather(1, place) * on_boundary
@@ -305,7 +306,7 @@ def positive_weights(
     coords: Float[Tensor, "B neighbors d"],
     degree: int,
     flux: Float[Tensor, "B K d"] | None = None,
-    share: float = 0.0,
+    share: float | Float[Tensor, "B K"] = 0.0,
     heights: Float[Tensor, "B neighbors n"] | None = None,
 ) -> Weights:
     """Least squares over as many neighbours as can have weights Δ ≥ 0: a row of an M-matrix, and consistent.
@@ -329,6 +330,7 @@ def positive_weights(
         rows = rows[some]
         keep[rows] &= ~negative[some]
         conormals = None if flux is None else flux[rows]
-        again = least_squares_weights(coords[rows], degree, keep[rows], conormals, share)
+        own = share[rows] if isinstance(share, Tensor) else share
+        again = least_squares_weights(coords[rows], degree, keep[rows], conormals, own)
         weights = weights.updated(rows, again)
     return replace(weights, height_residual=first)

@@ -8,7 +8,7 @@ mesh has a crease, or a corner, ν is the mean of the outer normals around.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from math import cos, radians
+from math import cos, factorial, radians
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -34,10 +34,15 @@ class Boundary:
     ----------
     mask : (N,), which points lie on the boundary.
     conormals : (N, n), unit and outward there, zero elsewhere.
+    sizes : (N,), ℓ^{d−1}, a first-order share of the boundary's length or area; 1 at the end of a curve.
+    folds : (N,), 1 over the length of the mean of the outer normals around, where ν is that mean; 1 elsewhere. If
+        ∂_n f = g along all of them, ∂_ν f is that times g.
     """
 
     mask: Bool[Tensor, " N"]
     conormals: Float[Tensor, "N n"]
+    sizes: Float[Tensor, " N"]
+    folds: Float[Tensor, " N"]
 
 
 @dataclass(frozen=True)
@@ -67,24 +72,31 @@ class BoundaryPlan:
 
     def at(self, points: Float[Tensor, "N n"], frames: Float[Tensor, "N n d"]) -> Boundary:
         """The boundary at these points, of a shape with these frames."""
-        own, tangents = (
-            points[self.members],
-            frames.new_zeros(len(self.members), points.shape[1], 0),
-        )
+        members, own = self.members, points[self.members]
+        tangents = frames.new_zeros(len(members), points.shape[1], 0)
         if self.fits is not None:
             tangents = LocalFits.at(self.fits, own, self.initial(points)).frames
-        conormals = torch.zeros_like(points)
-        rest = self.outward(points), self.crease
-        conormals[self.members] = _conormals(frames[self.members], tangents, *rest)
-        return Boundary(self.mask, conormals * self.mask[:, None])
+        outward, sizes, folds = self.measures(points)
+        conormals, every = torch.zeros_like(points), torch.zeros(2, len(points)).to(points)
+        conormals[members] = _conormals(frames[members], tangents, outward, self.crease)
+        every[1] = 1.0
+        every[:, members] = torch.stack([sizes, folds])
+        mask = self.mask.to(points)
+        return Boundary(self.mask, conormals * mask[:, None], every[0] * mask, every[1])
 
     def initial(self, points: Float[Tensor, "N n"]) -> Float[Tensor, "b n d_minus_1"]:
         """The boundary's first tangents."""
         return mesh_frames(points[self.members], torch.searchsorted(self.members, self.sides))
 
-    def outward(self, points: Float[Tensor, "N n"]) -> Float[Tensor, "b n"]:
-        """Vectors that leave the shape."""
-        return _outward_sums(points, self.sides, self.opposite)[0][self.members]
+    def measures(
+        self, points: Float[Tensor, "N n"]
+    ) -> tuple[Float[Tensor, "b n"], Float[Tensor, " b"], Float[Tensor, " b"]]:
+        """Vectors that leave the shape; sizes and folds, as in `Boundary`."""
+        outward, size = _outward_sums(points, self.sides, self.opposite)
+        outward, size = outward[self.members], size[self.members]
+        length = outward.norm(dim=1)
+        folds = torch.where(self.crease & (length > 0), size / length, 1.0)
+        return outward, size / factorial(self.sides.shape[1]), folds
 
     def with_fits(
         self, points: Float[Tensor, "N n"], graph: sparse.csr_array, degree: int

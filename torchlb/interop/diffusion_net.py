@@ -151,8 +151,9 @@ def _tuple(
     gradient = torch.einsum("exd,de->xe", turn[row], lb.gradient_values)
     weak = -lb.mass[row] * lb.values
     if symmetric and lb.has_weak_form:
-        rows = torch.arange(lb.num_points).repeat_interleave(lb.weak_crow.diff())
-        matrix = _coo(torch.stack([rows, lb.weak_col]), lb.weak_values[0], like)
+        crow, col, values = lb.pair
+        rows = torch.arange(lb.num_points).repeat_interleave(crow.diff())
+        matrix = _coo(torch.stack([rows, col]), values[0], like)
     elif symmetric:
         matrix = _coo(torch.cat([index, index.flip(0)], 1), torch.cat([weak, weak]) / 2, like)
     else:

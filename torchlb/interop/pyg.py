@@ -32,7 +32,7 @@ except ModuleNotFoundError as error:
 
 from torchlb.errors import InputError, TorchlbError, first_few, warn
 from torchlb.io.cache import load_or_build
-from torchlb.operator.batching import join_states
+from torchlb.operator.batching import join_states, trimmed
 from torchlb.operator.dispatch import Operator, build_operator
 from torchlb.operator.laplace_beltrami import LaplaceBeltrami
 from torchlb.operator.storage import BASIS, PAIRS
@@ -62,7 +62,7 @@ class LaplaceBeltramiTransform(BaseTransform):
     lb_face_index      (d + 1, F)   faces of the mesh, or of the surface through the cloud; F = 0 for other clouds
     lb_boundary        (N,)         mask of the points where the boundary condition holds; of none on a closed shape
     lb_weak_index      (2, nnz)     [i; j] of every entry of the weak pair, none where there is no pair; ascending
-    lb_weak_values     (nnz, 3)     stiffness, mass matrix, mass matrix of the boundary
+    lb_weak_values     (nnz, 3)     stiffness, mass matrix, mass matrix of the boundary; (nnz, 4) with Robin's term
     lb_linear_…                     the same of the linear pair
     lb_basis           (…,)         with k > 0: all parts of the eigenbasis in one vector, for `to_operator`
     lb_nodes           (N,)         lb_first and the numbers after it: nodes that are permuted take theirs along
@@ -166,11 +166,13 @@ def _keys(lb: LaplaceBeltrami, k: int) -> dict[str, Any]:
     }
     if len(lb.normals):
         keys["lb_normals"] = lb.normals
-    matrices = {"weak": (lb.weak_crow, lb.weak_col, lb.weak_values), "linear": lb.linear_pair}
-    for name, (crow, col, values) in matrices.items():
+    kind = lb.conditions[0]
+    width = 3 if kind.conserves or kind.fixes else 4  # of every shape with this condition
+    for name in PAIRS:
+        crow, col, values = lb.channels(name if len(lb.linear_crow) else "weak")
         rows = torch.arange(len(crow.diff())).repeat_interleave(crow.diff())
         keys[f"lb_{name}_index"] = torch.stack([rows, col])
-        keys[f"lb_{name}_values"] = pad(values, (0, 0, 0, 3 - len(values))).T.contiguous()
+        keys[f"lb_{name}_values"] = pad(values, (0, 0, 0, width - len(values))).T.contiguous()
     if k > 0:
         basis = lb.invariant_basis(k)
         parts = [getattr(basis, name) for name in BASIS]
@@ -225,7 +227,7 @@ def _buffers(data: Any, sizes: Int[Tensor, " S"]) -> dict[str, Tensor]:
         pairs |= {
             f"{name}_crow": weak_crow,
             f"{name}_col": columns.contiguous(),
-            f"{name}_values": values if values[2].any() else values[:2],
+            f"{name}_values": trimmed(values),
         }
     return pairs | {
         "crow": crow,

@@ -23,6 +23,7 @@ from torchlb.errors import CacheWarning, InputError, OperatorFileError, warn
 from torchlb.operator.dispatch import Operator, build_operator, builder_of, complete_options
 from torchlb.operator.inputs import ArrayLike, as_tensor, float_type, warn_of_gradients
 from torchlb.operator.laplace_beltrami import LaplaceBeltrami
+from torchlb.stencils.conditions import Condition
 from torchlb.version import __version__
 
 FORMAT = 2
@@ -116,6 +117,7 @@ def _key(operator: str, points: Tensor, faces: Tensor | None, options: dict[str,
     arrays = {"points": points, "faces": faces}
     plain: dict[str, Any] = {"operator": operator, "version": __version__}
     for name, value in options.items():
+        value = value.plain if isinstance(value, Condition) else value
         if isinstance(value, Tensor | np.ndarray | list | tuple):
             arrays[f"option {name}"] = as_tensor(value)
         else:

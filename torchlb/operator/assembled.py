@@ -10,9 +10,12 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from torchlb.cloud.surface import SurfaceSummary
+from torchlb.galerkin.absorption import absorbing
 from torchlb.galerkin.pair import WeakPair
+from torchlb.geometry.boundary import boundary_faces
 from torchlb.geometry.numbering import Numbering
 from torchlb.stability.certificate import Certificate
+from torchlb.stencils.conditions import condition_of
 from torchlb.stencils.rows import Rows
 from torchlb.stencils.shape import Shape
 
@@ -62,6 +65,17 @@ class AssembledOperator:
         faces = torch.zeros(0, shape.frames.shape[-1] + 1, dtype=torch.int64)
         kind = source, options, fit_counts, certificate
         return cls(rows, *of_shape, pair, faces, *kind)
+
+    @property
+    def whole_pair(self) -> WeakPair | None:
+        """The pair with what the condition adds."""
+        condition = condition_of(self.options.get("condition"))
+        share = None if condition is None else condition.share
+        if self.pair is None or self.on_boundary is None or share is None:
+            return self.pair
+        rim = torch.zeros_like(self.on_boundary)
+        rim[boundary_faces(self.faces).flatten()] = True
+        return absorbing(self.pair, share * self.on_boundary.to(self.points), rim)
 
     def restored(
         self, numbering: Numbering, points: Float[Tensor, "N n"], faces: Int[Tensor, "F v"]

@@ -81,10 +81,15 @@ def _join_pairs(shapes: Sequence[Buffers]) -> Buffers:
         crows = [crow[i > 0 :] + entries[i] for i, (crow, _, _) in enumerate(blocks)]
         joined[f"{pair}_crow"] = torch.cat(crows)
         joined[f"{pair}_col"] = torch.cat([b[1] + p for b, p in zip(blocks, points, strict=True)])
-        most = max(len(values) for _, _, values in blocks)  # 3 where some shape has a boundary
+        most = max(len(values) for _, _, values in blocks)  # the more, the more some shape has
         padded = [pad(values, (0, 0, 0, most - len(values))) for _, _, values in blocks]
         joined[f"{pair}_values"] = torch.cat(padded, dim=1)
     return joined
+
+
+def trimmed(values: Tensor) -> Tensor:
+    """Without the last matrices where they are zero: those of the boundary, and of what a condition adds."""
+    return values[: 4 if values[3:].any() else 3 if values[2:].any() else 2]
 
 
 def remember_shapes(batch: Any, shapes: Sequence[Any]) -> None:
@@ -126,8 +131,7 @@ def split_buffers(joined: Buffers, sizes: Sequence[int]) -> list[Buffers]:
             if len(crow):
                 first, last = crow[[start, start + size]].tolist()
                 crow, col = crow[start : start + size + 1] - first, col[first:last] - start
-                values = values[:, first:last]
-                values = values if values[2:].any() else values[:2]
+                values = trimmed(values[:, first:last])
             shape |= dict(
                 zip((f"{pair}_{part}" for part in PARTS), (crow, col, values), strict=True)
             )

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import sys
-from dataclasses import asdict, replace
+from dataclasses import replace
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -31,12 +31,11 @@ from torchlb.operator.options import Options
 from torchlb.operator.plan import Plan, stencils_of
 from torchlb.stability.enforce import certify
 from torchlb.stencils.assemble import assemble
-from torchlb.stencils.conditions import CONDITIONS
+from torchlb.stencils.conditions import Condition
 from torchlb.stencils.low_order import MeshLowOrder
 from torchlb.stencils.rows import Reason, matrix_rows
 from torchlb.stencils.shape import Shape, mesh_shape
 
-NOWHERE = "condition='dirichlet' holds nowhere: no boundary, or `boundary` has none of it; leave the condition out"
 LONG_BOUNDARY = 0.1
 """Share of the boundary's length at long triangles from which on a warning names them."""
 MANY = 0.5
@@ -98,7 +97,7 @@ def build_mesh(
     corners = check_faces(faces, len(vertices))
     options.check(len(vertices), vertices.shape[1], corners.shape[1] - 1)
     corners = mended_faces(vertices, corners)
-    if isinstance(boundary, str) and boundary in CONDITIONS:
+    if isinstance(boundary, str) and boundary in Condition.known:
         raise InputError(
             f"boundary: expected where the condition holds, a mask of the vertices, got {boundary!r}; what holds there "
             f"is condition={boundary!r}"
@@ -128,7 +127,7 @@ def on_cells(
             options.q,
             num_neighbors=options.num_neighbors,
             boundary=numbering.sorted(boundary) if isinstance(boundary, Tensor) else None,
-            condition=options.held,
+            condition=options.held(numbering),
             fit_degrees=degrees,
             progress=progress,
         )
@@ -211,8 +210,11 @@ def finished(
             progress=progress,
         )
         shape = replace(shape, areas=mass)
-    if options.condition == "dirichlet" and shape.boundary is None:
-        warn(NOWHERE)
+    if shape.boundary is None and not shape.condition.conserves:
+        warn(
+            f"condition={shape.condition!r} holds nowhere: no boundary, or `boundary` has none of it; leave the "
+            "condition out"
+        )
     low, counts = rows.order == 0, None if plan is None else plan.counts
     share = float(low.double().mean())
     if share >= MANY:
@@ -226,4 +228,4 @@ def finished(
             reason += f". Spectrum, diffusion and solves have the weak pair, {share_curved}"
         low_rows = "have only low-order rows for Δf and ∇f, of first order at best"
         warn(f"{share:.0%} of the points {low_rows}; at most of them: {reason}")
-    return AssembledOperator.of(rows, shape, pair, source, asdict(options), counts, certificate)
+    return AssembledOperator.of(rows, shape, pair, source, options.plain, counts, certificate)

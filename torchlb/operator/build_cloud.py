@@ -41,6 +41,7 @@ from torchlb.operator.checks import (
 from torchlb.operator.inputs import ArrayLike, check_points
 from torchlb.operator.options import Options
 from torchlb.operator.storage import OperatorStorage
+from torchlb.stencils.conditions import condition_of
 from torchlb.stencils.shape import cloud_shape, surface_shape
 
 Reconstruction = Callable[[Tensor], ArrayLike | Complex]
@@ -69,9 +70,10 @@ def build_cloud(
         d = found.cells.shape[1] - 1
     options.check(len(points), ambient, d)
     where = check_boundary(boundary, len(points))
-    if where is None and options.condition == "dirichlet":
+    held = condition_of(options.condition)
+    if where is None and held is not None and not held.conserves:
         raise InputError(
-            "boundary: condition='dirichlet' holds at boundary points; pass a mask of them, or 'detect'"
+            f"boundary: condition={held!r} holds at boundary points; pass a mask of them, or 'detect'"
         )
     if normals is not None:
         if d != ambient - 1:
@@ -89,9 +91,8 @@ def build_cloud(
             warn_of_buried(found.cells, mask)
         if found is None or isinstance(found, CloudSurface):
             if found is None:
-                built = _on_points(
-                    here, d, options, normals, where if mask is None else mask, progress
-                )
+                edge = where if mask is None else mask
+                built = _on_points(here, d, options, normals, edge, numbering, progress)
             else:
                 built = _on_surface(here, found, options, mask, numbering, progress)
             return built.restored(numbering, points, built.faces)
@@ -126,6 +127,7 @@ def _on_points(
     options: Options,
     normals: Float[Tensor, "N n"] | None,
     boundary: Bool[Tensor, " N"] | str | None,
+    numbering: Numbering,
     progress: bool,
 ) -> AssembledOperator:
     """Operator on a cloud that no complex goes through, by stencils alone."""
@@ -142,7 +144,7 @@ def _on_points(
         num_neighbors=options.num_neighbors,
         normals=normals,
         boundary=boundary,
-        condition=options.held,
+        condition=options.held(numbering),
         progress=progress,
     )
     return finished(shape, "points", options, progress)
@@ -171,7 +173,7 @@ def _on_surface(
         options.q,
         num_neighbors=options.num_neighbors,
         boundary=boundary,
-        condition=options.held,
+        condition=options.held(numbering),
         fit_degrees=degrees,
         progress=progress,
     )

@@ -267,3 +267,25 @@ def check_options(
         fits = [p for p in range(1, order) if num_monomials(dim, p + 1) <= num_points]
         remedy = f"lower `order` to {max(fits)}" if fits else "add points"
         raise InputError(f"{num_points} points are fewer than the {least} that {what}; {remedy}")
+
+
+def check_same_points(points: Tensor, built: Float[Tensor, "N n"]) -> None:
+    """InputError unless the points are those that an operator was built from, to float32 rounding."""
+    if points.shape != built.shape:
+        raise InputError(
+            f"points: expected the {tuple(built.shape)} that the operator was built from, got "
+            f"{tuple(points.shape)}; build it again after points are added, left out or projected"
+        )
+    theirs, ours = points.detach().to(built.device).double(), built.double()
+    rounding = max(
+        torch.finfo(torch.promote_types(t, torch.float16)).eps for t in (points.dtype, built.dtype)
+    )
+    most = 4 * max(rounding, torch.finfo(torch.float32).eps) * float(ours.abs().amax())
+    distance = (theirs - ours).abs().amax(1)
+    moved = (~(distance <= most)).nonzero()[:, 0]
+    if len(moved):
+        raise InputError(
+            f"points: {len(moved)} of {len(points)} are not where they were when the operator was built "
+            f"({first_few(moved)}; by up to {float(distance.amax()):.3g}); build it again after scaling, turning "
+            "or deforming a shape"
+        )

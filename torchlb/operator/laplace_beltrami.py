@@ -32,7 +32,7 @@ from torchlb.spectral.eigenbasis import (
     unstack_eigenbases,
 )
 from torchlb.stability.certificate import Certificate
-from torchlb.stencils.conditions import ConditionName
+from torchlb.stencils.conditions import Condition, ConditionName
 
 
 class LaplaceBeltrami(StencilFace, WeakFace):
@@ -84,7 +84,7 @@ class LaplaceBeltrami(StencilFace, WeakFace):
         num_neighbors: int | None = None,
         normals: ArrayLike | None = None,
         boundary: ArrayLike | Literal["detect"] | None = None,
-        condition: ConditionName | None = "neumann",
+        condition: ConditionName | Condition | None = "neumann",
         reconstruct: Reconstruction | None = None,
         weak_form: bool | None = None,
         certify: bool | None = None,
@@ -105,11 +105,12 @@ class LaplaceBeltrami(StencilFace, WeakFace):
         normals : (N, n), if known (d = n − 1): which way is out, where neighbours agree; a warning says where not.
         boundary : (N,) mask of the points on the boundary. By default, or for "detect", that of the complex through the
             cloud; where there is none, None is a closed shape, and surfaces alone can "detect" one.
-        condition : there: "neumann", ∂_ν f = 0, or "dirichlet", f = 0. With the latter the values of f at boundary
-            points are not used elsewhere, and have rows of their own, −4d f/h² with h the distance to the nearest, at
-            least a tenth of that to the farthest of the row. None uses no datum. That, and a boundary that is not
-            declared, leaves stencils there one-sided; hardly one passes, and the low-order rows in their place have
-            ∂_ν f = 0 at first order: Δx at the boundary of a disk is of size 1/h then, not 0.
+        condition : there: "neumann", ∂_ν f = 0; "dirichlet", f = 0; or `torchlb.Robin(a)`, ∂_ν f + a f = 0. With
+            Dirichlet's the values of f at boundary points are not used elsewhere, and have rows of their own, −4d f/h²
+            with h the distance to the nearest, at least a tenth of that to the farthest of the row. None uses no datum.
+            That, and a boundary that is not declared, leaves stencils there one-sided; hardly one passes, and the
+            low-order rows in their place have ∂_ν f = 0 at first order: Δx at the boundary of a disk is of size 1/h
+            then, not 0.
         reconstruct : from points (N, n) to cells through them, (F, d + 1), or a `torchlb.cloud.Complex`. By default
             `torchlb.cloud.reconstruct`: of curves, of surfaces in R² and R³ and of solids in R³ (`lb.faces`).
         weak_form : whether to build the weak pair (K, M); by default where there are cells.
@@ -143,7 +144,7 @@ class LaplaceBeltrami(StencilFace, WeakFace):
         weights: WeightsName = "least_squares",
         num_neighbors: int | None = None,
         boundary: ArrayLike | Literal["detect"] | None = None,
-        condition: ConditionName | None = "neumann",
+        condition: ConditionName | Condition | None = "neumann",
         weak_form: bool | None = None,
         certify: bool | None = None,
         progress: bool = True,
@@ -317,8 +318,9 @@ class LaplaceBeltrami(StencilFace, WeakFace):
         fits = built.fit_counts
         fits = rows.length.new_zeros(4, len(points)) if fits is None else fits
         buffers |= {f"report_{name}": t for name, t in zip(FIT_FIELDS, fits, strict=True)}
-        if built.pair is not None:
-            buffers |= built.pair.buffers
+        pair = built.whole_pair
+        if pair is not None:
+            buffers |= pair.buffers
         if built.on_boundary is not None and built.on_boundary.any():
             buffers["on_boundary"] = built.on_boundary
         lb = cls.from_buffers(buffers, {"source": built.source, "options": built.options})
@@ -334,7 +336,8 @@ class LaplaceBeltrami(StencilFace, WeakFace):
         if self.source == "empty":
             return "empty"
         size = f"{self.num_points} points, dim={self.dim} in R^{self.points.shape[1]}, from {self.source}"
-        options = [f"{k}={v!r}" for k, v in self.options.items() if v is not None]
+        options = self.options | {"condition": self.condition}
+        options = [f"{k}={v!r}" for k, v in options.items() if v is not None]
         certified = "" if self.certificate is None or self.certificate.holds else "NOT STABLE"
         last = [f"{self.col.shape[0]} entries", str(self.values.dtype), certified]
         return ", ".join(part for part in [size, *options, *last] if part)

@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import get_args
+from typing import Any, get_args
 
 from torchlb.errors import InputError
 from torchlb.fits.rules import WeightsName
 from torchlb.galerkin.pair import ELEMENTS
 from torchlb.geometry.frames import Projection
+from torchlb.geometry.numbering import Numbering
 from torchlb.operator.checks import check_options
-from torchlb.stencils.conditions import CONDITIONS, PAIRED, Condition, ConditionName
+from torchlb.stencils.conditions import Condition, ConditionName, condition_of
 
 
 @dataclass(frozen=True)
@@ -22,7 +23,7 @@ class Options:
     projection: Projection
     weights: WeightsName
     num_neighbors: int | None
-    condition: ConditionName | None
+    condition: ConditionName | Condition | dict[str, Any] | None
     weak_form: bool | None
     certify: bool | None
 
@@ -32,9 +33,15 @@ class Options:
         return self.order + 1 if self.normal_order is None else self.normal_order
 
     @property
-    def held(self) -> Condition | None:
-        """The condition at the boundary, as what it does to rows."""
-        return None if self.condition is None else CONDITIONS[self.condition]
+    def plain(self) -> dict[str, Any]:
+        """By name, in plain types."""
+        condition = condition_of(self.condition)
+        return vars(self) | {"condition": condition and condition.plain}
+
+    def held(self, numbering: Numbering) -> Condition | None:
+        """The condition at the boundary of the points in another order; InputError for what is none."""
+        condition = condition_of(self.condition)
+        return condition and condition.taken(numbering.given, len(numbering.given))
 
     @property
     def elements(self) -> tuple[int, tuple[int, ...]]:
@@ -49,15 +56,6 @@ class Options:
                 "leave it out, and the certificate makes the stencil stable instead"
             )
         weak = cells if self.weak_form is None else self.weak_form
-        if (
-            weak
-            and self.held is not None
-            and type(self.held) is not PAIRED.get(str(self.condition))
-        ):
-            raise InputError(
-                f"condition: eigenpairs, heat and solves are of the weak pair, which has {list(PAIRED)} alone and "
-                f"would ignore {self.condition!r}; weak_form=False builds the stencil, which has it"
-            )
         return replace(
             self, weak_form=weak, certify=not weak if self.certify is None else self.certify
         )
@@ -73,5 +71,4 @@ class Options:
             self.num_neighbors,
             projection=(self.projection, [*get_args(Projection)]),
             weights=(self.weights, [*get_args(WeightsName)]),
-            condition=(self.condition or "neumann", [*CONDITIONS]),
         )

@@ -7,7 +7,7 @@ points that the plan was made from those of the operator, at points that moved a
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 
 from jaxtyping import Float, Int
 from torch import Tensor
@@ -94,11 +94,11 @@ def evaluate(plan: Plan, points: Float[Tensor, "N n"]) -> AssembledOperator:
             balls=None,
             areas=pair.mass,
             low_order=MeshLowOrder(here, plan.shape.cells, plan.flips),
-            condition=options.held or Condition(),
+            condition=options.held(plan.numbering) or Condition(),
             on_mesh=plan.on_mesh,
         )
         rows = stencils_of(shape, options).evaluated(plan.rows)
-    built = AssembledOperator.of(rows, shape, pair, plan.source, asdict(options), plan.pair.counts)
+    built = AssembledOperator.of(rows, shape, pair, plan.source, options.plain, plan.pair.counts)
     return built.restored(plan.numbering, points, plan.faces)
 
 

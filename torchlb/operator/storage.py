@@ -8,15 +8,17 @@ from math import isnan
 from typing import Any, TypeVar
 
 import torch
-from jaxtyping import Bool
+from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
 from torchlb.cloud.surface import SurfaceSummary
-from torchlb.errors import InputError, first_few, warn
+from torchlb.errors import InputError, warn
 from torchlb.linalg.sparse import to_scipy, transpose_pattern
 from torchlb.linalg.spectral_bounds import Bounds, interval_bounds, spectral_bounds
+from torchlb.operator.checks import check_same_points
 from torchlb.spectral.eigenbasis import Eigenbasis
 from torchlb.stability.certificate import Certificate
+from torchlb.stencils.conditions import Condition, condition_of, kind_of
 
 REAL_FIELDS = ("growth", "condition", "off_diagonal_ratio")
 FIT_FIELDS = ("fit_degree", "fit_reason", "edges", "curved_edges")
@@ -39,12 +41,18 @@ def no_pairs(like: Tensor) -> dict[str, Tensor]:
     return {f"{pair}_{part}": t.clone() for pair in PAIRS for part, t in parts.items()}
 
 
+def with_added(values: Float[Tensor, "terms nnz"]) -> Float[Tensor, "2 nnz"]:
+    """K + R and M, of K, M, B, R; R is what a condition adds, and there is none unless it has been stored."""
+    return values[:2] if len(values) < 4 else torch.stack([values[0] + values[3], values[1]])
+
+
 class OperatorStorage(nn.Module):
     """Plain buffers of any size, which an empty instance takes from any `state_dict`.
 
     Attributes are those of `LaplaceBeltrami`; the transpose's pattern and, unless asked for, the basis are left out of
     `state_dict`. ``weak_crow``, ``weak_col``, ``weak_values`` (2, nnz) are stiffness and mass matrix on one pattern,
-    (3, nnz) with the mass matrix of the boundary; ``linear_…`` those of linear elements, empty where they are the same.
+    (3, nnz) with the mass matrix of the boundary, (4, nnz) with what a condition adds to the stiffness; ``linear_…``
+    those of linear elements, empty where they are the same.
     ``faces`` are those of the mesh, or of the surface through a cloud; ``surface`` says how that was found.
     """
 
@@ -161,9 +169,10 @@ class OperatorStorage(nn.Module):
         return self.options.get("order")
 
     @property
-    def condition(self) -> str | None:
-        """What holds at the boundary, "neumann" or "dirichlet"; None if no datum is used there."""
-        return self.options.get("condition")
+    def condition(self) -> str | Condition | None:
+        """What holds at the boundary, "neumann", "dirichlet" or a `Robin`; None if no datum is used there."""
+        plain = self.options.get("condition")
+        return condition_of(plain) if isinstance(plain, dict) else plain
 
     @property
     def boundary(self) -> Tensor | None:
@@ -175,16 +184,26 @@ class OperatorStorage(nn.Module):
         """Mask of the points where a Dirichlet condition holds; None if there are none."""
         if len(self.on_boundary) == 0:
             return None
-        holds = [condition == "dirichlet" for condition in self._conditions]
+        holds = [kind.fixes for kind in self.conditions]
         sizes = self.sizes or (self.num_points,)
         mask = torch.tensor(holds).repeat_interleave(torch.tensor(sizes)).to(self.on_boundary)
         return mask & self.on_boundary if any(holds) else None
 
     @property
-    def _conditions(self) -> list[str | None]:
-        """What holds at the boundary of each shape."""
+    def losing(self) -> Bool[Tensor, " N"] | None:
+        """Mask of the points where a condition keeps constants out of the null space of the pair; None for none."""
+        _, col, values = self.channels("linear" if len(self.linear_crow) else "weak")
+        if len(values) < 4:
+            return self.fixed
+        mask = torch.zeros_like(self.mass, dtype=torch.bool)
+        mask[col[values[3] > 0]] = True  # on the diagonal
+        return mask if self.fixed is None else mask | self.fixed
+
+    @property
+    def conditions(self) -> list[type[Condition]]:
+        """What kind of condition holds at the boundary of each shape."""
         states = [{"options": self.options}] if self.parts is None else self.parts
-        return [state["options"].get("condition") for state in states]
+        return [kind_of(state["options"].get("condition")) for state in states]
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -225,9 +244,19 @@ class OperatorStorage(nn.Module):
         return self._bounds
 
     @property
+    def pair(self) -> tuple[Tensor, Tensor, Tensor]:
+        """(crow, col, values (2, nnz)) of K, with what a condition adds to it, and M: what all is computed by."""
+        crow, col, values = self.channels("weak")
+        return crow, col, with_added(values)
+
+    @property
     def linear_pair(self) -> tuple[Tensor, Tensor, Tensor]:
-        """(crow, col, values (2, nnz)) of the pair of linear elements, close to (K, M) and 20 times sparser."""
-        pair = "linear" if len(self.linear_crow) else "weak"
+        """The same of the pair of linear elements, close to (K, M) and 20 times sparser."""
+        crow, col, values = self.channels("linear" if len(self.linear_crow) else "weak")
+        return crow, col, with_added(values)
+
+    def channels(self, pair: str) -> tuple[Tensor, Tensor, Tensor]:
+        """The buffers of the pair "weak" or "linear": crow, col, and values of K, M, B, and of what is added to K."""
         return tuple(getattr(self, f"{pair}_{part}") for part in ("crow", "col", "values"))  # type: ignore[return-value]
 
     def _flow_bounds(self) -> Bounds:
@@ -299,25 +328,7 @@ class OperatorStorage(nn.Module):
 
         An operator does not follow its points: after scaling, turning, or taking a part of them it is another one.
         """
-        if points.shape != self.points.shape:
-            raise InputError(
-                f"points: expected the {tuple(self.points.shape)} that the operator was built from, got "
-                f"{tuple(points.shape)}; build it again after points are added, left out or projected"
-            )
-        theirs, ours = points.detach().to(self.points.device).double(), self.points.double()
-        rounding = max(
-            torch.finfo(torch.promote_types(t, torch.float16)).eps
-            for t in (points.dtype, self.points.dtype)
-        )
-        most = 4 * max(rounding, torch.finfo(torch.float32).eps) * float(ours.abs().amax())
-        distance = (theirs - ours).abs().amax(1)
-        moved = (~(distance <= most)).nonzero()[:, 0]
-        if len(moved):
-            raise InputError(
-                f"points: {len(moved)} of {len(points)} are not where they were when the operator was built "
-                f"({first_few(moved)}; by up to {float(distance.amax()):.3g}); build it again after scaling, turning "
-                "or deforming a shape"
-            )
+        check_same_points(points, self.points)
 
     def get_extra_state(self) -> dict[str, Any]:
         """Source, options, certificate, spectral bounds and what is known of the surface, plain types only."""

@@ -22,7 +22,6 @@ from torchlb.spectral.eigenbasis import (
 )
 from torchlb.spectral.eigensolver import blockwise_eigenbasis
 from torchlb.spectral.pencil import pencil_eigenbasis
-from torchlb.stencils.conditions import CONDITIONS
 
 MatrixName = Literal["laplacian", "stiffness", "mass", "boundary_mass"]
 NO_PAIR = (
@@ -89,8 +88,7 @@ class WeakFace(OperatorStorage):
     @property
     def loses(self) -> bool:
         """Whether a condition takes something away, so that rows at the boundary do not sum to zero."""
-        kinds = [CONDITIONS.get(name) for name in self._conditions if name is not None]
-        return not all(kind is not None and kind.conserves for kind in kinds)
+        return not all(kind.conserves for kind in self.conditions)
 
     def eigenbasis(
         self, k: int, *, tolerance: float | None = None, store: bool = False
@@ -152,12 +150,14 @@ class WeakFace(OperatorStorage):
 
     def _pair_eigenbasis(self, k: int, tolerance: float | None) -> Eigenbasis:
         """From the weak pair of each shape; the more exact, the higher the order."""
-        pairs = [(self.weak_crow, self.weak_col, self.weak_values), self.linear_pair]
         (stiffness, mass), linear = (
-            [to_scipy(crow, col, v.double(), self.shape) for v in values[:2]]
-            for crow, col, values in pairs
+            [to_scipy(crow, col, v.double(), self.shape) for v in values]
+            for crow, col, values in (self.pair, self.linear_pair)
         )
-        fixed = None if self.fixed is None else self.fixed.cpu().numpy()
+        none = torch.zeros_like(self.mass, dtype=torch.bool)
+        fixed, losing = (
+            (none if mask is None else mask).cpu().numpy() for mask in (self.fixed, self.losing)
+        )
         order = self.options.get("order") or 3
         if tolerance is None and order > 3:
             tolerance = 10.0 ** -(2 * min(order, 5) + 1)
@@ -173,7 +173,8 @@ class WeakFace(OperatorStorage):
                     k,
                     dim=self.dim,
                     linear=None if near is None else (near[0], near[1]),
-                    fixed=None if fixed is None or not fixed[block].any() else fixed[block],
+                    fixed=fixed[block],
+                    losing=losing[block],
                     tolerance=tolerance,
                 )
             )

@@ -6,8 +6,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import torch
-from jaxtyping import Bool, Float, Int
-from scipy import sparse
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from torchlb.errors import InputError, first_few
@@ -21,13 +20,11 @@ from torchlb.operator.medium import forms_of
 
 @dataclass(frozen=True, eq=False)
 class Conducting:
-    """(K(κ), M) of an operator, under the names of its buffers, and the derivatives of K in κ."""
+    """(K(κ), M) of an operator, with what its condition adds to K, and the derivatives of K in κ."""
 
     lb: LaplaceBeltrami
     forms: Forms
-    weak_crow: Int[Tensor, " N_plus_1"]
-    weak_col: Int[Tensor, " nnz"]
-    weak_values: Float[Tensor, "2 nnz"]
+    pair: tuple[Tensor, Tensor, Tensor]
     linear_pair: tuple[Tensor, Tensor, Tensor]
 
     has_weak_form = True
@@ -35,7 +32,7 @@ class Conducting:
     @property
     def values(self) -> Tensor:
         """What factors are kept by."""
-        return self.weak_values
+        return self.pair[2]
 
     @property
     def linear_crow(self) -> Tensor:
@@ -46,6 +43,11 @@ class Conducting:
     def fixed(self) -> Bool[Tensor, " N"] | None:
         """As of the operator."""
         return self.lb.fixed
+
+    @property
+    def losing(self) -> Bool[Tensor, " N"] | None:
+        """As of the operator."""
+        return self.lb.losing
 
     @property
     def mass(self) -> Tensor:
@@ -101,15 +103,16 @@ def conducting(lb: LaplaceBeltrami, conductivity: Tensor) -> Conducting:
             f"{len(kappa)} vertices or faces ({first_few(bad)})"
         )
     values = forms.conductivities(kappa)
-    mass = _mass(lb, lb.weak_crow, lb.weak_col, lb.weak_values)
-    linear = pair = stored(forms.matrix(values).real + 1j * mass)
+    pair = linear = _with_rest(lb, "weak", forms.matrix(values))
     if len(lb.linear_crow):
-        linear = stored(forms.near(values).real + 1j * _mass(lb, *lb.linear_pair))
-    (crow, col, values), near = (
-        [t.to(lb.device) for t in (part.crow, part.col, part.values)] for part in (pair, linear)
-    )
-    return Conducting(lb, forms, crow, col, values, (near[0], near[1], near[2]))
+        linear = _with_rest(lb, "linear", forms.near(values))
+    return Conducting(lb, forms, pair, linear)
 
 
-def _mass(lb: LaplaceBeltrami, crow: Tensor, col: Tensor, values: Tensor) -> Any:
-    return sparse.csr_array(to_scipy(crow, col, values[1].double(), lb.shape))
+def _with_rest(lb: LaplaceBeltrami, pair: str, matrix: Any) -> tuple[Tensor, Tensor, Tensor]:
+    """K(κ) with M, and with what the condition adds, whatever κ is."""
+    crow, col, values = lb.channels(pair)
+    _, mass, *rest = (to_scipy(crow, col, v.double(), lb.shape) for v in values)
+    found = stored(matrix.real + 1j * mass, rest[1] if len(rest) > 1 else None)
+    values = torch.stack([found.values[0] + found.values[2:].sum(0), found.values[1]])
+    return found.crow.to(lb.device), found.col.to(lb.device), values.to(lb.device)

@@ -46,8 +46,9 @@ def implicit_step(
     t : time ≥ 0 in ℓ², one for all channels or (C,).
     boundary_values : u at the points of a Dirichlet condition, a number or of the shape of f, of which only those
         points count; 0 by default.
-    flux : κ∂_ν u along the rest of the boundary, units of f by 1/ℓ, in the same way; 0 by default. Beside that rest it
-        counts at the next few held points, too, as the curve between points does: continue it smoothly to them.
+    flux : κ∂_ν u along the rest of the boundary, κ∂_ν u + a u with `Robin`, units of f by 1/ℓ, in the same way; 0 by
+        default. Beside that rest it counts at the next few held points, too, as the curve between points does: continue
+        it smoothly to them.
     conductivity : κ > 0 of u − t div(κ∇u) = f, of the vertices (N,), its logarithm prolonged as the surface is, or of
         the faces (F,), if they are not as many; 1 by default. On meshes, with the weak pair or the cotangent's, of one
         shape; differentiable in it, too.
@@ -76,7 +77,7 @@ def implicit_step(
     medium = lb if conductivity is None else conducting(lb, conductivity)
     right = _mass(lb, columns)
     if poured is not None:
-        right = right + time * _product(lb, 2, poured)
+        right = right + time * lb.product("boundary_mass", poured)
     if given is not None:
         right = right - _product(lb, 1, given) - time * _product(medium, 0, given)
     u = _solve(right, time, conductivity, given, medium, tolerance)
@@ -95,9 +96,9 @@ def poisson_solve(
 ) -> Tensor:
     """u with −Δu = f; differentiable in f and the boundary's data. Units of f by ℓ².
 
-    Ku = Mf + B·flux with the weak pair, −Lu = f with the stencil. On a component without a Dirichlet condition u has
-    mean zero, and f and flux are made compatible: their total is taken off f, evenly. Arguments and errors as for
-    `implicit_step`.
+    Ku = Mf + B·flux with the weak pair, −Lu = f with the stencil. On a component that neither a Dirichlet nor a Robin
+    condition holds u has mean zero, and f and flux are made compatible: their total is taken off f, evenly. Arguments
+    and errors as for `implicit_step`.
 
     Examples
     --------
@@ -115,7 +116,7 @@ def poisson_solve(
     medium = lb if conductivity is None else conducting(lb, conductivity)
     right = _mass(lb, columns)
     if poured is not None:
-        right = right + _product(lb, 2, poured)
+        right = right + lb.product("boundary_mass", poured)
     if given is not None:
         right = right - _product(medium, 0, given)
     u = _solve(right, None, conductivity, given, medium, tolerance)
@@ -231,8 +232,9 @@ def _missing(lb: LaplaceBeltrami, kind: int) -> str:
 
 
 def _product(lb: LaplaceBeltrami | Conducting, number: int, x: Tensor) -> Tensor:
-    """K, M or B times x."""
-    return symmetric_product(lb.weak_crow, lb.weak_col, lb.weak_values[number].to(x), x)
+    """K, with what a condition adds, or M times x."""
+    crow, col, values = lb.pair
+    return symmetric_product(crow, col, values[number].to(x), x)
 
 
 def _mass(lb: LaplaceBeltrami, x: Tensor) -> Tensor:

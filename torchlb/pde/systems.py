@@ -1,11 +1,11 @@
 """The linear systems behind implicit steps and Poisson problems, by the weak pair or by the stencil.
 
-A system is a K + b M with the rows and columns of Dirichlet points taken out. The weak pair is solved by conjugate
-gradients; the factor of the linear pair, which is spectrally close and 20 times sparser, preconditions them
-(`method.md`, section 10). Where rows of the fits have large weights, K is up to thirty times stiffer than K₁ at single
-points, in functions that live there: smoothing before and after the factor's solve then takes a third of the steps.
-Many times of one call share factors, those of powers of four. Factors are kept as long as the operator that they
-belong to; a batch takes those of its shapes.
+A system is a K + b M, K with what a Robin condition adds to it, with the rows and columns of Dirichlet points taken
+out. The weak pair is solved by conjugate gradients; the factor of the linear pair, which is spectrally close and 20
+times sparser, preconditions them (`method.md`, section 10). Where rows of the fits have large weights, K is up to
+thirty times stiffer than K₁ at single points, in functions that live there: smoothing before and after the factor's
+solve then takes a third of the steps. Many times of one call share factors, those of powers of four. Factors are kept
+as long as the operator that they belong to; a batch takes those of its shapes.
 """
 
 from __future__ import annotations
@@ -114,7 +114,7 @@ class _Components:
         self.count, number = csgraph.connected_components(graph, directed=False)
         self.of = torch.from_numpy(number.astype(np.int64)).to(col.device)
         held = torch.zeros(self.count, device=col.device)
-        rows = lb.fixed if held_rows is None else torch.from_numpy(held_rows).to(col.device)
+        rows = lb.losing if held_rows is None else torch.from_numpy(held_rows).to(col.device)
         if rows is not None:
             held = held.index_add(0, self.of, rows.float())
         if self.count > 1:
@@ -136,9 +136,10 @@ class PairSystem:
 
     def __init__(self, lb: Operator) -> None:
         self.dim = lb.dim
-        self.stiffness, self.mass = self.parts = [v.detach() for v in lb.weak_values[:2]]
+        crow, col, values = lb.pair
+        self.stiffness, self.mass = self.parts = list(values.detach())
         self.units = [values.abs().max().double() for values in self.parts]
-        self.pattern = lb.weak_crow.int(), lb.weak_col.int()
+        self.pattern = crow.int(), col.int()
         self.free = None if lb.fixed is None else (~lb.fixed).double()[:, None]
         self.components = _Components(lb)
         self.one = torch.ones_like(lb.mass.double())[:, None]
@@ -148,14 +149,17 @@ class PairSystem:
         self.smooths = len(lb.linear_crow) > 0  # the cotangent's pair is the linear one
         self.steps = 0
         crow, col, linear = lb.linear_pair
-        first, second = (to_scipy(crow, col, v.double(), lb.shape) for v in linear[:2])
-        first = first - sparse.diags_array(first.sum(1))  # in float32 it would be indefinite
+        first, second = (to_scipy(crow, col, v.double(), lb.shape) for v in linear)
+        sums = first.sum(1)  # in float32 it would be indefinite with what is below zero
+        if lb.losing is not None:
+            sums = np.where(lb.losing.cpu().numpy(), np.minimum(sums, 0.0), sums)
+        first = first - sparse.diags_array(sums)
         self.linear, self.factors = (first, second), OrderedDict()
 
     def solve(
         self, b: Float[Tensor, "N C"], time: Float[Tensor, " C"] | None, tolerance: float | None
     ) -> Float[Tensor, "N C"]:
-        """The solution, zero at Dirichlet points, of mean zero on the other components of a Poisson problem.
+        """The solution, zero at Dirichlet points, of mean zero on components where K1 = 0 of a Poisson problem.
 
         On these, constants are split off, for which M + tK is M: they and the mass stay to rounding. A tolerance of
         None takes the factors' solution, that of linear elements.
@@ -286,7 +290,7 @@ class PairSystem:
         return Factor(sparse.csr_array((matrix + matrix.T) / 2))
 
     def _mean(self, weights: Tensor, x: Tensor) -> Tensor:
-        """Weighted sums over components that no Dirichlet point holds, by their areas; 0 on the others."""
+        """Weighted sums over components where K1 = 0, by their areas; 0 on the others."""
         return torch.where(self.components.free, self.components.sums(weights, x) / self.area, 0.0)
 
     def inside(self, x: Tensor) -> Tensor:

@@ -62,7 +62,7 @@ class _Part(NamedTuple):
     stiffness: Sparse
     mass_matrix: Sparse
     linear: Pair | None  # K₁, M₁
-    conserving: bool  # no point is fixed, so that constants have the eigenvalue 0
+    conserving: bool  # constants have the eigenvalue 0
 
 
 def pencil_eigenbasis(
@@ -74,18 +74,20 @@ def pencil_eigenbasis(
     dim: int = 2,
     linear: Pair | None = None,
     fixed: Bool[np.ndarray, " N"] | None = None,
+    losing: Bool[np.ndarray, " N"] | None = None,
     tolerance: float | None = None,
 ) -> Eigenbasis:
     """The min(k, N) smallest eigenpairs of K u = λ M u, and more where a group of equal ones (but 0) would be split.
 
     Parameters
     ----------
-    stiffness, mass_matrix : K, positive semidefinite with K1 = 0, and M, positive definite, (N, N).
+    stiffness, mass_matrix : K, positive semidefinite, and M, positive definite, (N, N).
     mass : diagonal mass, stored with the basis.
     dim : d, from which the unit of a length follows: K is in ℓ^{d−2}, M in ℓ^d.
     linear : K₁ and M₁ of the same points, spectrally close, with fewer entries. None if (K, M) are that themselves:
         the eigenvalues are then exact to 1e-12 or so.
     fixed : points where functions vanish (Dirichlet).
+    losing : these, and points where K1 > 0 (Robin); on components without K1 = 0. By default the same.
     tolerance : bound on the estimated relative error of every eigenvalue, 1.5e-8 k² by default; those closer than that
         are not separated.
 
@@ -99,29 +101,27 @@ def pencil_eigenbasis(
     >>> pencil_eigenbasis(path, sparse.eye_array(2).tocsr(), torch.ones(2), 2).eigenvalues
     tensor([0., 2.], dtype=torch.float64)
     """
-    held = np.zeros(len(mass), dtype=bool) if fixed is None else np.asarray(fixed, dtype=bool)
-    matrices = [_narrow(matrix) for matrix in (stiffness, mass_matrix)]
-    if not (matrices[1].diagonal() > 0).all():
+    fixed = np.zeros(len(mass), dtype=bool) if fixed is None else fixed
+    losing = fixed if losing is None else losing
+    if not (mass_matrix.diagonal() > 0).all():
         raise EigenbasisError(
             "eigenbasis: the mass matrix is not positive; a shape so small that areas are zero in float32 has to be "
             "scaled, or kept in float64"
         )
     # A unit of length with which float32 holds the entries, and nothing is rounded.
-    length = 2.0 ** round(float(np.log2(matrices[1].sum())) / dim)
+    length = 2.0 ** round(float(np.log2(mass_matrix.sum())) / dim)
     units = length ** (dim - 2), length**dim
-    whole = matrices[0] / units[0], matrices[1] / units[1]
-    near = (
-        None if linear is None else (_narrow(linear[0]) / units[0], _narrow(linear[1]) / units[1])
-    )
+    whole = _narrow(stiffness, units[0]), _narrow(mass_matrix, units[1])
+    near = linear and (_narrow(linear[0], units[0]), _narrow(linear[1], units[1]))
     component, pattern = _components(whole, near)
     areas = np.bincount(component, whole[1].sum(axis=1))
-    areas[component[held]] = 0.0
+    areas[component[losing]] = 0.0
     zeros = min(int((areas > 0).sum()), k)
     if linear is None:
         tolerance = EXACT**2
     elif tolerance is None:
         tolerance = min(TOLERANCE * k**2, LOOSEST)
-    parts = _parts(whole, near, held, component, pattern) if zeros < k else []
+    parts = _parts(whole, near, fixed, component, pattern, areas) if zeros < k else []
     found = [_pairs(part, k, tolerance) for part in parts]
     null = constants(component, areas, zeros)
     return _merged(parts, found, (null, whole[1] @ null), mass, k, tolerance, (length**2, units[1]))
@@ -137,7 +137,12 @@ def _components(whole: Pair, near: Pair | None) -> tuple[np.ndarray, Sparse]:
 
 
 def _parts(
-    whole: Pair, near: Pair | None, fixed: np.ndarray, component: np.ndarray, pattern: Sparse
+    whole: Pair,
+    near: Pair | None,
+    fixed: np.ndarray,
+    component: np.ndarray,
+    pattern: Sparse,
+    areas: np.ndarray,
 ) -> list[_Part]:
     """The components without their fixed points.
 
@@ -151,7 +156,7 @@ def _parts(
         if len(free):
             linear = None if near is None else _renumbered(near, free)
             k, m = _renumbered(whole, free)
-            parts.append(_Part(free, k, m, linear, len(free) == len(points)))
+            parts.append(_Part(free, k, m, linear, bool(areas[component[free[0]]] > 0)))
     return parts
 
 
@@ -168,10 +173,10 @@ def _renumbered(pair: Pair, order: np.ndarray) -> Pair:
     return one, other
 
 
-def _narrow(matrix: Sparse) -> Sparse:
-    """With indices of 32 bits, in float64."""
+def _narrow(matrix: Sparse, unit: float) -> Sparse:
+    """With indices of 32 bits, in float64, over a unit."""
     ends = (part.astype(np.int32, copy=False) for part in (matrix.indices, matrix.indptr))
-    return sparse.csr_array((matrix.data.astype(float, copy=False), *ends), shape=matrix.shape)
+    return sparse.csr_array((np.divide(matrix.data, unit, dtype=float), *ends), shape=matrix.shape)
 
 
 def _joined(one: Sparse, other: Sparse) -> Sparse:
@@ -181,10 +186,6 @@ def _joined(one: Sparse, other: Sparse) -> Sparse:
         if data.all():
             return sparse.csr_array((data, one.indices, one.indptr), shape=one.shape)
     return sparse.csr_array(abs(one) + abs(other))
-
-
-def _constant(mass_matrix: Sparse) -> np.ndarray:
-    return np.full(len(mass_matrix.diagonal()), float(mass_matrix.sum()) ** -0.5)
 
 
 def _pairs(part: _Part, k: int, tolerance: float) -> tuple[np.ndarray, ...]:
@@ -197,7 +198,7 @@ def _pairs(part: _Part, k: int, tolerance: float) -> tuple[np.ndarray, ...]:
         errors, mu = np.zeros(count), part.mass_matrix @ u
     else:
         k1, m1 = part.linear or (part.stiffness, part.mass_matrix)
-        null = _constant(m1) if zero else None
+        null = np.full(size, float(m1.sum()) ** -0.5) if zero else None
         accuracy = EXACT if part.linear is None else START
         settings = {"tolerance": accuracy, "more": GUARD, "null": null}
         solve, (values, u) = lanczos_of_pair(k1, m1, k - zero, SHIFT / float(m1.sum()), **settings)

@@ -75,6 +75,8 @@ class Stencils:
             dim, order, weights, num_neighbors, on_mesh=on_mesh, triangles=triangles
         )
         self.acceptance = Acceptance(dim, on_mesh, projection)
+        share, boundary = shape.condition.share, shape.boundary
+        self.share = None if share is None or boundary is None else share * boundary.folds
 
     def rows(self, centers: Int[Tensor, " B"], start: Int[Tensor, " B"] | None = None) -> Rows:
         """Rows of `centers`, each of the first candidate (from `start` on) that passes, else the low-order row."""
@@ -89,7 +91,7 @@ class Stencils:
                 tried, index, holds = tried[~holds], index[~holds], holds[~holds]
                 if len(tried) == 0:
                     continue
-            with_data = holds & (self.shape.condition.share is not None)
+            with_data = holds & (self.share is not None)
             weights = self._weights(centers[tried], index, candidate, with_data)
             failure, rejected = self.acceptance.judge(weights, candidate, holds)
             if candidate.degree == self.order + 1 and candidate.rule != "positive":
@@ -112,10 +114,9 @@ class Stencils:
             blocks.append(self._low_order_rows(centers[left], reason[left]))
             taken.append(left.nonzero()[:, 0])
         rows = Rows.stack(blocks)[torch.cat(taken).argsort()]
-        if self.shape.boundary is not None:
-            rows = self.shape.condition.finish(
-                self.shape.points, self.shape.boundary, centers, rows
-            )
+        shape = self.shape
+        if shape.boundary is not None:
+            rows = shape.condition.finish(shape.points, shape.areas, shape.boundary, centers, rows)
         return replace(rows, reason=torch.where(rows.order < self.order, reason, rows.reason))
 
     def _holds_boundary(self, index: Int[Tensor, "B K"]) -> Bool[Tensor, " B"]:
@@ -129,7 +130,7 @@ class Stencils:
         own = (rows.candidate == len(self.candidates)) & (rows.slope > 0)
         slope = (rows.gradient != 0).any(1)
         # Dirichlet's condition takes weights of Δ away, that of Neumann knows more than those of ∇.
-        weights = slope if self.shape.condition.share is None else rows.laplacian != 0
+        weights = slope if self.share is None else rows.laplacian != 0
         positive = rows.rule == RULES.index("positive")
         used = (~positive[row] | weights) & (~own[row] | slope)
         kinds = rows.candidate, rows.rule, rows.order, rows.slope, rows.reason
@@ -146,7 +147,7 @@ class Stencils:
                 own = plan.col[places] == centers[:, None]
                 places = places.gather(1, own.byte().argsort(dim=1, descending=True, stable=True))
                 index, used = plan.col[places].long(), plan.used[places][:, 1:]
-                with_data = self._holds_boundary(index) & (self.shape.condition.share is not None)
+                with_data = self._holds_boundary(index) & (self.share is not None)
                 keep, slope = None if used.all() else used, plan.slope[centers]
                 weights = self._weights(centers, index, candidate, with_data, keep, slope)
                 gradient = self._tangent_vectors(centers, index, weights.gradient)
@@ -159,9 +160,9 @@ class Stencils:
             blocks.append(self._low_order_again(low, plan))
             taken.append(low)
         rows = Rows.stack(blocks)[torch.cat(taken).argsort()]
-        if self.shape.boundary is not None:
-            finish = self.shape.condition.finish
-            rows = finish(self.shape.points, self.shape.boundary, every, rows)
+        shape = self.shape
+        if shape.boundary is not None:
+            rows = shape.condition.finish(shape.points, shape.areas, shape.boundary, every, rows)
         rows = rows.on_pattern(plan) if len(low) else rows
         return replace(rows, reason=plan.reason)
 
@@ -242,15 +243,15 @@ class Stencils:
         data did: first derivatives are those of the highest degree that they do.
         """
         points, frames, degree = self.shape.points, self.shape.frames, candidate.degree
-        boundary, share = self.shape.boundary, self.shape.condition.share
+        boundary, share = self.shape.boundary, self.share
         assert boundary is not None
         assert share is not None
         coords = local_offsets(points, frames, centers, index[:, 1:], "tangent")
         flux = boundary.conormals[index] @ frames[centers]
         if candidate.rule == "positive" and keep is None:
-            weights = positive_weights(coords, degree, flux=flux, share=share)
+            weights = positive_weights(coords, degree, flux=flux, share=share[index])
         else:
-            weights = least_squares_weights(coords, degree, keep, flux, share)
+            weights = least_squares_weights(coords, degree, keep, flux, share[index])
         heights = self._heights(centers, index, coords)
         free = part = least_squares_weights(coords, degree, heights=heights)
         gradient, left = free.gradient.clone(), torch.arange(len(centers))

@@ -1,14 +1,16 @@
-"""What holds at the boundary of a shape, and what that does to rows (`method.md`, section 6)."""
+"""What holds at a boundary: a class each, with what it does to rows and to the weak pair (`method.md`, 6 and 9)."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import replace
-from typing import Literal
+from typing import Any, ClassVar, Literal
 
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from torchlb.errors import InputError, first_few
 from torchlb.geometry.boundary import Boundary
 from torchlb.stencils.rows import Rows
 
@@ -19,18 +21,51 @@ CLOSEST = 0.1
 class Condition:
     """Nothing is known at the boundary: stencils there are one-sided. Other conditions derive from it.
 
+    A class with a `name` is known by it, in options, files and messages. What it is made of is one argument of numbers
+    and lists, or none, and `data` gives that back.
+
     Attributes
     ----------
-    share : a of ∂_ν f + a f = 0, 1/ℓ, if stencils may use that at the boundary points that they hold, else None.
-    conserves : whether rows sum to zero, so that constants stay.
+    name
+        Of the condition.
+    conserves
+        Whether constants stay: rows sum to zero, and K1 = 0.
+    fixes
+        Whether values at the boundary are zero: solves take out rows and columns there.
+    share
+        a ≥ 0 of ∂_ν f + a f = 0, 1/ℓ, a number or of each point: stencils have that as data, and K has a added along
+        the boundary. None where they have not.
+    data
+        What an instance is made of again; None for nothing.
     """
 
-    share: float | None = None
-    conserves: bool = True
+    known: ClassVar[dict[str | None, type[Condition]]] = {}
+    name: ClassVar[str]
+    conserves: ClassVar[bool] = True
+    fixes: ClassVar[bool] = False
+    share: float | Float[Tensor, " N"] | None = None
+    data: Any = None
+
+    def __init_subclass__(cls) -> None:
+        if "name" in cls.__dict__:
+            Condition.known[cls.name] = cls
+
+    @property
+    def plain(self) -> str | dict[str, Any]:
+        """The condition in plain types: its name, or {name: data}."""
+        return self.name if self.data is None else {self.name: self.data}
+
+    def __repr__(self) -> str:
+        return repr(self.plain)
+
+    def taken(self, points: Int[Tensor, " N"], count: int) -> Condition:
+        """That of the points in another order; InputError if it is not one of `count` points."""
+        return self
 
     def finish(
         self,
         points: Float[Tensor, "N n"],
+        areas: Float[Tensor, " N"],
         boundary: Boundary,
         centers: Int[Tensor, " B"],
         rows: Rows,
@@ -39,9 +74,13 @@ class Condition:
         return rows
 
 
+Condition.known[None] = Condition
+
+
 class Neumann(Condition):
     """∂_ν f = 0."""
 
+    name = "neumann"
     share = 0.0
 
 
@@ -52,11 +91,14 @@ class Dirichlet(Condition):
     `CLOSEST` of that to the farthest in its row.
     """
 
+    name = "dirichlet"
     conserves = False
+    fixes = True
 
     def finish(
         self,
         points: Float[Tensor, "N n"],
+        areas: Float[Tensor, " N"],
         boundary: Boundary,
         centers: Int[Tensor, " B"],
         rows: Rows,
@@ -75,8 +117,115 @@ class Dirichlet(Condition):
         return replace(rows, laplacian=torch.where(own, -4 * dim / nearest[local], kept))
 
 
+class Robin(Condition):
+    """κ∂_ν f + a f = 0: what leaves through the boundary is a ≥ 0 times what is there.
+
+    Parameters
+    ----------
+    a
+        Units of κ/ℓ: a number, or one of each point, of which those off the boundary do not count. 0 is Neumann's
+        condition, and a → ∞ Dirichlet's. Of first order where a jumps.
+
+    Raises InputError for what is neither, and for values that are negative or not finite.
+
+    >>> Robin(2.0)
+    Robin(2.0)
+    """
+
+    name = "robin"
+    conserves = False
+
+    def __init__(self, a: Any) -> None:
+        try:
+            share = torch.as_tensor(a, dtype=torch.float64).detach().cpu()
+        except (TypeError, ValueError, RuntimeError) as error:
+            raise InputError(
+                f"Robin: expected a number, or one of each point, got {a!r}"
+            ) from error
+        if share.ndim > 1:
+            raise InputError(
+                f"Robin: expected a number, or one of each point, (N,), got {tuple(share.shape)}"
+            )
+        bad = (~((share >= 0) & share.isfinite())).reshape(-1).nonzero()[:, 0]
+        if len(bad):
+            where = f" at {len(bad)} points ({first_few(bad)})" if share.ndim else ""
+            raise InputError(
+                f"Robin: expected finite a ≥ 0, got {float(share.reshape(-1)[bad[0]]):.3g}{where}; with a < 0 more "
+                "comes in the more there is, and Δ may have positive eigenvalues"
+            )
+        self._a, self.share = share, share if share.ndim else float(share)
+
+    @property
+    def data(self) -> float | list[float]:
+        """a, as a number or a list."""
+        return self._a.tolist()
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, Robin) and self.data == other.data
+
+    def __hash__(self) -> int:
+        return hash(str(self.data))
+
+    def __repr__(self) -> str:
+        return f"Robin(a of {len(self._a)} points)" if self._a.ndim else f"Robin({self.share})"
+
+    def taken(self, points: Int[Tensor, " N"], count: int) -> Robin:
+        """With a of the points in another order."""
+        if self._a.ndim == 0:
+            return self
+        if len(self._a) != count:
+            raise InputError(
+                f"Robin: expected one a, or one of each of {count} points, got {len(self._a)}"
+            )
+        return Robin(self._a[points])
+
+    def finish(
+        self,
+        points: Float[Tensor, "N n"],
+        areas: Float[Tensor, " N"],
+        boundary: Boundary,
+        centers: Int[Tensor, " B"],
+        rows: Rows,
+    ) -> Rows:
+        """Low-order rows lose a f through their share of the boundary; others have the condition as data."""
+        lost = self._a.to(areas) * boundary.sizes / areas
+        local = torch.arange(len(centers)).repeat_interleave(rows.length)
+        own = (centers[local] == rows.col) & (rows.order == 0)[local]
+        return replace(rows, laplacian=rows.laplacian - torch.where(own, lost[rows.col], 0.0))
+
+
 ConditionName = Literal["neumann", "dirichlet"]
-PAIRED: dict[str, type[Condition]] = {"neumann": Neumann, "dirichlet": Dirichlet}
-"""The conditions that the weak pair has, too: the natural one, and the one that takes out rows and columns."""
-CONDITIONS: dict[str, Condition] = {name: kind() for name, kind in PAIRED.items()}
-"""The values of the option `condition`; None stands for no condition at all."""
+
+
+def condition_of(given: Any) -> Condition | None:
+    """The condition of a name, of plain types, or itself; None for none at all. InputError for anything else.
+
+    >>> condition_of({"robin": 2.0})
+    Robin(2.0)
+    """
+    if given is None or isinstance(given, Condition):
+        return given
+    if isinstance(given, str) and given in Condition.known:
+        kind = Condition.known[given]
+        if kind.__init__ is object.__init__:
+            return kind()
+    elif isinstance(given, Mapping) and kind_of(given) is not Condition:
+        return kind_of(given)(*given.values())  # pyright: ignore[reportCallIssue]
+    known = [
+        repr(kind.name) if kind.__init__ is object.__init__ else f"{kind.__name__}(…)"
+        for name, kind in Condition.known.items()
+        if name is not None
+    ]
+    raise InputError(f"condition: expected {', '.join(known)} or None, got {given!r}")
+
+
+def kind_of(plain: str | Mapping[str, Any] | None) -> type[Condition]:
+    """The class of a condition in plain types.
+
+    >>> kind_of("dirichlet").fixes
+    True
+    """
+    name = next(iter(plain), "") if isinstance(plain, Mapping) else plain
+    if name not in Condition.known:
+        raise InputError(f"condition: {name!r} is none; a class of yours has to be imported first")
+    return Condition.known[name]

@@ -185,7 +185,7 @@ class Shape(Placed):
     @property
     def held(self) -> Bool[Tensor, " N"] | None:
         """Points whose values are zero by the condition; None if there are none."""
-        return None if self.boundary is None or self.condition.conserves else self.boundary.mask
+        return self.boundary.mask if self.boundary is not None and self.condition.fixes else None
 
 
 def cloud_shape(

@@ -1,0 +1,57 @@
+"""What a condition κ∂_ν f + a f = 0 adds to the stiffness, as a matrix of its own beside K, M and B."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from torchlb.galerkin.pair import SMALLEST, SparsePair, WeakPair
+
+
+def absorbing(pair: WeakPair, a: Float[Tensor, " N"], rim: Bool[Tensor, " N"]) -> WeakPair:
+    """The pair with R_ij = B_ij √(a_i a_j), a ≥ 0 at the vertices of the boundary `rim`; itself where R = 0.
+
+    R is positive semidefinite whatever a is, aB for one a, and of the order of B where a is smooth and positive. The
+    linear pair has it of B lumped to its row sums, at least a tenth of the absolute ones.
+    """
+    whole, near = pair.matrices, pair.linear
+    if len(whole.values) < 3 or not (a[rim] > 0).any():
+        return pair
+    row, boundary = _rows(whole), whole.values[2]
+    sums, sizes = (torch.zeros_like(a).index_add(0, row, b) for b in (boundary, boundary.abs()))
+    a = torch.where(rim, a, 0.0)
+    if bool((sizes[~rim] > 0).any()):
+        a = _continued(a, rim, near or whole)
+    values = [*whole.values, boundary * (a[row] * a[whole.col]).sqrt()]
+    if near is not None:
+        row = _rows(near)
+        lumped = torch.where(row == near.col, sums.maximum(SMALLEST * sizes)[row], 0.0)
+        near = replace(near, values=torch.stack([*near.values, lumped, lumped * a[row]]))
+    return replace(pair, matrices=replace(whole, values=torch.stack(values)), linear=near)
+
+
+def _continued(
+    a: Float[Tensor, " N"], rim: Bool[Tensor, " N"], pair: SparsePair
+) -> Float[Tensor, " N"]:
+    """Inside, where fits along the boundary of a solid and coarse triangles reach: means over neighbours, ring by ring.
+
+    What they are of another continuation changes eigenvalues of a cube of 2,000 points by 5e-6.
+    """
+    row, known = _rows(pair), rim
+    while True:
+        near = known[pair.col]
+        count, total = (
+            torch.zeros_like(a).index_add(0, row[near], x[pair.col[near]])
+            for x in (torch.ones_like(a), a)
+        )
+        new = ~known & (count > 0)
+        if not new.any():
+            return a
+        a, known = torch.where(new, total / count, a), known | new
+
+
+def _rows(matrices: SparsePair) -> Tensor:
+    return torch.arange(len(matrices.crow) - 1).repeat_interleave(matrices.crow.diff())
