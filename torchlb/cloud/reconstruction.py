@@ -12,12 +12,8 @@ from torchlb.cloud.complexes import Complex
 from torchlb.cloud.curve import cloud_curve
 from torchlb.cloud.solid import cloud_solid
 from torchlb.cloud.surface import check_spread, cloud_surface
+from torchlb.cloud.tangential import cloud_stars
 from torchlb.errors import InputError, first_few
-
-
-def has_complex(dim: int, ambient: int) -> bool:
-    """Whether clouds of this dimension have one: curves in any Rⁿ, surfaces in R² and R³, solids in R³."""
-    return dim == 1 or (dim == 2 and ambient in (2, 3)) or dim == ambient == 3
 
 
 def reconstruct(
@@ -26,7 +22,8 @@ def reconstruct(
     """Cells through a cloud of points: what `LaplaceBeltrami.from_points` builds on.
 
     Curves become chains of segments (Dey and Kumar 1999), solids Delaunay tetrahedra without those outside (an alpha
-    shape), surfaces triangles by the cocone and the poles of Amenta and Bern (`method.md`, section 12).
+    shape), surfaces in R² and R³ triangles by the cocone and the poles of Amenta and Bern (`method.md`, section 12). Of
+    other shapes every point has the star of its tangent plane (Boissonnat and Ghosh 2014).
 
     Parameters
     ----------
@@ -63,16 +60,17 @@ def reconstruct(
         raise InputError(f"points: {len(bad)} are NaN or infinite ({first_few(bad)})")
     count, ambient = space.shape
     dim = max(ambient - 1, 1) if dim is None else dim
-    if not has_complex(dim, ambient) or count < dim + 1:
+    if not 1 <= dim <= min(3, ambient) or count < dim + 1:
         raise InputError(
-            "dim: clouds of curves, of surfaces in R² and R³, and of solids in R³ have a complex, not "
-            f"{count} points of dimension {dim} in R^{ambient}; LaplaceBeltrami.from_points takes others, too"
+            f"dim: clouds of dimension 1, 2 and 3 have a complex, not {count} points of dimension {dim} in R^{ambient}"
         )
     given = None if normals is None else torch.as_tensor(normals).to("cpu", torch.float64)
     mask = None if boundary is None else torch.as_tensor(boundary).to("cpu")
     if dim == 1:
         return cloud_curve(space, normals=given, boundary=mask)
-    if dim == 3:
+    if dim == ambient == 3:
         return cloud_solid(space)
+    if dim == 3 or ambient > 3:
+        return cloud_stars(space, dim)
     check_spread(space)
     return cloud_surface(pad(space, (0, 3 - ambient)), normals=given, boundary=mask)

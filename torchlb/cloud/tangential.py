@@ -14,15 +14,22 @@ from collections.abc import Iterable
 from itertools import permutations
 
 import numpy as np
+import torch
 from jaxtyping import Float, Int
 from scipy.spatial import Delaunay, QhullError
 from torch import Tensor
 
+from torchlb.cloud.complexes import Complex
+from torchlb.cloud.frames import cloud_frames
 from torchlb.cloud.manifold import boundary_loops
+from torchlb.errors import InputError, first_few
 from torchlb.geometry.admission import mutually_admissible, planes_of
 from torchlb.geometry.complex import Faces, edges_of
+from torchlb.geometry.neighbors import nearest_neighbors
 from torchlb.geometry.vectors import lengths
 
+CANDIDATES = {2: 24, 3: 64}
+"""Nearest points among which those of a star are, by dimension."""
 REACH, NEAR = 3.0, 6
 """Largest circumradius of a simplex of a star, over the distance of its point to the neighbour of this number."""
 OVERLAP = 0.05
@@ -31,6 +38,31 @@ LOOP = 12
 """Edges of the largest loop that is closed."""
 FLAT = 1e-6
 """Volume of a simplex over the product of its edges at a corner, below which it is none."""
+
+
+def cloud_stars(points: Float[Tensor, "N n"], dim: int) -> Complex:
+    """Cells through a cloud of dimension d ≥ 2 in Rⁿ, n > d: a surface of triangles, or all simplices of the stars.
+
+    Raises
+    ------
+    InputError
+        For points that are in no cell.
+    """
+    near = nearest_neighbors(points, min(CANDIDATES[dim], len(points)))
+    frames = cloud_frames(points, near, dim)
+    stars, places, shares = delaunay_stars(points, frames, near), points.numpy(), None
+    if dim == 2:
+        cells = glued(places, frames.numpy(), stars)
+    else:
+        cells, parts = shared(places, stars)
+        shares = torch.from_numpy(parts)
+    alone = np.setdiff1d(np.arange(len(places)), cells)
+    if len(alone):
+        raise InputError(
+            f"points: no cell of dimension {dim} reaches {len(alone)} of {len(places)} "
+            f"({first_few(torch.from_numpy(alone))}); leave them out, add points around them, or pass another `dim`"
+        )
+    return Complex(points=points, cells=torch.from_numpy(cells), shares=shares)
 
 
 def delaunay_stars(

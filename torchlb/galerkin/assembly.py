@@ -128,9 +128,10 @@ def linear_elements(
     num_points: int,
     conductivity: Float[Tensor, " T"] | None = None,
     *,
+    shares: Float[Tensor, " T"] | None = None,
     lumped: bool = False,
 ) -> sparse.csr_array:
-    """K + iM of linear elements on flat simplices with these edges; M lumped to equal shares of corners if asked."""
+    """K + iM of linear elements on flat simplices with these edges, or on shares of them; M lumped if asked."""
     shape, g = simplex(cells.shape[1] - 1, 1), flat_metric(lengths)
     points = len(shape.weights)
     kappa = None if conductivity is None else conductivity[:, None].expand(-1, points)
@@ -139,7 +140,7 @@ def linear_elements(
         corners = cells.shape[1]
         blocks.imag.zero_()
         blocks.imag[:, :: corners + 1] = (area_element(g) * shape.weights.sum() / corners)[:, None]
-    return summed(blocks, cells, num_points)
+    return summed(blocks if shares is None else shares[:, None] * blocks, cells, num_points)
 
 
 def summed(

@@ -77,6 +77,8 @@ class Forms:
         (T, Q, S), at its Gauss points.
     element
         Its shape functions there.
+    shares
+        (T,), which part of each counts; None where all of them do.
     flats
         Simplices beside these, with linear elements.
     """
@@ -89,6 +91,7 @@ class Forms:
     nodes: Int[Tensor, "T n"]
     metric: Float[Tensor, "T Q S"]
     element: Element
+    shares: Float[Tensor, " T"] | None
     flats: list[FlatCells]
 
     @classmethod
@@ -99,8 +102,9 @@ class Forms:
         plan: CurvingPlan,
         mesh: CurvedMesh,
         stars: Int[Tensor, "S corners"],
+        shares: Float[Tensor, " F"] | None,
     ) -> Forms:
-        """Those of curved cells, of the cover that stands for coarse triangles, and of local stars.
+        """Those of curved cells, or shares of them, of the cover that stands for coarse triangles, and of local stars.
 
         A star's simplex is in those of all its corners, each of which has an equal share of it.
         """
@@ -115,7 +119,8 @@ class Forms:
         p = prolongation(fit_plan, fits, plan, mesh)
         cells, faces = (nodes.cells[own], mesh.lengths[own]), own.nonzero()[:, 0]
         curved = p, nodes.elements[own], mesh.metric[own], simplex(nodes.dim, nodes.degree)
-        return cls(*cells, faces, len(own), *curved, flats)
+        shares = None if shares is None else shares[own]
+        return cls(*cells, faces, len(own), *curved, shares, flats)
 
     @classmethod
     def linear(cls, points: Float[Tensor, "N n"], faces: Int[Tensor, "F corners"]) -> Forms:
@@ -124,7 +129,7 @@ class Forms:
         metric = flat_metric(lengths)[:, None].expand(-1, len(element.weights), -1)
         same: Any = sparse.eye_array(len(points), format="csr")
         every = torch.arange(len(faces))
-        return cls(faces, lengths, every, len(faces), same, faces, metric, element, [])
+        return cls(faces, lengths, every, len(faces), same, faces, metric, element, None, [])
 
     def restored(self, numbering: Numbering, order: Int[Tensor, " G"], num_faces: int) -> Forms:
         """With the user's numbers of the points and of so many faces, `order` those of the faces here."""
@@ -170,6 +175,7 @@ class Forms:
     def elements(self, conductivity: Float[Tensor, "T Q"] | None = None) -> sparse.csr_array:
         """K_FE + iM_FE of the curved elements, (N + X, N + X)."""
         blocks = element_matrices(self.metric, self.element, conductivity)
+        blocks = blocks if self.shares is None else self.shares[:, None] * blocks
         return summed(blocks, self.nodes, self.prolongation.shape[0])
 
     def near(self, conductivities: list[Tensor] | None = None) -> sparse.csr_array:
@@ -178,7 +184,8 @@ class Forms:
         if conductivities is not None:
             means = conductivities[0] @ self.element.weights / self.element.weights.sum()
         count = self.prolongation.shape[1]
-        return linear_elements(self.lengths, self.cells, count, means) + self.flat(conductivities)
+        own = linear_elements(self.lengths, self.cells, count, means, shares=self.shares)
+        return own + self.flat(conductivities)
 
     def flat(self, conductivities: list[Tensor] | None = None) -> sparse.csr_array:
         """K + iM of the flat cells."""
@@ -193,7 +200,8 @@ class Forms:
     def sensitivity(self, w: Float[Tensor, "N C"], u: Float[Tensor, "N C"]) -> list[Tensor]:
         """∂/∂κ of Σ_c w_cᵀK(κ)u_c, of the shapes of `conductivities`: weights times ∇w·∇u."""
         at_nodes = [torch.from_numpy(self.prolongation @ x.numpy()) for x in (w, u)]
-        found = [_slopes(self.metric, self.element, self.nodes, at_nodes)]
+        own = _slopes(self.metric, self.element, self.nodes, at_nodes)
+        found = [own if self.shares is None else self.shares[:, None] * own]
         for flat in self.flats:
             shape = simplex(self.element.dim, 1)
             metric = flat_metric(flat.lengths)[:, None].expand(-1, len(shape.weights), -1)

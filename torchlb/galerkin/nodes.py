@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -109,8 +109,10 @@ class Nodes:
         return cell, self.elements[cell].gather(1, local)
 
 
-def lagrange_nodes(cells: Int[Tensor, "F corners"], num_points: int, degree: int) -> Nodes:
-    """The nodes of degree r on a complex of any topology.
+def lagrange_nodes(
+    cells: Int[Tensor, "F corners"], num_points: int, degree: int, *, closed: bool = False
+) -> Nodes:
+    """The nodes of degree r on a complex of any topology; without a boundary if it is `closed`.
 
     >>> lagrange_nodes(torch.tensor([[0, 1, 2], [1, 3, 2]]), 4, 2).elements.tolist()
     [[0, 1, 2, 4, 6, 5], [1, 2, 3, 6, 8, 7]]
@@ -131,6 +133,8 @@ def lagrange_nodes(cells: Int[Tensor, "F corners"], num_points: int, degree: int
         share = torch.nn.functional.pad(inner(size, degree), (0, corners_of_cell - size))
         shares.append(share.repeat(len(side.uses), 1))
         count += len(side.uses) * side.nodes
+    if closed:
+        sides[dim] = replace(sides[dim], uses=sides[dim].uses.clamp_min(2))
     return Nodes(
         degree,
         faces,

@@ -91,6 +91,8 @@ class PairPlan:
         Of functions and of the surface at the vertices; of the cells.
     stars
         (S, d + 1), simplices of local stars, of which an equal share counts.
+    shares
+        (F,), which part of each cell counts; None where all of them do.
     lowered
         (L,), nodes beyond the vertices whose rows of P are linear where the mass of the vertices is found.
     """
@@ -98,12 +100,14 @@ class PairPlan:
     fits: FitPlan
     curving: CurvingPlan
     stars: Int[Tensor, "S corners"]
+    shares: Float[Tensor, " F"] | None
     lowered: Int[Tensor, " L"]
 
     def forms(self, points: Float[Tensor, "N n"], fits: LocalFits) -> tuple[Forms, CurvedMesh]:
         """The elements at these points, from the fits there, and where their nodes stand."""
         mesh = self.curving.at(points, self.fits, fits)
-        return Forms.curved(self.fits, fits, self.curving, mesh, self.stars), mesh
+        rest = self.stars, self.shares
+        return Forms.curved(self.fits, fits, self.curving, mesh, *rest), mesh
 
     def at(self, points: Float[Tensor, "N n"], fits: LocalFits) -> WeakPair:
         """The pair at these points, from the fits there."""
@@ -129,18 +133,20 @@ def mesh_pair(
     degrees: tuple[int, ...],
     stars: Int[Tensor, "S corners"] | None = None,
     held: Bool[Tensor, " N"] | None = None,
+    shares: Float[Tensor, " F"] | None = None,
 ) -> tuple[PairPlan, WeakPair]:
     """The pair of a mesh of d-simplices, from the fits of its vertices, with elements of degree r ≥ 2.
 
     Symmetric, K1 = 0, K ≥ 0, M > 0 whatever the fits are: rows of P sum to one, and it has full column rank. `degrees`
-    are those of the fits of functions, best first; `held` marks where a Dirichlet condition holds.
+    are those of the fits of functions, best first; `held` marks where a Dirichlet condition holds. Cells of which only
+    `shares` count may overlap, and have no boundary.
     """
-    nodes = lagrange_nodes(cells, len(points), degree)
+    nodes = lagrange_nodes(cells, len(points), degree, closed=shares is not None)
     boundary = boundary_nodes(points, nodes, degrees, held)
     curving, mesh = curve(points, fit_plan, fits, nodes, boundary, held)
     stars = cells[:0] if stars is None else stars
-    plan = PairPlan(fit_plan, curving, stars, torch.zeros(0, dtype=torch.int64))
-    forms = Forms.curved(fit_plan, fits, curving, mesh, stars)
+    plan = PairPlan(fit_plan, curving, stars, shares, torch.zeros(0, dtype=torch.int64))
+    forms = Forms.curved(fit_plan, fits, curving, mesh, stars, shares)
     pair, lowered = assembled_pair(plan, forms, mesh, points)
     return replace(plan, lowered=lowered), pair
 

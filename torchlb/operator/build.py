@@ -115,8 +115,12 @@ def on_cells(
     boundary: Bool[Tensor, " N"] | str | None,
     source: str,
     progress: bool,
+    shares: Float[Tensor, " F"] | None = None,
 ) -> AssembledOperator:
-    """Operator of `given` points on a complex that reaches all vertices, which stand where it is."""
+    """Operator of `given` points on a complex that reaches all vertices, which stand where it is.
+
+    Where cells overlap, `shares` says which part of each counts.
+    """
     options = options.settled(cells=True)
     degree, degrees = options.elements
     numbering, here, corners, order = numbered_mesh(vertices, cells, flip=degree > 0)
@@ -130,13 +134,16 @@ def on_cells(
             condition=options.held(numbering),
             fit_degrees=degrees,
             progress=progress,
+            shares=None if shares is None else shares[order],
+            on_mesh=source == "mesh",
         )
         pair = plan = None
         if degree > 0:
             assert shape.plan is not None
             assert shape.fits is not None
             own = shape.plan.fits, shape.fits, degree, degrees
-            plan, pair = mesh_pair(here, corners, *own, held=shape.held)
+            rest = {"held": shape.held, "shares": shape.plan.shares}
+            plan, pair = mesh_pair(here, corners, *own, **rest)
             assert pair.mass is not None
             shape = replace(shape, areas=pair.mass)
         built = replace(finished(shape, source, options, progress, pair, plan), faces=cells)

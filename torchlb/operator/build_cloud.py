@@ -20,9 +20,9 @@ from torchlb.cloud.doubts import (
     warn_of_layers,
     warn_of_near_duplicates,
 )
-from torchlb.cloud.reconstruction import has_complex, reconstruct
+from torchlb.cloud.reconstruction import reconstruct
 from torchlb.cloud.surface import CloudSurface
-from torchlb.errors import InputError, renumbered, warn
+from torchlb.errors import InputError, renumbered
 from torchlb.galerkin.flips import flipped
 from torchlb.galerkin.pair import mesh_pair
 from torchlb.geometry.numbering import Numbering
@@ -42,7 +42,7 @@ from torchlb.operator.inputs import ArrayLike, check_points
 from torchlb.operator.options import Options
 from torchlb.operator.storage import OperatorStorage
 from torchlb.stencils.conditions import condition_of
-from torchlb.stencils.shape import cloud_shape, surface_shape
+from torchlb.stencils.shape import surface_shape
 
 Reconstruction = Callable[[Tensor], ArrayLike | Complex]
 """From points, (N, n) float64, to cells through them."""
@@ -85,22 +85,19 @@ def build_cloud(
     mask = numbering.sorted(where) if isinstance(where, Tensor) else None
     normals = None if normals is None else numbering.sorted(normals)
     with renumbered(numbering.given), threads_for(len(points)):
-        if found is None and has_complex(d, ambient):
+        if found is None:
             found = reconstruct(here, d, normals=normals, boundary=mask)
-        if found is not None and mask is not None:
+        if mask is not None and found.shares is None:
             warn_of_buried(found.cells, mask)
-        if found is None or isinstance(found, CloudSurface):
-            if found is None:
-                edge = where if mask is None else mask
-                built = _on_points(here, d, options, normals, edge, numbering, progress)
-            else:
-                built = _on_surface(here, found, options, mask, numbering, progress)
+        if isinstance(found, CloudSurface):
+            built = _on_surface(here, found, options, mask, numbering, progress)
             return built.restored(numbering, points, built.faces)
     cells, edge = numbering.given[found.cells], None
     if isinstance(where, Tensor):
-        edge = where & on_rim(cells, len(points))
+        edge = where if found.shares is not None else where & on_rim(cells, len(points))
     places = numbering.restored(found.points)
-    return on_cells(points, places, cells, options, edge, "points", progress)
+    rest = options, edge, "points", progress
+    return on_cells(points, places, cells, *rest, shares=found.shares)
 
 
 def _given_complex(
@@ -109,6 +106,8 @@ def _given_complex(
     """What a user's function makes of the points."""
     found = reconstruction(points.clone())
     if isinstance(found, CloudSurface):
+        return found
+    if isinstance(found, Complex) and found.shares is not None:
         return found
     places, cells = (found.points, found.cells) if isinstance(found, Complex) else (points, found)
     places = check_points(places)
@@ -119,35 +118,6 @@ def _given_complex(
             f"shape {tuple(cells.shape)} through {tuple(places.shape)}"
         )
     return Complex(points=places, cells=cells)
-
-
-def _on_points(
-    points: Float[Tensor, "N n"],
-    dim: int,
-    options: Options,
-    normals: Float[Tensor, "N n"] | None,
-    boundary: Bool[Tensor, " N"] | str | None,
-    numbering: Numbering,
-    progress: bool,
-) -> AssembledOperator:
-    """Operator on a cloud that no complex goes through, by stencils alone."""
-    if dim == points.shape[1] and boundary is None:
-        warn(
-            f"boundary: a shape of {dim} dimensions in R^{dim} ends somewhere, and without the mask of its boundary "
-            "points areas and Δ are wrong there; pass boundary=mask"
-        )
-    options = options.settled(cells=False)
-    shape = cloud_shape(
-        points,
-        dim,
-        options.q,
-        num_neighbors=options.num_neighbors,
-        normals=normals,
-        boundary=boundary,
-        condition=options.held(numbering),
-        progress=progress,
-    )
-    return finished(shape, "points", options, progress)
 
 
 def _on_surface(
@@ -198,7 +168,7 @@ def built_again(lb: OperatorStorage) -> AssembledOperator:
     """The operator of a mesh or a cloud, from what is stored of it."""
     points, options = lb.points.detach().cpu().double(), Options(**lb.options)
     boundary, cells = None if lb.boundary is None else lb.boundary.cpu(), lb.faces.cpu()
-    if lb.surface is None:
+    if lb.surface is None and (lb.source == "mesh" or lb.dim < 3 or lb.points.shape[1] == 3):
         return on_cells(points, points, cells, options, boundary, lb.source, progress=False)
     given: Any = {"normals": lb.normals.cpu() if len(lb.normals) else None, "boundary": boundary}
     return build_cloud(points, lb.dim, options, **given, reconstruction=None, progress=False)

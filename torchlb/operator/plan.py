@@ -93,7 +93,7 @@ def evaluate(plan: Plan, points: Float[Tensor, "N n"]) -> AssembledOperator:
             normal_order=plan.shape.fits.order,
             balls=None,
             areas=pair.mass,
-            low_order=MeshLowOrder(here, plan.shape.cells, plan.flips),
+            low_order=MeshLowOrder(here, plan.shape.cells, plan.flips, plan.shape.shares),
             condition=options.held(plan.numbering) or Condition(),
             on_mesh=plan.on_mesh,
         )

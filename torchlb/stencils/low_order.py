@@ -9,19 +9,15 @@ from __future__ import annotations
 from functools import cached_property
 from math import factorial
 
-import numpy as np
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 from scipy import sparse
 from torch import Tensor
 
-from torchlb.cloud.voronoi import cell_laplacian, cell_volume, rows_at_once, unrolled
 from torchlb.errors import first_few, warn
 from torchlb.galerkin.assembly import linear_elements
 from torchlb.galerkin.delaunay import delaunay_cover, sound_lengths
 from torchlb.galerkin.nodes import lagrange_nodes
-from torchlb.geometry.boundary import Boundary
-from torchlb.geometry.neighbors import GraphBalls, nearest_neighbors
 from torchlb.linalg.sparse import with_diagonal
 
 LEAST_AREA = 1e-12
@@ -29,7 +25,9 @@ LEAST_AREA = 1e-12
 
 
 def simplex_shares(
-    vertices: Float[Tensor, "N n"], faces: Int[Tensor, "F v"]
+    vertices: Float[Tensor, "N n"],
+    faces: Int[Tensor, "F v"],
+    shares: Float[Tensor, " F"] | None = None,
 ) -> Float[Tensor, " N"]:
     """Of each vertex an equal share of the length, area or volume of its simplices, ℓ^d: half, a third, a quarter.
 
@@ -40,6 +38,7 @@ def simplex_shares(
     edges = vertices[faces[:, 1:]] - vertices[faces[:, :1]]
     upper = torch.linalg.qr(edges.mT).R
     volume = torch.diagonal(upper, dim1=-2, dim2=-1).prod(-1).abs() / factorial(dim)
+    volume = volume if shares is None else shares * volume
     share = (volume / (dim + 1)).repeat_interleave(dim + 1)
     return torch.zeros_like(vertices[:, 0]).index_add_(0, faces.reshape(-1), share)
 
@@ -56,6 +55,8 @@ class MeshLowOrder:
         (N, n), ℓ; (F, d + 1).
     flips
         Those that lead to the triangulation, `flips` of the same shape before it moved; None to look for them.
+    shares
+        (F,), which part of each cell counts; None where all of them do.
     """
 
     def __init__(
@@ -63,8 +64,9 @@ class MeshLowOrder:
         points: Float[Tensor, "N n"],
         cells: Int[Tensor, "F corners"],
         flips: list[Tensor] | None = None,
+        shares: Float[Tensor, " F"] | None = None,
     ) -> None:
-        self.points, self.cells, self._flips = points, cells, flips
+        self.points, self.cells, self._flips, self.shares = points, cells, flips, shares
 
     @property
     def flips(self) -> list[Tensor]:
@@ -74,18 +76,19 @@ class MeshLowOrder:
     @cached_property
     def _elements(self) -> tuple[sparse.csr_array, Float[Tensor, " N"], list[Tensor]]:
         """Stiffness, lumped mass, and flips."""
-        nodes, flips, share = lagrange_nodes(self.cells, len(self.points), 1), [], 1.0
+        nodes, flips, share = lagrange_nodes(self.cells, len(self.points), 1), [], self.shares
         cells, lengths = nodes.cells, sound_lengths(nodes.lengths(self.points), nodes.cells)
         if nodes.dim == 2:
             free = torch.zeros(len(nodes.edges), dtype=torch.bool)
             cover = delaunay_cover(cells, lengths, nodes.edge, free, self._flips)
-            cells, lengths, flips, share = cover.faces, cover.lengths, cover.flips, 0.5
-        pair = share * linear_elements(lengths, cells, len(self.points))
+            cells, lengths, flips = cover.faces, cover.lengths, cover.flips
+            share = torch.full((len(cells),), 0.5).to(lengths)
+        pair = linear_elements(lengths, cells, len(self.points), shares=share)
         return pair.real, torch.from_numpy(pair.imag.sum(axis=1)), flips
 
     def areas(self) -> Float[Tensor, " N"]:
         """Equal shares of the cells around each vertex, ℓ^d; the triangulation's where some have next to none."""
-        shares = simplex_shares(self.points, self.cells)
+        shares = simplex_shares(self.points, self.cells, self.shares)
         longest = torch.zeros_like(shares)
         square = (
             lagrange_nodes(self.cells, len(self.points), 1).lengths(self.points).amax(1).square()
@@ -116,89 +119,3 @@ class MeshLowOrder:
     def _matrix(self) -> sparse.csr_array:
         strong = -sparse.diags_array(1 / self._masses.numpy()) @ self._elements[0]
         return with_diagonal(sparse.csr_array(strong))
-
-
-class CloudLowOrder:
-    """Finite-volume rows and cell volumes of a cloud in any dimension.
-
-    Parameters
-    ----------
-    balls : admissible neighbourhoods.
-    boundary : where cells end.
-    """
-
-    def __init__(self, balls: GraphBalls, boundary: Boundary | None) -> None:
-        self.balls, self.boundary = balls, boundary
-        dim = balls.frames.shape[-1]
-        self.size = min(6 * 2**dim + 1, len(balls.points))
-        self.few = min(4 * dim + 1, len(balls.points))
-        self.at_once = rows_at_once(self.size, dim)
-
-    def areas(self) -> Float[Tensor, " N"]:
-        """Volumes of the Voronoi cells, ℓ^d: second order in the spacing."""
-        return self._volumes
-
-    @cached_property
-    def _volumes(self) -> Float[Tensor, " N"]:
-        volumes = []
-        for centers in torch.arange(len(self.balls.points)).split(self.at_once):
-            _, coords, valid = self._cells(centers)
-            outward = torch.zeros_like(coords[:, 0])
-            if self.boundary is not None:
-                conormals = self.boundary.conormals[centers, None]
-                outward = (conormals @ self.balls.frames[centers])[:, 0]
-            volumes.append(cell_volume(coords, valid, outward))
-        return torch.cat(volumes)
-
-    def rows(self, centers: Int[Tensor, " B"]) -> sparse.csr_array:
-        """Rows (B, N) of Δ, 1/ℓ²."""
-        return sparse.csr_array(self._matrix[centers.numpy()])
-
-    @cached_property
-    def _matrix(self) -> sparse.csr_array:
-        """W/m less its sums, with m the volumes and W the mean of what both ends make of the flux.
-
-        So these rows alone are an M-matrix, symmetric in m. A flux that one end alone knows is its own.
-        """
-        chunks = torch.arange(len(self._volumes)).split(self.at_once)
-        rows = sparse.vstack([self._one_sided(chunk) for chunk in chunks], format="csr")
-        volumes = self._volumes.numpy()
-        flux = sparse.csr_array(sparse.diags_array(volumes) @ rows)
-        flux = sparse.csr_array(flux - sparse.diags_array(flux.diagonal()))
-        flux.eliminate_zeros()
-        ends = flux.astype(bool).astype(float)
-        flux = (flux + flux.T).multiply((ends + ends.T).power(-1))
-        flux = flux - sparse.diags_array(flux.sum(axis=1))
-        return sparse.csr_array(sparse.diags_array(1 / volumes) @ flux)
-
-    def _one_sided(self, centers: Int[Tensor, " B"]) -> sparse.csr_array:
-        """Rows as each point by itself would have them."""
-        index, coords, valid = self._cells(centers)
-        flux = cell_laplacian(coords, valid, self._volumes[centers])
-        weights = torch.cat([-flux.sum(1, keepdim=True), flux], dim=1)
-        row = np.arange(len(centers)).repeat(index.shape[1])
-        shape = (len(centers), len(self.balls.points))
-        cells = sparse.csr_array((weights.flatten(), (row, index.flatten())), shape=shape)
-        cells.sum_duplicates()
-        return cells
-
-    def _cells(
-        self, centers: Int[Tensor, " B"]
-    ) -> tuple[Int[Tensor, "B K"], Float[Tensor, "B neighbors d"], Bool[Tensor, "B neighbors"]]:
-        """Neighbours, their coordinates, and which are real.
-
-        A point with hardly an admissible neighbour takes the few nearest points, whatever they are.
-        """
-        points, frames = self.balls.points, self.balls.frames
-        index, count = self.balls(centers, self.size)
-        alone = count <= 2 * frames.shape[-1]
-        if alone.any():
-            index[alone, : self.few] = self._nearest[centers[alone]]
-            count[alone] = self.few
-        offset = points[index[:, 1:]] - points[centers, None]
-        valid = torch.arange(1, self.size) < count[:, None]
-        return index, unrolled(offset, frames[centers]), valid
-
-    @cached_property
-    def _nearest(self) -> Int[Tensor, "N K"]:
-        return nearest_neighbors(self.balls.points, self.few)

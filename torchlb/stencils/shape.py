@@ -12,12 +12,9 @@ from torch import Tensor
 from torch.nn.functional import normalize
 from tqdm import tqdm
 
-from torchlb.cloud.boundary import boundary_of_cloud, detect_boundary
-from torchlb.cloud.frames import cloud_frames
-from torchlb.cloud.orientation import orient_normals, settled_normals
+from torchlb.cloud.boundary import boundary_of_cloud
 from torchlb.cloud.surface import CloudSurface
-from torchlb.cloud.voronoi import nearest_graph
-from torchlb.errors import InputError, first_few, warn
+from torchlb.errors import InputError, first_few
 from torchlb.geometry.admission import thin_sides
 from torchlb.geometry.boundary import Boundary, BoundaryPlan, boundary_of_mesh
 from torchlb.geometry.complex import consistently_wound
@@ -32,12 +29,11 @@ from torchlb.geometry.local_fits import FitPlan, LocalFits
 from torchlb.geometry.neighbors import AT_ONCE, GraphBalls, mesh_graph, nearest_neighbors
 from torchlb.geometry.vectors import dot
 from torchlb.stencils.conditions import Condition, Neumann
-from torchlb.stencils.low_order import CloudLowOrder, MeshLowOrder
+from torchlb.stencils.low_order import MeshLowOrder
 
-LowOrder = CloudLowOrder | MeshLowOrder
 NEUMANN = Neumann()
-CANDIDATES = {1: 32, 2: 24, 3: 64}
-"""Nearest points from which the frames and the graph of a cloud start, by dimension."""
+NEAREST = 24
+"""Nearest points among which those on the other side of a thin shape are."""
 
 
 class FirstNormals(NamedTuple):
@@ -98,6 +94,8 @@ class ShapePlan:
     ----------
     cells
         (F, d + 1), whose planes the frames start from.
+    shares
+        (F,), which part of each counts; None where all of them do.
     fits
         Of heights, and of functions where there is to be a weak pair.
     start
@@ -109,6 +107,7 @@ class ShapePlan:
     """
 
     cells: Int[Tensor, "F corners"]
+    shares: Float[Tensor, " F"] | None
     fits: FitPlan
     start: FirstNormals | None
     side: Int[Tensor, " N"] | None
@@ -176,7 +175,7 @@ class Shape(Placed):
     normal_order: Int[Tensor, " N"]
     balls: GraphBalls | None
     areas: Float[Tensor, " N"]
-    low_order: LowOrder | None
+    low_order: MeshLowOrder | None
     condition: Condition
     on_mesh: bool = False
     plan: ShapePlan | None = None
@@ -186,66 +185,6 @@ class Shape(Placed):
     def held(self) -> Bool[Tensor, " N"] | None:
         """Points whose values are zero by the condition; None if there are none."""
         return self.boundary.mask if self.boundary is not None and self.condition.fixes else None
-
-
-def cloud_shape(
-    points: Float[Tensor, "N n"],
-    dim: int,
-    normal_order: int,
-    *,
-    num_neighbors: int | None = None,
-    normals: Float[Tensor, "N n"] | None = None,
-    boundary: Bool[Tensor, " N"] | str | None = None,
-    condition: Condition | None = NEUMANN,
-    progress: bool = True,
-) -> Shape:
-    """A point cloud: graph and frames from the nearest neighbours.
-
-    `boundary` is the mask of its boundary points, or "detect"; `condition` what holds there, None if nothing does.
-    """
-    candidates = nearest_neighbors(points, min(CANDIDATES.get(dim, 128), len(points)))
-    sides, oriented = None, False
-    if normals is None:
-        initial = cloud_frames(points, candidates, dim)
-    else:
-        normals, oriented = settled_normals(points, normals, candidates)
-        initial = complete_frames(normals)
-    graph = nearest_graph(points, initial, candidates)
-    if dim == points.shape[1] - 1:
-        outward = orient_normals(points, normals_of_frames(initial), candidates)
-        normals = normals if oriented else outward
-        sides = thin_sides(points, outward, candidates)
-    balls = GraphBalls(points, graph, initial, sides)
-    plan, fits = _searched(balls, normal_order, num_neighbors, progress)
-    mask = detect_boundary(points, fits.frames, balls) if isinstance(boundary, str) else boundary
-    if mask is None and dim == 2:
-        _warn_of_open_surface(detect_boundary(points, fits.frames, balls))
-    edge = None
-    if mask is not None and condition is not None:
-        edge = boundary_of_cloud(points, mask, dim, normal_order)
-    frames, normals = _righthanded(fits.frames, normals)
-    edge = None if edge is None else edge.at(points, frames)
-    placed = Placed(points, frames, normals, edge)
-    balls = balls.with_frames(frames, _follow(balls.sides, frames))
-    low_order = CloudLowOrder(balls, edge)
-    own = Condition() if condition is None else condition
-    return Shape(
-        **vars(placed),
-        normal_order=plan.order,
-        balls=balls,
-        areas=low_order.areas(),
-        low_order=low_order,
-        condition=own,
-    )
-
-
-def _warn_of_open_surface(rim: Bool[Tensor, " N"]) -> None:
-    index = rim.nonzero()[:, 0]
-    if len(index) > len(rim) ** 0.5:
-        warn(
-            f"boundary: {len(index)} points ({first_few(index)}) look like those of an open surface's, and without a "
-            "condition areas and Δ are wrong there; pass boundary='detect', or a mask"
-        )
 
 
 def mesh_shape(
@@ -259,33 +198,40 @@ def mesh_shape(
     areas: Float[Tensor, " N"] | None = None,
     fit_degrees: tuple[int, ...] = (),
     progress: bool = True,
+    shares: Float[Tensor, " F"] | None = None,
+    on_mesh: bool = True,
 ) -> Shape:
     """A mesh of triangles (or of segments, or tetrahedra in Rⁿ): graph and frames from the faces.
 
     `condition` holds on its boundary, or on the part of it that is the mask `boundary`; None leaves it alone. With
-    `areas` given there are no low-order rows. `fit_degrees` asks for `fits` of the first of them that passes.
+    `areas` given there are no low-order rows. `fit_degrees` asks for `fits` of the first of them that passes. Where
+    faces overlap, `shares` says which part of each counts, and only `boundary` where the shape ends. Triangles that are not
+    given, but found through a cloud, are not `on_mesh`.
     """
     sides = None
     hypersurface = faces.shape[1] == vertices.shape[1] and faces.shape[1] < 4
     if hypersurface and areas is None and consistently_wound(faces):
-        candidates = nearest_neighbors(vertices, min(CANDIDATES[2], len(vertices)))
+        candidates = nearest_neighbors(vertices, min(NEAREST, len(vertices)))
         sides = thin_sides(vertices, vertex_normals(vertices, faces), candidates)
     balls = GraphBalls(
         vertices, mesh_graph(faces, len(vertices)), mesh_frames(vertices, faces), sides
     )
     plan, fits = _searched(balls, normal_order, num_neighbors, progress, fit_degrees)
     edge = None
-    if condition is not None or boundary is not None:
+    if shares is not None:
+        dim = faces.shape[1] - 1
+        if boundary is not None:
+            edge = boundary_of_cloud(vertices, boundary, dim, normal_order)
+    elif condition is not None or boundary is not None:
         edge = boundary_of_mesh(vertices, faces, normal_order)
-    if boundary is not None:
-        edge = _part(edge, boundary)
+        edge = edge if boundary is None else _part(edge, boundary)
     low_order = None
     if areas is None:
-        low_order = MeshLowOrder(vertices, faces)
+        low_order = MeshLowOrder(vertices, faces, shares=shares)
         areas = low_order.areas()
     side = torch.ones(len(vertices), dtype=torch.int8) if hypersurface else None
-    whole = ShapePlan(faces, plan, None, side, None if condition is None else edge)
-    on_mesh = faces.shape[1] == 3
+    whole = ShapePlan(faces, shares, plan, None, side, None if condition is None else edge)
+    on_mesh = on_mesh and faces.shape[1] == 3
     return _shape(whole, fits, balls, areas, low_order, condition, on_mesh)
 
 
@@ -331,7 +277,7 @@ def surface_shape(
         against = (own * vertex_normals(points, triangles)).sum(1) < 0
         side = torch.where(against, -1, 1).to(torch.int8)
     low_order = MeshLowOrder(points, triangles)
-    whole = ShapePlan(triangles, plan, start, side, edge)
+    whole = ShapePlan(triangles, None, plan, start, side, edge)
     return _shape(whole, fits, balls, low_order.areas(), low_order, condition)
 
 
@@ -340,7 +286,7 @@ def _shape(
     fits: LocalFits,
     balls: GraphBalls,
     areas: Float[Tensor, " N"],
-    low_order: LowOrder | None,
+    low_order: MeshLowOrder | None,
     condition: Condition | None,
     on_mesh: bool = False,
 ) -> Shape:
