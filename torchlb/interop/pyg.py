@@ -40,7 +40,6 @@ from torchlb.spectral.eigenbasis import Eigenbasis, stack_eigenbases
 
 __all__ = ["LaplaceBeltramiTransform", "to_operator"]
 
-KINDS = (lambda k: [], lambda k: [(2, k), (3, k, k)], lambda k: [(k,)])
 """Shapes of what an eigenbasis has beside its pairs: nothing; the flow on its invariant span; errors of a pair's."""
 
 
@@ -67,8 +66,8 @@ class LaplaceBeltramiTransform(BaseTransform):
     lb_basis           (…,)         with k > 0: all parts of the eigenbasis in one vector, for `to_operator`
     lb_nodes           (N,)         lb_first and the numbers after it: nodes that are permuted take theirs along
     lb_first           (1,)         checksum of the positions
-    lb_basis_size      (1, 2)       number of eigenpairs, and their `KINDS`
-    lb_info            str          source, options, certificate, bounds as JSON
+    lb_basis_size      (1,)         number of eigenpairs
+    lb_info            str          source, options, certificate, radius as JSON
     =================  ===========  ============================================================================
 
     Every key has a last or first axis that concatenates, and those whose names contain "index" are shifted by the
@@ -177,9 +176,7 @@ def _keys(lb: LaplaceBeltrami, k: int) -> dict[str, Any]:
         basis = lb.invariant_basis(k)
         parts = [getattr(basis, name) for name in BASIS]
         keys["lb_basis"] = torch.cat([part.flatten() for part in parts if part is not None])
-        kind = 2 if basis.is_symmetric else int(basis.is_invariant)
-        size = [basis.eigenvectors.shape[1], kind]
-        keys["lb_basis_size"] = torch.tensor([size])
+        keys["lb_basis_size"] = torch.tensor([basis.eigenvectors.shape[1]])
     return keys
 
 
@@ -283,16 +280,12 @@ def _starts(index: Int[Tensor, " nnz"], size: int) -> Int[Tensor, " size_plus_1"
 def _bases(data: Any, sizes: list[int]) -> list[Eigenbasis]:
     """The eigenbasis of each shape out of the common vector."""
     shapes = []
-    for n, (k, kind) in zip(sizes, data.lb_basis_size.tolist(), strict=True):
-        parts = [(k,), (n, k), (n, k), *KINDS[kind](k)]
+    for n, k in zip(sizes, data.lb_basis_size.tolist(), strict=True):
+        parts = [(k,), (n, k), (n, k), (k,)]
         shapes.append([torch.Size(part) for part in parts])
     pieces = iter(data.lb_basis.split([part.numel() for parts in shapes for part in parts]))
     bases = []
     for parts, mass in zip(shapes, data.lb_mass.split(sizes), strict=True):
-        values, vectors, left, *rest = (next(pieces).view(part) for part in parts)
-        if len(rest) == 1:
-            more = {"is_symmetric": True, "relative_errors": rest[0]}
-        else:
-            more = dict(zip(("decay_rates", "modal_transform"), rest, strict=False))
-        bases.append(Eigenbasis(values, vectors, mass, left, **more))
+        values, vectors, left, errors = (next(pieces).view(part) for part in parts)
+        bases.append(Eigenbasis(values, vectors, mass, left, relative_errors=errors))
     return bases

@@ -1,46 +1,64 @@
-r"""e^{tL}x for many channels, each with its own time, in one differentiable operation (`method.md`, section 8).
+r"""e^{tL}x of a symmetric L ≤ 0 for many channels, each with its own time, in one differentiable operation.
 
-Two expansions e^{tL}x = Σ_k c_k(t) v_k, whose vectors v_k all channels and times share:
+The spectrum lies in [−R, 0]. Both expansions e^{tL}x = Σ_k c_k(t) v_k have vectors v_k that all channels and times
+share (`method.md`, section 8):
 
-- "chebyshev": v_k = r^{−k} T_k((L + a)/d) x, c_k = 2 r^k e^{−ta} I_k(td), for a spectrum in the ellipse around −a
-  with the half axes a and b, d² = a² − b², r = (a + b)/d. It touches 0, so that no c_k v_k is larger than x; b = 0 is
-  the interval. About √(4ta ln 1/ε) + tb products.
-- "contour": v_k = (z_k − L)⁻¹x on a hyperbola in the left half plane (Weideman, Trefethen 2007), by sparse LU on
-  the CPU; about 15 of them, for any spectrum in a sector around the negative axis and all times within a factor 10.
+- a Chebyshev series, v_k = T_k(1 + 2L/R) x and c_k = 2 e^{−tR/2} I_k(tR/2), about √(2tR ln 1/ε) products;
+- where that would be more than `PRODUCTS`, as slivers make the spectrum long, a Chebyshev series of Z = (1 − γL)⁻¹: in
+  z = 1/(1 + γλ), between 0 and 1, e^{−tλ} is smooth for all t between 5γ and 50γ, and takes about 20 solves.
 
-"either" is the first unless that takes more than `PRODUCTS` of them, where slivers make the spectrum long. In both
-p(0) = 1 is restored exactly, so that Σ π u is conserved to rounding. The derivatives come from the adjoint
-expansion w_k of the gradient g: Σ c_k w_k in x, and Σ c_k'(t) ⟨w_k, x⟩ in t.
+In both constants are kept exactly. The derivatives come from the expansion w_k of the gradient g: Σ c_k w_k in x, and
+Σ c_k'(t) ⟨w_k, x⟩ in t.
 """
 
 from __future__ import annotations
 
-import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from functools import lru_cache
 from itertools import accumulate
+from math import inf, log, sqrt
 from typing import Any
 
 import numpy as np
 import torch
 from jaxtyping import Float
 from scipy import sparse
+from scipy.fft import dct
 from scipy.special import ive
 from torch import Tensor
 
-from torchlb.errors import DiffusionError
-from torchlb.linalg.factor import factorized
-from torchlb.linalg.sparse import csr_product, multiply
+from torchlb.linalg.factor import Factor
+from torchlb.linalg.sparse import multiply
 
-MAX_TERMS = 30_000
 PRODUCTS = 5_000
-"""Beyond this many the sparse factors of the contour sum are quicker."""
-SECTOR = 0.4
-"""Half angle (radians) around the negative axis that the hyperbola stays clear of; the largest seen is 0.35."""
-WINDOW = 10.0
-"""Ratio of the times that share one hyperbola."""
+"""Beyond this many a few factors are quicker."""
+SHORTEST = 5.0
+"""t/γ of the shortest time that shares a pole γ, a power of ten; the longest is ten times longer."""
+POINTS = 256
+"""Of the interpolation that gives the coefficients of rational functions."""
+ROUNDS, FLOOR = 20, 1e-6
+"""Products with |K| towards its first eigenvector, which bring its bound to within 25 %; least share of an entry."""
 CACHED = 2**18
 """Values of a vector that stays in a processor's cache from product to product."""
 Term = tuple[tuple[slice, Any], Tensor, np.ndarray, np.ndarray]
+
+
+def spectral_radius(stiffness: sparse.csr_array, mass: Float[np.ndarray, " N"]) -> float:
+    """A bound of the eigenvalues of D⁻¹K, K positive semidefinite and D the diagonal mass, in 1/ℓ².
+
+    max_i (|K|x)_i / (Dx)_i for any x > 0: so say Collatz and Wielandt of |K|, whose spectral radius is not below K's.
+
+    >>> path = sparse.csr_array([[1.0, -1.0], [-1.0, 1.0]])
+    >>> spectral_radius(path, np.ones(2))
+    2.0
+    """
+    size, x, radius = abs(stiffness), np.ones(len(mass)), np.inf
+    for _ in range(ROUNDS):
+        y = size @ x / mass
+        radius = min(radius, float((y / x).max(initial=0.0)))
+        x = np.sqrt(x) * np.sqrt(y)  # the mean keeps it from turning in circles
+        x = np.maximum(x / (x.max(initial=0.0) or 1.0), FLOOR)
+    return radius
 
 
 def heat(
@@ -48,8 +66,7 @@ def heat(
     values: Float[Tensor, " nnz"],
     x: Float[Tensor, "N C"],
     time: Float[Tensor, " C"],
-    bounds: Float[Tensor, 2],
-    expansion: str,
+    radius: Float[Tensor, ""],
     tolerance: float,
     sizes: Sequence[int],
 ) -> Float[Tensor, "N C"]:
@@ -57,32 +74,34 @@ def heat(
 
     Parameters
     ----------
-    pattern : [crow, col, crow_t, col_t, order_t] of L and its transpose.
-    values : of L, 1/ℓ²; no gradient goes there.
-    time : t ≥ 0, ℓ².
-    bounds : (R, b), in float64 on the CPU: the spectrum lies in the ellipse of half axes R/2, b around −R/2; b is NaN
-        where no ellipse is known. A tensor, since numbers would be compiled anew for every operator.
-    expansion : "chebyshev", "contour" or "either".
-    tolerance : of the result, relative to x.
-    sizes : numbers of rows of the diagonal blocks of L; (N,) for one shape.
+    pattern
+        [crow, col] of L.
+    values
+        Of L, 1/ℓ²; no gradient goes there.
+    time
+        t ≥ 0, ℓ².
+    radius
+        R, in float64 on the CPU: a tensor, since a number would be compiled anew for every operator.
+    tolerance
+        Of the result, relative to x.
+    sizes
+        Numbers of rows of the diagonal blocks of L; (N,) for one shape.
     """
-    options = bounds, expansion, tolerance, list(sizes)
-    return _heat(list(pattern), values, x, time, *options, False)
+    return _heat(list(pattern), values, x, time, radius, tolerance, list(sizes))
 
 
 SCHEMA = (
-    "(Tensor[] pattern, Tensor values, Tensor x, Tensor time, Tensor bounds, str expansion, "
-    "float tolerance, SymInt[] sizes, bool transposed"
+    "(Tensor[] pattern, Tensor values, Tensor x, Tensor time, Tensor radius, float tolerance, "
+    "SymInt[] sizes"
 )
 
 
 @torch.library.custom_op("torchlb::heat", mutates_args=(), schema=SCHEMA + ") -> Tensor")
 def _heat(pattern: Any, values: Tensor, x: Tensor, time: Tensor, *options: Any) -> Tensor:
-    dtype, terms = _terms(pattern, values, x, time, *options)
-    y = torch.zeros_like(x, dtype=dtype, memory_format=torch.contiguous_format)
-    for where, vector, coefficient, _ in terms:
+    y = torch.zeros_like(x, memory_format=torch.contiguous_format)
+    for where, vector, coefficient, _ in _terms(pattern, values, x, time, *options):
         _add_scaled(y, where, vector, coefficient)
-    return y.to(x.dtype)
+    return y
 
 
 @torch.library.custom_op(
@@ -93,16 +112,13 @@ def _heat(pattern: Any, values: Tensor, x: Tensor, time: Tensor, *options: Any) 
 def _heat_backward(
     pattern: Any, values: Tensor, x: Tensor, time: Tensor, *options: Any
 ) -> tuple[Tensor, Tensor]:
-    bounds, expansion, tolerance, sizes, transposed, grad = options
-    rest = bounds, expansion, tolerance, sizes, not transposed
-    dtype, terms = _terms(pattern, values, grad, time, *rest)
-    grad_x = torch.zeros_like(x, dtype=dtype, memory_format=torch.contiguous_format)
+    *rest, grad = options
+    grad_x = torch.zeros_like(x, memory_format=torch.contiguous_format)
     grad_t = torch.zeros_like(time)
-    for where, vector, coefficient, derivative in terms:
+    for where, vector, coefficient, slope in _terms(pattern, values, grad, time, *rest):
         _add_scaled(grad_x, where, vector, coefficient)
-        along = (vector * x[where]).sum(0)
-        grad_t[where[1]] += _real(along * _like(derivative, vector)).to(time)
-    return grad_x.to(x.dtype), grad_t
+        grad_t[where[1]] += ((vector * x[where]).sum(0) * _like(slope, vector)).to(time)
+    return grad_x, grad_t
 
 
 @_heat.register_fake
@@ -123,7 +139,7 @@ def _save(ctx: Any, inputs: tuple[Any, ...], output: Tensor) -> None:
 def _backward(ctx: Any, grad: Tensor) -> tuple[Any, ...]:
     *pattern, values, x, time = ctx.saved_tensors
     gradients = _heat_backward(pattern, values, x, time, *ctx.options, grad)
-    return [None] * len(pattern), None, *gradients, None, None, None, None, None
+    return [None] * len(pattern), None, *gradients, None, None, None
 
 
 _heat.register_autograd(_backward, setup_context=_save)
@@ -132,15 +148,11 @@ _heat.register_autograd(_backward, setup_context=_save)
 def _add_scaled(
     y: Tensor, where: tuple[slice, Any], vector: Tensor, coefficient: np.ndarray
 ) -> None:
-    """Add the real part of c_k v_k to some rows and columns of y."""
-    if isinstance(where[1], slice) and not vector.is_complex():
+    """Add c_k v_k to some rows and columns of y."""
+    if isinstance(where[1], slice):
         y[where].addcmul_(vector, _like(coefficient, vector))
     else:
-        y[where] += _real(vector * _like(coefficient, vector))
-
-
-def _real(t: Tensor) -> Tensor:
-    return t.real if t.is_complex() else t
+        y[where] += (vector * _like(coefficient, vector)).to(y)
 
 
 def _like(coefficient: np.ndarray, vector: Tensor) -> Tensor:
@@ -152,106 +164,77 @@ def _terms(
     values: Tensor,
     x: Tensor,
     time: Tensor,
-    bounds: Tensor,
-    expansion: str,
+    radius: Tensor,
     tolerance: float,
     sizes: Sequence[int],
-    transposed: bool,
-) -> tuple[torch.dtype, Iterator[Term]]:
-    """The terms ((rows, columns), v_k, c_k, c_k') of the expansion, with L or its transpose, and the type to sum in.
-
-    "either" is settled here: outside the operation times have no values yet. The contour sum cancels, its terms are
-    some hundred times larger than it.
-    """
+) -> Iterator[Term]:
+    """The terms ((rows, columns), v_k, c_k, c_k') of the shorter expansion; it needs values that a trace has not."""
     times = time.detach().double().cpu().numpy()
     if len(times) == 0 or len(x) == 0:
-        return x.dtype, iter(())
-    radius, height = bounds.tolist()
-    products = _estimate(float(times.max()), radius / 2, height, tolerance)  # NaN without a height
-    if expansion == "chebyshev" or (expansion == "either" and products < PRODUCTS):
-        options = times, radius, height, tolerance, sizes, transposed
-        return x.dtype, _chebyshev(pattern, values, x, *options)
-    return torch.float64, _contour(
-        pattern, values, x.double(), times, radius, tolerance, transposed
-    )
+        return iter(())
+    if _estimate(float(times.max()) * float(radius), tolerance) < PRODUCTS:
+        return _polynomial(pattern, values, x, times, float(radius), tolerance, sizes)
+    return _rational(pattern, values, x.double(), times, tolerance)
 
 
-def _estimate(longest: float, a: float, b: float, tolerance: float) -> float:
-    """Products that the Chebyshev series takes, from above."""
-    digits = math.log(1 / tolerance)
-    return longest * b + math.sqrt(4 * digits * longest * a) + 2 * digits + 8
+def _estimate(scaled: float, tolerance: float) -> float:
+    """Products that the Chebyshev series takes for tR, from above."""
+    digits = log(1 / tolerance)
+    return sqrt(2 * digits * scaled) + 2 * digits + 8
 
 
-def chebyshev_coefficients(
-    times: np.ndarray, radius: float, height: float, tolerance: float
-) -> tuple[np.ndarray, np.ndarray, float, float]:
-    """Coefficients c_k(t) and their derivatives, (K, C), with d and r of the ellipse; see the module.
+def chebyshev_coefficients(scaled: np.ndarray, tolerance: float) -> tuple[np.ndarray, np.ndarray]:
+    """Coefficients c_k for tR, and their derivatives in tR, (K, C), as few as sum to less than the tolerance beyond.
 
-    K is the smallest number whose tail sums to less than `tolerance` for every time.
-
-    >>> c, _, d, r = chebyshev_coefficients(np.array([0.0]), 1.0, 0.0, 1e-7)
-    >>> c.tolist(), d, r
-    ([[1.0], [0.0]], 0.5, 1.0)
+    >>> chebyshev_coefficients(np.array([0.0]), 1e-7)[0].tolist()
+    [[1.0], [0.0]]
     """
-    a, b = radius / 2, height
-    if math.isnan(b):
-        raise DiffusionError(
-            "method='chebyshev': no ellipse in the left half plane holds the spectrum, as on an operator that is not "
-            "stable; build it with certify=True, or use method='contour'"
-        )
-    d = np.sqrt(a * a - b * b)
-    r = (a + b) / d
-    longest = float(times.max())
-    estimate = _estimate(longest, a, b, tolerance)
-    if not estimate < MAX_TERMS:
-        raise DiffusionError(
-            f"a diffusion time of {longest:.3g} with a spectral radius of {radius:.3g} takes {estimate:.0f} products; "
-            "use shorter times, method='contour' or method='spectral', or mend the slivers that make the radius large"
-        )
-    distinct, place = np.unique(times, return_inverse=True)
-    k = np.arange(-1, int(estimate) + 2)[:, None]
-    with np.errstate(divide="ignore"):
-        log_bessel = np.log(ive(np.abs(k), distinct * d))
-    base = np.exp(log_bessel + distinct * (d - a) + k * np.log(r))
-    slope = -a * base[1:-1] + d / 2 * (r * base[:-2] + base[2:] / r)
-    c, slope = 2 * base[1:-1], 2 * slope
+    half, place = np.unique(scaled / 2, return_inverse=True)
+    k = np.arange(-1, int(_estimate(float(scaled.max()), tolerance)) + 2)[:, None]
+    bessel = ive(np.abs(k), half)
+    c = 2 * bessel[1:-1]
+    slope = (bessel[:-2] + bessel[2:] - 2 * bessel[1:-1]) / 2
     c[0] /= 2
     slope[0] /= 2
     tail = np.cumsum(c[::-1], axis=0)[::-1].max(1)
     count = max(int((tail > tolerance).sum()), 2)
     c, slope = c[:count], slope[:count]
-    at_zero = (1 + r ** (-2.0 * np.arange(count)))[:, None] / 2
-    c[0] += 1 - (c * at_zero).sum(0)
-    slope[0] -= (slope * at_zero).sum(0)
-    return c[:, place], slope[:, place], float(d), float(r)
+    c[0] += 1 - c.sum(0)
+    slope[0] -= slope.sum(0)
+    return c[:, place], slope[:, place]
 
 
-def _chebyshev(
+def _polynomial(
     pattern: Sequence[Tensor],
     values: Tensor,
     x: Tensor,
     times: np.ndarray,
     radius: float,
-    height: float,
     tolerance: float,
     sizes: Sequence[int],
-    transposed: bool,
 ) -> Iterator[Term]:
-    c, slope, d, r = chebyshev_coefficients(times, radius, height, tolerance)
-    crow, col, crow_t, col_t, order_t = pattern
-    if transposed:
-        crow, col, values = crow_t, col_t, values[order_t]
-    shift = radius / (r * d)
-    for rows, matrix in _blocks(crow, col, values * (2 / (r * d)), x, sizes):
-        where = rows, slice(None)
-        before = x[rows]
-        yield where, before, c[0], slope[0]
-        v = (multiply(*matrix, before) + shift * before) / 2
-        yield where, v, c[1], slope[1]
-        for k in range(2, len(c)):
-            after = multiply(*matrix, v).add_(v, alpha=shift)
-            before, v = v, after.sub_(before, alpha=r**-2)
-            yield where, v, c[k], slope[k]
+    c, slope = chebyshev_coefficients(times * radius, tolerance)
+    crow, col = pattern
+    scaled = values * (2 / max(radius, 1e-300))
+    for rows, matrix in _blocks(crow, col, scaled, x, sizes):
+
+        def shifted(v: Tensor, matrix: Any = matrix) -> Tensor:
+            crow, col, values = matrix
+            return multiply(crow, col, values, v).add_(v)
+
+        for k, v in enumerate(chebyshev_vectors(shifted, x[rows], len(c))):
+            yield (rows, slice(None)), v, c[k], radius * slope[k]
+
+
+def chebyshev_vectors(
+    operator: Callable[[Tensor], Tensor], x: Tensor, count: int
+) -> Iterator[Tensor]:
+    """T_k(A)x for k < count."""
+    yield x
+    before, v = x, x
+    for k in range(1, count):
+        before, v = v, operator(v) if k == 1 else 2 * operator(v) - before
+        yield v
 
 
 def _blocks(
@@ -261,7 +244,7 @@ def _blocks(
     limit = CACHED // x.shape[1] if x.device.type == "cpu" else len(x)
     ends = list(accumulate(sizes))
     start = 0
-    for end, following in zip(ends, [*ends[1:], math.inf], strict=True):
+    for end, following in zip(ends, [*ends[1:], inf], strict=True):
         if following - start > limit:
             first, last = int(crow[start]), int(crow[end])
             pattern = crow[start : end + 1] - first, col[first:last] - start
@@ -269,75 +252,59 @@ def _blocks(
             start = end
 
 
-def hyperbola(spread: float, tolerance: float) -> tuple[np.ndarray, np.ndarray]:
-    """Poles z_k and weights w_k with e^{−τx} ≈ Re Σ w_k e^{τ z_k}/(z_k + x), for τ in [1/spread, 1], x in the sector.
-
-    Σ over half of the symmetric rule on z = μ(1 + sin(iu − α)), with the angle α that balances the errors of the step,
-    from the left and from the right, and of the truncation.
-
-    >>> z, w = hyperbola(1.0, 1e-8)
-    >>> len(z), bool(abs((w * np.exp(z) / (z + 2.0)).sum().real - np.exp(-2.0)) < 1e-8)
-    (16, True)
-    """
-    from scipy.optimize import minimize_scalar
-
-    def reach(alpha: float) -> float:
-        left, right = np.pi - 2 * (alpha + SECTOR), 4 * alpha - np.pi + 2 * SECTOR
-        return float(np.arccosh((spread * left + right) / (right * np.sin(alpha))))
-
-    def rate(alpha: float) -> float:
-        return np.pi * (np.pi - 2 * (alpha + SECTOR)) / reach(alpha)
-
-    bounds = (np.pi / 4 - SECTOR / 2 + 1e-3, np.pi / 2 - SECTOR - 1e-3)
-    alpha = float(minimize_scalar(lambda s: -rate(s), bounds=bounds, method="bounded").x)  # pyright: ignore[reportAttributeAccessIssue]
-    count = int(np.ceil((np.log(1 / tolerance) + 4) / rate(alpha)))
-    step = reach(alpha) / count
-    u = (np.arange(count) + 0.5) * step
-    mu = np.pi * (4 * alpha - np.pi + 2 * SECTOR) / step
-    z = mu * (1 + np.sin(1j * u - alpha))
-    return z, step / np.pi * mu * np.cos(1j * u - alpha)
-
-
-def _windows(times: np.ndarray) -> Iterator[np.ndarray]:
-    """Indices of times that share a hyperbola."""
-    order = np.argsort(times, kind="stable")
-    while len(order):
-        together = int(np.searchsorted(times[order], WINDOW * times[order[0]], side="right"))
-        yield order[:together]
-        order = order[together:]
-
-
-def _contour(
-    pattern: Sequence[Tensor],
-    values: Tensor,
-    x: Tensor,
-    times: np.ndarray,
-    radius: float,
-    tolerance: float,
-    transposed: bool,
+def _rational(
+    pattern: Sequence[Tensor], values: Tensor, x: Tensor, times: np.ndarray, tolerance: float
 ) -> Iterator[Term]:
-    every = slice(None)
-    short = np.flatnonzero(times * radius <= 1e-5)
-    if len(short):  # 1 + tL, exact to 1e-10; a hyperbola would lose digits
-        columns = torch.from_numpy(short).to(x.device)
-        part, t = x[:, columns].contiguous(), times[short]
-        yield (every, columns), part, np.ones_like(t), np.zeros_like(t)
-        yield (every, columns), csr_product(pattern, values, part, transposed), t, np.ones_like(t)
-    rest = np.flatnonzero(times * radius > 1e-5)
-    crow, col = (p.cpu().numpy() for p in pattern[:2])
-    entries = values.detach().double().cpu().numpy()
-    matrix = sparse.csr_array((entries, col, crow), shape=(len(x), len(x)))
-    for window in _windows(times[rest]):
-        chosen = rest[window]
+    crow, col = pattern
+    parts = [t.cpu().numpy() for t in (values.detach().double(), col, crow)]
+    matrix: Any = sparse.csr_array(tuple(parts), shape=(len(x), len(x)))
+    every, still = slice(None), np.flatnonzero(times == 0)
+    if len(still):
+        columns = torch.from_numpy(still).to(x.device)
+        part, one = x[:, columns].contiguous(), np.ones(len(still))
+        yield (every, columns), part, one, 0 * one
+        yield (every, columns), multiply(crow, col, values.double(), part), 0 * one, one
+    for pole, chosen in poles(times):
+        factor = Factor(sparse.csr_array(sparse.eye_array(len(x)) - pole * matrix))
+        c, slope = rational_coefficients(times[chosen] / pole, tolerance)
         columns = torch.from_numpy(chosen).to(x.device)
-        part, t = x[:, columns], times[chosen]
-        right = part.detach().cpu().numpy().astype(np.complex128)
-        poles, weights = hyperbola(float(t.max() / t.min()), tolerance)
-        lack, slope = np.ones_like(t), np.zeros_like(t)
-        for z, w in zip(poles / t.max(), weights / t.max(), strict=True):
-            lu = factorized(sparse.csc_array(z * sparse.eye_array(len(x)) - matrix), 1e-1)
-            vector = torch.from_numpy(lu.solve(right, "T" if transposed else "N"))
-            c = w * np.exp(t * z)
-            lack, slope = lack - (c / z).real, slope - c.real
-            yield (every, columns), vector.to(x.device, x.dtype.to_complex()), c, z * c
-        yield (every, columns), part, lack, slope
+
+        def doubled(v: Tensor, factor: Factor = factor) -> Tensor:
+            return 2 * factor.solve(v) - v
+
+        for k, v in enumerate(chebyshev_vectors(doubled, x[:, columns].contiguous(), len(c))):
+            yield (every, columns), v, c[k], slope[k] / pole
+
+
+def poles(times: np.ndarray) -> Iterator[tuple[float, np.ndarray]]:
+    """(γ, which times share it) for the positive times: powers of ten, so that those of the next step share them."""
+    level = np.floor(np.log10(np.where(times > 0, times / SHORTEST, 1.0)))
+    for exponent in np.unique(level[times > 0]).tolist():
+        yield 10.0**exponent, np.flatnonzero((level == exponent) & (times > 0))
+
+
+def rational_coefficients(ratios: np.ndarray, tolerance: float) -> tuple[np.ndarray, np.ndarray]:
+    """c_k of T_k(2Z − 1) for several t/γ, and their derivatives, (K, C); constants, z = 1, stay exactly.
+
+    >>> c, slope = rational_coefficients(np.array([10.0]), 1e-7)
+    >>> bool(abs(np.polynomial.chebyshev.chebval(2 / (1 + 0.3) - 1, c[:, 0]) - np.exp(-10 * 0.3)) < 1e-7)
+    True
+    """
+    parts = zip(*(_coefficients(ratio, tolerance) for ratio in ratios.tolist()), strict=True)
+    c, slope = (np.stack(part, 1) for part in parts)
+    count = int(c.any(1).sum())
+    return c[:count], slope[:count]
+
+
+@lru_cache(maxsize=4096)
+def _coefficients(ratio: float, tolerance: float) -> tuple[np.ndarray, np.ndarray]:
+    """Of one ratio, zero from where they are small on."""
+    decay = 2 / (1 + np.cos(np.pi * (np.arange(POINTS) + 0.5) / POINTS)) - 1
+    flow = np.exp(-ratio * decay)
+    c, slope = np.asarray(dct(np.stack([flow, -decay * flow]))) / POINTS
+    c[0], slope[0] = c[0] / 2, slope[0] / 2
+    count = int((np.cumsum(np.abs(c[::-1]))[::-1] > tolerance / 2).sum())
+    c[count:] = slope[count:] = 0
+    c[0] += 1 - c.sum()
+    slope[0] -= slope.sum()
+    return c, slope

@@ -60,7 +60,7 @@ class SpectralConv(nn.Module):
             orders = torch.arange(self.num_filters, dtype=dtype, device=x.device)
             polynomials = torch.cos(orders * torch.acos((2 * u - 1).clamp(-1, 1))[..., None])
             filters = torch.einsum("...kf,foi->...koi", polynomials, self.weight.to(dtype))
-            coefficients = basis.analyse(basis.functionals, x.to(dtype))
+            coefficients = basis.analyse(basis.left, x.to(dtype))
             y = basis.from_basis((filters @ coefficients[..., None])[..., 0])
         y = y.to(x.dtype)
         return y if self.bias is None else y + self.bias.to(y.dtype)

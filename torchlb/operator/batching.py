@@ -13,7 +13,6 @@ from torch.nn.functional import pad
 from torch.utils.weak import WeakIdKeyDictionary
 
 from torchlb.errors import InputError
-from torchlb.linalg.spectral_bounds import Bounds, join_bounds
 from torchlb.operator.storage import PAIRS, no_pairs
 
 Buffers = dict[str, Tensor]
@@ -148,7 +147,7 @@ def join_states(states: Sequence[dict[str, Any]], sizes: Sequence[int]) -> dict[
 
     Its options are those that the shapes share.
     """
-    known, options = ([state[key] for state in states] for key in ("bounds", "options"))
+    known, options = ([state[key] for state in states] for key in ("radius", "options"))
     first = options[0]
     parts = [part for state in states for part in state.get("parts") or [state]]
     return {
@@ -156,7 +155,7 @@ def join_states(states: Sequence[dict[str, Any]], sizes: Sequence[int]) -> dict[
         "options": {k: v for k, v in first.items() if all(o.get(k, ...) == v for o in options)},
         "certificate": _joined_certificate([state["certificate"] for state in states]),
         "sizes": list(sizes),
-        "bounds": list(join_bounds([Bounds(*each) for each in known])) if all(known) else None,
+        "radius": None if any(each is None for each in known) else max(known),
         "parts": parts,
     }
 

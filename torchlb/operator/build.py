@@ -121,7 +121,6 @@ def on_cells(
 
     Where cells overlap, `shares` says which part of each counts.
     """
-    options = options.settled(cells=True)
     degree, degrees = options.elements
     numbering, here, corners, order = numbered_mesh(vertices, cells, flip=degree > 0)
     with renumbered(numbering.given), threads_for(len(vertices)):

@@ -134,7 +134,6 @@ def _on_surface(
     if ambient == 3:
         warn_of_layers(points)
     surface = replace(surface, cells=flipped(surface.points, surface.cells))
-    options = options.settled(cells=len(surface.cells) > 0)
     degree, degrees = options.elements
     places = surface.points[:, :ambient]
     shape = surface_shape(

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from torchlb.cloud.surface import SurfaceSummary
-from torchlb.errors import InputError, InputTypeError, warn
+from torchlb.errors import InputError, InputTypeError
 from torchlb.fits.rules import WeightsName
 from torchlb.geometry.frames import Projection
 from torchlb.operator import build
@@ -86,8 +86,8 @@ class LaplaceBeltrami(StencilFace, WeakFace):
         boundary: ArrayLike | Literal["detect"] | None = None,
         condition: ConditionName | Condition | None = "neumann",
         reconstruct: Reconstruction | None = None,
-        weak_form: bool | None = None,
-        certify: bool | None = None,
+        weak_form: bool = True,
+        certify: bool = False,
         progress: bool = True,
     ) -> LaplaceBeltrami:
         """Operator on a point cloud.
@@ -113,9 +113,9 @@ class LaplaceBeltrami(StencilFace, WeakFace):
             then, not 0.
         reconstruct : from points (N, n) to cells through them, (F, d + 1), or a `torchlb.cloud.Complex`. By default
             `torchlb.cloud.reconstruct`: of curves, of surfaces in R² and R³ and of solids in R³ (`lb.faces`).
-        weak_form : whether to build the weak pair (K, M); by default where there are cells.
+        weak_form : whether to build the weak pair (K, M), which eigenpairs, flows and solves are of.
         certify : whether rows of the stencil are lowered until the certificate of stability holds, whose π is then the
-            mass; by default where there is no weak pair. With neither of them the operator may blow up under diffusion.
+            mass. Eigenpairs, flows and solves are of the weak pair, and need none.
         progress : whether to show a bar, on a terminal, for what takes longer than two seconds.
 
         Raises
@@ -145,8 +145,8 @@ class LaplaceBeltrami(StencilFace, WeakFace):
         num_neighbors: int | None = None,
         boundary: ArrayLike | Literal["detect"] | None = None,
         condition: ConditionName | Condition | None = "neumann",
-        weak_form: bool | None = None,
-        certify: bool | None = None,
+        weak_form: bool = True,
+        certify: bool = False,
         progress: bool = True,
     ) -> LaplaceBeltrami:
         """Operator on the vertices of a mesh; its faces say who is whose neighbour and give the first normals.
@@ -207,14 +207,10 @@ class LaplaceBeltrami(StencilFace, WeakFace):
         if len(shapes) == 0:
             raise InputError("batch: got no shapes")
         sizes = [n for shape in shapes for n in shape.sizes or (shape.num_points,)]
-        if not all(shape.has_weak_form for shape in shapes):
-            bare = [s.source == "mesh" and s.has_weak_form and not s.certificate for s in shapes]
-            if any(bare):
-                warn(
-                    f"batch: not all shapes have a weak pair, so that the stencils do its work, and that of shape "
-                    f"{bare.index(True)} is not certified; build it with certify=True"
-                )
-        _ = [shape.bounds for shape in shapes]  # of one from an old state they are found here, once
+        if all(shape.has_weak_form for shape in shapes):
+            _ = [
+                shape.radius for shape in shapes
+            ]  # of one from an old state it is found here, once
         state = join_states([shape.get_extra_state() for shape in shapes], sizes)
         bases = [shape.basis for shape in shapes if shape.basis and not shape.sizes]
         with torch.inference_mode(False):
@@ -287,7 +283,7 @@ class LaplaceBeltrami(StencilFace, WeakFace):
         )
 
     def unbatch(self) -> list[LaplaceBeltrami]:
-        """The operators of the shapes of a `batch`, with all that they had: certificates, bounds, eigenbases.
+        """The operators of the shapes of a `batch`, with all that they had: certificates, spectral radii, eigenbases.
 
         But weak pairs only if all of them had one.
         """
@@ -325,10 +321,8 @@ class LaplaceBeltrami(StencilFace, WeakFace):
             buffers["on_boundary"] = built.on_boundary
         lb = cls.from_buffers(buffers, {"source": built.source, "options": built.options})
         lb.certificate, lb.surface, lb._plan = built.certificate, built.surface, built.plan
-        if (
-            built.certificate is not None or built.pair is not None
-        ):  # else flows find them, if there are any
-            _ = lb.bounds  # from values that are not yet rounded
+        if lb.has_weak_form:
+            _ = lb.radius  # from values that are not yet rounded
         return lb.to(float_type(given))
 
     def extra_repr(self) -> str:

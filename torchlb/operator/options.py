@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any, get_args
 
-from torchlb.errors import InputError
 from torchlb.fits.rules import WeightsName
 from torchlb.galerkin.pair import ELEMENTS
 from torchlb.geometry.frames import Projection
@@ -24,8 +23,8 @@ class Options:
     weights: WeightsName
     num_neighbors: int | None
     condition: ConditionName | Condition | dict[str, Any] | None
-    weak_form: bool | None
-    certify: bool | None
+    weak_form: bool | None = True
+    certify: bool | None = False
 
     @property
     def q(self) -> int:
@@ -47,18 +46,6 @@ class Options:
     def elements(self) -> tuple[int, tuple[int, ...]]:
         """Degree of the elements and degrees of the fits of the weak pair, where there is to be one."""
         return ELEMENTS[min(self.order, max(ELEMENTS))] if self.weak_form else (0, ())
-
-    def settled(self, cells: bool) -> Options:
-        """With the choices that were left open: a pair where there can be one, the certificate where there is none."""
-        if self.weak_form and not cells:
-            raise InputError(
-                "weak_form: only meshes, and clouds of curves, of surfaces in R² and R³ and of solids in R³, have one; "
-                "leave it out, and the certificate makes the stencil stable instead"
-            )
-        weak = cells if self.weak_form is None else self.weak_form
-        return replace(
-            self, weak_form=weak, certify=not weak if self.certify is None else self.certify
-        )
 
     def check(self, num_points: int, ambient_dim: int, dim: int) -> None:
         """InputError for a choice that is none."""

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import asdict
-from math import isnan
 from typing import Any, TypeVar
 
 import torch
@@ -13,8 +12,8 @@ from torch import Tensor, nn
 
 from torchlb.cloud.surface import SurfaceSummary
 from torchlb.errors import InputError, warn
+from torchlb.linalg.exponential import spectral_radius
 from torchlb.linalg.sparse import to_scipy, transpose_pattern
-from torchlb.linalg.spectral_bounds import Bounds, interval_bounds, spectral_bounds
 from torchlb.operator.checks import check_same_points
 from torchlb.spectral.eigenbasis import Eigenbasis
 from torchlb.stability.certificate import Certificate
@@ -31,7 +30,9 @@ PAIRS = ("weak", "linear")
 BUFFERS = ("crow", "col", "values", "gradient_values", "mass", "points", "frames", "normals")
 TRANSPOSE = ("crow_t", "col_t", "order_t")
 Storage = TypeVar("Storage", bound="OperatorStorage")
-BASIS = ("eigenvalues", "eigenvectors", "left", "decay_rates", "modal_transform", "relative_errors")
+BASIS = ("eigenvalues", "eigenvectors", "left", "relative_errors")
+FORMER = ("basis_decay_rates", "basis_modal_transform")
+"""Of a state of an older torchlb, whose stencils had eigenpairs of their own."""
 
 
 def no_pairs(like: Tensor) -> dict[str, Tensor]:
@@ -78,8 +79,6 @@ class OperatorStorage(nn.Module):
     basis_eigenvalues: Tensor
     basis_eigenvectors: Tensor
     basis_left: Tensor
-    basis_decay_rates: Tensor
-    basis_modal_transform: Tensor
     basis_relative_errors: Tensor
 
     def __init__(self) -> None:
@@ -91,7 +90,7 @@ class OperatorStorage(nn.Module):
         self._sizes: list[Tensor] | None = None
         self.parts: list[dict[str, Any]] | None = None  # the extra states of the shapes of a batch
         self._plan: Any = None
-        self._bounds: Tensor | None = None
+        self._radius: Tensor | None = None
         self._pairs = torch.empty(0, 0)  # as many rows as `num_pairs`
         for name in BUFFERS:
             self.register_buffer(name, torch.zeros(0))
@@ -227,21 +226,18 @@ class OperatorStorage(nn.Module):
         return tuple(sum(sizes[:i]) for i in range(len(sizes) + 1))
 
     @property
-    def spectral_bounds(self) -> Bounds:
-        """The ellipse that holds the spectrum of Δ, 1/ℓ²; stored with the operator, once it was asked for.
+    def radius(self) -> Tensor:
+        """Bound on the eigenvalues of D⁻¹K₁, the linear pair with lumped mass, for flows beyond the basis.
 
-        Beside a weak pair that of −D⁻¹K₁, the linear pair with lumped mass, by which flows beyond the basis are made.
+        1/ℓ², a float64 tensor () on the CPU, which compiled code can take; found once, and stored with the operator.
         """
-        radius, height = self.bounds.tolist()
-        return Bounds(radius, None if isnan(height) else height)
-
-    @property
-    def bounds(self) -> Tensor:
-        """`spectral_bounds` as a float64 tensor (2,) on the CPU, NaN for no height, which compiled code can take."""
-        if self._bounds is None:  # of a bare stencil, or from an older torchlb
-            self.set_bounds(self._flow_bounds())
-        assert self._bounds is not None
-        return self._bounds
+        if self._radius is None:
+            crow, col, values = self.linear_pair
+            stiffness, mass = (to_scipy(crow, col, v.double(), self.shape) for v in values)
+            lumped: Any = mass.sum(axis=1)
+            self.set_radius(spectral_radius(stiffness, lumped))
+        assert self._radius is not None
+        return self._radius
 
     @property
     def pair(self) -> tuple[Tensor, Tensor, Tensor]:
@@ -259,22 +255,10 @@ class OperatorStorage(nn.Module):
         """The buffers of the pair "weak" or "linear": crow, col, and values of K, M, B, and of what is added to K."""
         return tuple(getattr(self, f"{pair}_{part}") for part in ("crow", "col", "values"))  # type: ignore[return-value]
 
-    def _flow_bounds(self) -> Bounds:
-        """Of the matrix that Chebyshev series expand: Δ, or −D⁻¹K₁ beside a weak pair."""
-        if len(self.weak_crow) == 0:
-            matrix = to_scipy(self.crow, self.col, self.values.double(), self.shape)
-            return spectral_bounds(matrix, self.mass.detach().cpu().double().numpy())
-        crow, col, values = self.linear_pair
-        stiffness, mass = (to_scipy(crow, col, v.double(), self.shape) for v in values[:2])
-        lumped: Any = mass.sum(axis=1)
-        return interval_bounds(stiffness, lumped)
-
-    def set_bounds(self, bounds: Bounds | None) -> None:
+    def set_radius(self, radius: float | None) -> None:
         """Hold what is known of the spectrum; it is neither rounded nor moved with the buffers."""
-        known = None if bounds is None else [torch.nan if b is None else b for b in bounds]
-        self._bounds = (
-            None if known is None else torch.tensor(known, dtype=torch.float64, device="cpu")
-        )
+        known = None if radius is None else torch.tensor(radius, dtype=torch.float64, device="cpu")
+        self._radius = known
 
     def _transpose(self) -> None:
         self.crow_t, self.col_t, self.order_t = transpose_pattern(
@@ -286,12 +270,9 @@ class OperatorStorage(nn.Module):
         """All eigenpairs that are stored; None if there are none."""
         if len(self.basis_left) == 0:
             return None
-        modes = (self.basis_decay_rates, self.basis_modal_transform)
         pairs = (self.basis_eigenvalues, self.basis_eigenvectors, self.mass, self.basis_left)
         errors = self.basis_relative_errors if len(self.basis_relative_errors) else None
-        alone = errors is not None and len(modes[0]) == 0  # else in a batch with stencils
-        symmetric = {"is_symmetric": alone, "relative_errors": errors}
-        return Eigenbasis(*pairs, self.sizes, *(t if len(t) else None for t in modes), **symmetric)
+        return Eigenbasis(*pairs, self.sizes, errors)
 
     def keep_basis(self, basis: Eigenbasis | None = None, *, store: bool | None = None) -> None:
         """Hold a basis (None: the one there is) in buffers, in `state_dict` or not (None: as it was)."""
@@ -331,13 +312,13 @@ class OperatorStorage(nn.Module):
         check_same_points(points, self.points)
 
     def get_extra_state(self) -> dict[str, Any]:
-        """Source, options, certificate, spectral bounds and what is known of the surface, plain types only."""
+        """Source, options, certificate, spectral radius and what is known of the surface, plain types only."""
         return {
             "source": self.source,
             "options": self.options,
             "certificate": None if self.certificate is None else asdict(self.certificate),
             "sizes": None if self.sizes is None else list(self.sizes),
-            "bounds": None if self._bounds is None else list(self.spectral_bounds),
+            "radius": None if self._radius is None else float(self._radius),
             "parts": self.parts,
             "surface": None if self.surface is None else asdict(self.surface),
         }
@@ -345,12 +326,12 @@ class OperatorStorage(nn.Module):
     def set_extra_state(self, state: dict[str, Any]) -> None:
         """Inverse of `get_extra_state`; what is left out is not known."""
         self.source, self.options = state["source"], dict(state["options"])
-        found, sizes, bounds = (state.get(key) for key in ("certificate", "sizes", "bounds"))
+        found, sizes, radius = (state.get(key) for key in ("certificate", "sizes", "radius"))
         surface = state.get("surface")
         self.surface = None if surface is None else SurfaceSummary.of(surface)
         self.certificate = None if found is None else Certificate(**found)
         self.sizes, self.parts = None if sizes is None else tuple(sizes), state.get("parts")
-        self.set_bounds(bounds and Bounds(*bounds))
+        self.set_radius(radius)
 
     def _load_from_state_dict(
         self,
@@ -375,10 +356,12 @@ class OperatorStorage(nn.Module):
                     f"{prefix or 'LaplaceBeltrami'}: the operator on {self.num_points} points is replaced by one on "
                     f"{len(theirs)} others; leave it out of the state to keep the one that is there"
                 )
+        for name in FORMER:
+            state_dict.pop(prefix + name, None)
         for name in BASIS:
             stored = f"{prefix}basis_{name}" in state_dict
             self.register_buffer(f"basis_{name}", self.values.new_zeros(0), persistent=stored)
-        self._bounds = None
+        self._radius = None
         missing = {"faces": torch.zeros(0, 3, dtype=torch.int64)} | no_pairs(torch.zeros(0))
         for name, tensor in missing.items():  # as in a state of an older torchlb
             state_dict.setdefault(prefix + name, tensor)

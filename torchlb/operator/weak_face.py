@@ -20,13 +20,12 @@ from torchlb.spectral.eigenbasis import (
     stack_eigenbases,
     unstack_eigenbases,
 )
-from torchlb.spectral.eigensolver import blockwise_eigenbasis
 from torchlb.spectral.pencil import pencil_eigenbasis
 
 MatrixName = Literal["laplacian", "stiffness", "mass", "boundary_mass"]
 NO_PAIR = (
-    "{}: this operator has no weak pair, which meshes and clouds of surfaces in R² or R³ have unless built with "
-    "weak_form=False, and clouds of curves and solids have not; the stencil is lb.matrix"
+    "{}: this operator has no weak pair, as it was built with weak_form=False, or is a batch of which one was; the "
+    "stencil is lb.matrix"
 )
 
 
@@ -35,8 +34,13 @@ class WeakFace(OperatorStorage):
 
     @property
     def has_weak_form(self) -> bool:
-        """Whether there is a weak pair: on meshes and clouds of surfaces, unless built with weak_form=False."""
+        """Whether there is a weak pair, as there is unless built with weak_form=False."""
         return self.weak_crow.shape[0] > 0
+
+    def check_pair(self) -> None:
+        """InputError without a weak pair, which eigenpairs, flows and solves are of."""
+        if not self.has_weak_form:
+            raise InputError(NO_PAIR.format("eigenpairs, flows and solves"))
 
     @property
     def stiffness(self) -> Tensor:
@@ -85,11 +89,6 @@ class WeakFace(OperatorStorage):
         """
         return to_scipy(*self.parts_of(name), self.shape)
 
-    @property
-    def loses(self) -> bool:
-        """Whether a condition takes something away, so that rows at the boundary do not sum to zero."""
-        return not all(kind.conserves for kind in self.conditions)
-
     def eigenbasis(
         self, k: int, *, tolerance: float | None = None, store: bool = False
     ) -> Eigenbasis:
@@ -109,7 +108,8 @@ class WeakFace(OperatorStorage):
 
         Raises
         ------
-        EigenbasisError : where the solver does not converge, or the operator is not stable.
+        EigenbasisError : where the solver does not converge.
+        InputError : without a weak pair.
         """
         return self.invariant_basis(k, tolerance=tolerance, store=store).truncate(k)
 
@@ -132,21 +132,12 @@ class WeakFace(OperatorStorage):
 
     def _solved_basis(self, k: int, tolerance: float | None) -> Eigenbasis:
         """Of a batch those of its shapes, which keep them, as long as they are known."""
+        self.check_pair()
         shapes = shapes_of(self)
-        if shapes and all(shape.has_weak_form == self.has_weak_form for shape in shapes):
+        if shapes:
             bases = [shape.invariant_basis(k, tolerance=tolerance) for shape in shapes]
             return stack_eigenbases([part for basis in bases for part in unstack_eigenbases(basis)])
-        return (
-            self._pair_eigenbasis(k, tolerance)
-            if self.has_weak_form
-            else self._stencil_eigenbasis(k)
-        )
-
-    def _stencil_eigenbasis(self, k: int) -> Eigenbasis:
-        """From the rows of Δ, in the inner product of the mass."""
-        matrix = to_scipy(self.crow, self.col, self.values, self.shape)
-        options = {"outflow": self.loses, "rounding": torch.finfo(self.dtype).eps}
-        return blockwise_eigenbasis(matrix, self.mass, k, self.sizes, **options)
+        return self._pair_eigenbasis(k, tolerance)
 
     def _pair_eigenbasis(self, k: int, tolerance: float | None) -> Eigenbasis:
         """From the weak pair of each shape; the more exact, the higher the order."""

@@ -34,10 +34,11 @@ def check_shape(x: Tensor, lb: LaplaceBeltrami) -> None:
 def as_columns(f: Tensor, lb: LaplaceBeltrami) -> Tensor:
     """(N, C) or (B, N, C) of the f of a user, which may be (N,), too; integers and masks in the operator's type.
 
-    Errors as for `check_shape`, and InputError for complex numbers, NaN and infinity.
+    Errors as for `check_shape`, and InputError for complex numbers, NaN and infinity, and without a weak pair.
     """
     x = f[:, None] if isinstance(f, Tensor) and f.ndim == 1 else f
     check_shape(x, lb)
+    lb.check_pair()
     if x.is_complex():
         raise InputError(f"expected real f, got {x.dtype}; torch.view_as_real(f) makes channels")
     check_finite(x)

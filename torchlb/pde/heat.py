@@ -1,10 +1,9 @@
-"""Heat flow e^{tΔ}f, by the weak pair or by the stencil (`method.md`, section 8).
+"""Heat flow e^{tΔ}f = e^{−tM⁻¹K}f (`method.md`, section 8).
 
-With a weak pair e^{−tM⁻¹K}, without one e^{tL} of the stencil. method="deflated", the layer's default, splits off
-the span of the slow eigenvectors, where the flow is exact; the rest, of which nothing is left after about 16/λ_k, takes
-a short Chebyshev series: of the stencil, or of the linear pair with lumped mass, since the mesh hardly resolves what is
-beyond the basis. "spectral" is the first part alone: everything beyond the basis is dropped, also as t → 0. "chebyshev"
-and "contour" need no basis, and are exact to the tolerance; with a pair both are the solves of `pair_flow`.
+method="deflated", the layer's default, splits off the span of the slow eigenvectors, where the flow is exact; the rest,
+of which nothing is left after about 16/λ_k, takes a short Chebyshev series of the linear pair with lumped mass, since
+the mesh hardly resolves what is beyond the basis. "spectral" is the first part alone: everything beyond the basis is
+dropped, also as t → 0. "rational" needs no basis, and is exact to the tolerance: the solves of `pair_flow`.
 """
 
 from __future__ import annotations
@@ -17,7 +16,6 @@ import torch
 from jaxtyping import Shaped
 from torch import Tensor
 
-from torchlb.errors import DiffusionError
 from torchlb.linalg.exponential import heat
 from torchlb.linalg.sparse import compute_dtype
 from torchlb.operator.checks import check_tolerance
@@ -26,8 +24,8 @@ from torchlb.pde.checks import as_columns, as_times, check_choice
 from torchlb.pde.pair_flow import pair_flow
 from torchlb.spectral.eigenbasis import Eigenbasis
 
-Method = Literal["deflated", "spectral", "chebyshev", "contour"]
-FORMER_NAMES = {"full": "deflated", "rational": "contour"}
+Method = Literal["deflated", "spectral", "rational"]
+FORMER_NAMES = {"full": "deflated", "chebyshev": "rational", "contour": "rational"}
 TOLERANCE = 1e-7
 
 
@@ -36,7 +34,7 @@ def heat_flow(
     f: Shaped[Tensor, "*B N C"] | Shaped[Tensor, " N"],
     t: float | Tensor,
     *,
-    method: Method | None = None,
+    method: Method = "rational",
     k: int = 128,
     tolerance: float = TOLERANCE,
 ) -> Tensor:
@@ -49,18 +47,15 @@ def heat_flow(
     lb : operator of one shape, or of a batch.
     f : (N,), (N, C) or (B, N, C).
     t : time ≥ 0 in ℓ², one for all channels or (C,). (In a time t a peak spreads to a width of √(2t).)
-    method : "deflated", "spectral", "chebyshev" or "contour"; by default one that is exact to the tolerance: "contour"
-        with a weak pair, "deflated" with a stencil.
-    k : number of eigenpairs, for the first two.
-    tolerance : of the error in the norm of π, relative to |f|. Values that are smaller than that everywhere around,
+    method : "rational", which is exact to the tolerance, "deflated" or "spectral".
+    k : number of eigenpairs, for the last two.
+    tolerance : of the error in the norm of M, relative to |f|. Values that are smaller than that everywhere around,
         as far away from a heated point, are noise: logarithms and directions of them (geodesics) need an implicit step.
 
     Raises
     ------
     InputError : for times that are negative or not finite, for an unknown method and a wrong shape, a tolerance that
-        is not between 0 and 1.
-    DiffusionError : where the method cannot be used: a series of too many products or of no ellipse, a basis of
-        dependent eigenvectors.
+        is not between 0 and 1, an operator without a weak pair.
 
     Examples
     --------
@@ -70,7 +65,7 @@ def heat_flow(
     True
     """
     x = as_columns(f, lb)
-    method = checked_method(method or ("contour" if lb.has_weak_form else "deflated"))
+    method = checked_method(method)
     dtype = compute_dtype(x, lb.values)
     time = as_times(t, x, dtype)
     with torch.autocast(x.device.type, enabled=False):
@@ -82,8 +77,8 @@ def heat_flow(
 def checked_method(method: str) -> Method:
     """The method, by its name of today.
 
-    >>> checked_method("chebyshev")
-    'chebyshev'
+    >>> checked_method("rational")
+    'rational'
     """
     if method in FORMER_NAMES:
         message = f"method={method!r} is called {FORMER_NAMES[method]!r} now"
@@ -105,51 +100,21 @@ def flow(
         columns, times = x.transpose(0, 1).flatten(1), time.repeat(len(x))
         y = flow(lb, columns, times, method, k, tolerance)
         return y.view(x.shape[1], x.shape[0], x.shape[2]).transpose(0, 1)
+    lb.check_pair()
     if method == "spectral":
         return _spectral(lb.eigenbasis(k), x, time)
     if method == "deflated":
-        basis = lb.invariant_basis(k)
-        deflated = _deflated_pair if basis.is_symmetric else _deflated
-        return deflated(lb, basis, x, time, tolerance)
-    if lb.has_weak_form:
-        return pair_flow(lb, x, time, tolerance).to(x.dtype)
-    return _expanded(lb, x, time, method, tolerance)
+        return _deflated(lb, lb.invariant_basis(k), x, time, tolerance)
+    return pair_flow(lb, x, time, tolerance).to(x.dtype)
 
 
 def _spectral(basis: Eigenbasis, x: Tensor, time: Tensor) -> Tensor:
-    """Φ e^{−λt} Φᵀ(πx)."""
+    """Φ e^{−λt} ΦᵀMx."""
     decay = torch.exp(-basis.eigenvalues.to(x.dtype)[..., None] * time)
-    return basis.from_basis(decay * basis.analyse(basis.functionals, x))
+    return basis.from_basis(decay * basis.analyse(basis.left, x))
 
 
 def _deflated(
-    lb: LaplaceBeltrami, basis: Eigenbasis, x: Tensor, time: Tensor, tolerance: float
-) -> Tensor:
-    """e^{−tB} on the span, a series on the rest, whose time is cut where it has decayed below the tolerance."""
-    if basis.modal_transform is None or basis.decay_rates is None:
-        raise DiffusionError(
-            "method='deflated': the slow eigenvectors are too close to dependent, or fewer than the components; "
-            "ask for another k, or use method='chebyshev' or 'spectral'"
-        )
-    coefficients = basis.analyse(basis.left, x)
-    v, inverse, turned = basis.modal_transform.to(x.dtype).unbind(-3)
-    rates, frequencies = basis.decay_rates.to(x.dtype)[..., None].unbind(-3)
-    decay = torch.exp(-rates * time)
-    flowed = decay * (frequencies * time).cos() * (inverse @ coefficients)
-    flowed = v @ (flowed + decay * (frequencies * time).sin() * (turned @ coefficients))
-    slow = basis.from_basis(flowed)
-    if lb.has_pairs(lb.num_points):
-        return slow
-    rest = x - basis.from_basis(coefficients)
-    fastest = rates.amax((-2, -1))
-    if basis.sizes is not None:  # a shape whose basis is complete has no rest
-        incomplete = [size > lb.num_pairs for size in basis.sizes]
-        fastest = torch.where(torch.tensor(incomplete, device=x.device), fastest, torch.inf).amin()
-    enough = math.log(1 / tolerance) / fastest
-    return slow + _expanded(lb, rest, torch.minimum(time, enough), "either", tolerance)
-
-
-def _deflated_pair(
     lb: LaplaceBeltrami, basis: Eigenbasis, x: Tensor, time: Tensor, tolerance: float
 ) -> Tensor:
     """e^{−λt} on the span, the flow of the linear pair with lumped mass on the rest, from which it does not return."""
@@ -165,7 +130,7 @@ def _deflated_pair(
         fastest = torch.where(torch.tensor(incomplete, device=x.device), fastest, torch.inf).amin()
     whole, time = time, torch.minimum(time, math.log(1 / tolerance) / fastest)
     pattern, matrix, root = _linear_flow(lb)
-    options = lb.bounds, "either", tolerance, lb.sizes or (lb.num_points,)
+    options = lb.radius, tolerance, lb.sizes or (lb.num_points,)
     rest = root.to(x.dtype)[:, None] * (x - basis.from_basis(coefficients))
     rest = heat(pattern, matrix.to(x.dtype), rest, time, *options)
     rest = rest / root.to(x.dtype)[:, None] * torch.exp(-fastest * (whole - time))
@@ -182,14 +147,4 @@ def _linear_flow(lb: LaplaceBeltrami) -> tuple[list[Tensor], Tensor, Tensor]:
     values = -stiffness / (root[row] * root[col])
     if lb.fixed is not None:
         values = torch.where(lb.fixed[row] | lb.fixed[col], 0.0, values)
-    return [crow, col, crow, col, torch.arange(len(col), device=col.device)], values, root
-
-
-def _expanded(
-    lb: LaplaceBeltrami, x: Tensor, time: Tensor, expansion: str, tolerance: float
-) -> Tensor:
-    """e^{tΔ}x by one of the expansions."""
-    pattern = [lb.crow, lb.col, lb.crow_t, lb.col_t, lb.order_t]
-    values = lb.values.to(x.dtype)
-    options = lb.bounds, expansion, tolerance, lb.sizes or (lb.num_points,)
-    return heat(pattern, values, x, time, *options)
+    return [crow, col], values, root

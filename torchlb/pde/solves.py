@@ -34,10 +34,9 @@ def implicit_step(
 ) -> Tensor:
     """(1 − tΔ)⁻¹f, one implicit Euler step of heat flow; differentiable in f, t and the boundary's data.
 
-    (M + tK)u = Mf + tB·flux with the weak pair, by conjugate gradients that the linear pair preconditions; without one
-    (1 − tL)u = f with the stencil, by LU. Solved in float64; to a tolerance of 1e-5 or more steps are in float32, and
-    where f and the operator are, right-hand sides, too. The result has the type of f, that of the operator where f are
-    integers.
+    (M + tK)u = Mf + tB·flux, by conjugate gradients that the linear pair preconditions. Solved in float64; to a
+    tolerance of 1e-5 or more steps are in float32, and where f and the operator are, right-hand sides, too. The result
+    has the type of f, that of the operator where f are integers.
 
     Parameters
     ----------
@@ -75,7 +74,7 @@ def implicit_step(
     columns, time = _columns(x, as_times(t, x, torch.float64), dtype)
     given, poured = (_data(lb, d, n, f) for d, n in ((boundary_values, 0), (flux, 1)))
     medium = lb if conductivity is None else conducting(lb, conductivity)
-    right = _mass(lb, columns)
+    right = _product(lb, 1, columns)
     if poured is not None:
         right = right + time * lb.product("boundary_mass", poured)
     if given is not None:
@@ -96,7 +95,7 @@ def poisson_solve(
 ) -> Tensor:
     """u with −Δu = f; differentiable in f and the boundary's data. Units of f by ℓ².
 
-    Ku = Mf + B·flux with the weak pair, −Lu = f with the stencil. On a component that neither a Dirichlet nor a Robin
+    Ku = Mf + B·flux. On a component that neither a Dirichlet nor a Robin
     condition holds u has mean zero, and f and flux are made compatible: their total is taken off f, evenly. Arguments
     and errors as for `implicit_step`.
 
@@ -114,7 +113,7 @@ def poisson_solve(
     columns, _ = _columns(x, None)
     given, poured = (_data(lb, d, n, f) for d, n in ((boundary_values, 0), (flux, 1)))
     medium = lb if conductivity is None else conducting(lb, conductivity)
-    right = _mass(lb, columns)
+    right = _product(lb, 1, columns)
     if poured is not None:
         right = right + lb.product("boundary_mass", poured)
     if given is not None:
@@ -133,8 +132,8 @@ def potential(
 ) -> Float[Tensor, "*B N C"]:
     """u with −Δu = s − ∇·v, of mean zero, for a tangent field v, given in the frames, and a source s; differentiable.
 
-    Ku = Σ_c G_cᵀ(π v_c) + π s, G the rows of the gradient and π the mass; with the stencil −L for K, and the right side
-    over π. For a field alone u's gradient is closest to it; where v = ∇f it is f less its mean, up to the order.
+    Ku = Σ_c G_cᵀ(π v_c) + π s, G the rows of the gradient and π the mass. For a field alone u's gradient is closest to
+    it; where v = ∇f it is f less its mean, up to the order.
 
     Parameters
     ----------
@@ -152,8 +151,8 @@ def potential(
             lb._apply_rows(values, part, transposed=True)
             for values, part in zip(lb.gradient_values, weighted.unbind(-2), strict=True)
         ]
-    right = sum(products[1:], products[0])
-    columns, _ = _columns(right if lb.has_weak_form else right / lb.mass.double()[:, None], None)
+    lb.check_pair()
+    columns, _ = _columns(sum(products[1:], products[0]), None)
     if source is None and field is not None:
         source = field[..., 0, :]
     assert source is not None, "neither field nor source"
@@ -183,8 +182,6 @@ def _data(lb: LaplaceBeltrami, data: Tensor | float | None, kind: int, f: Tensor
     if data is None:
         return None
     name = ("boundary_values", "flux")[kind]
-    if not lb.has_weak_form:
-        raise InputError(f"{name}: {_without_pair(lb)}")
     fixed = torch.zeros_like(lb.mass, dtype=torch.bool) if lb.fixed is None else lb.fixed
     counts = _poured(lb, ~fixed) if kind == 1 else fixed
     if not bool(counts.any()):
@@ -211,17 +208,6 @@ def _poured(lb: LaplaceBeltrami, free: Tensor) -> Tensor:
     return symmetric_product(lb.weak_crow, lb.weak_col, size, free.to(size)[:, None])[:, 0] > 0
 
 
-def _without_pair(lb: LaplaceBeltrami) -> str:
-    """Why there is no place for boundary data, and what to do."""
-    if len(lb.faces) > 0:
-        return "the stencil has no place for them, the weak pair has; build without weak_form=False"
-    return (
-        f"only a weak pair has a place for them, and a shape of dimension {lb.dim} in R^{lb.points.shape[1]} has none; "
-        "give values by a system of the stencil (docs/pde.md, 'Boundary values without a weak pair'); "
-        "condition='dirichlet' alone holds u = 0"
-    )
-
-
 def _missing(lb: LaplaceBeltrami, kind: int) -> str:
     """Why there is no point for Dirichlet values (kind 0) or for fluxes (1)."""
     if len(lb.weak_values) < 3:
@@ -237,14 +223,10 @@ def _product(lb: LaplaceBeltrami | Conducting, number: int, x: Tensor) -> Tensor
     return symmetric_product(crow, col, values[number].to(x), x)
 
 
-def _mass(lb: LaplaceBeltrami, x: Tensor) -> Tensor:
-    return _product(lb, 1, x) if lb.has_weak_form else x
-
-
 class _Solve(torch.autograd.Function):
     """u of S(t)u = b: (M + tK)u = b, or Ku = b for a time of None; zero at Dirichlet points.
 
-    Its derivatives are solves with the same matrix: S⁻ᵀg in b, −⟨S⁻ᵀg, S'(t)u⟩ in t, and −t⟨S⁻ᵀg, K'(κ)(u + g)⟩ in the
+    Its derivatives are solves with the same matrix: S⁻¹g in b, −⟨S⁻¹g, Ku⟩ in t, and −t⟨S⁻¹g, K'(κ)(u + g)⟩ in the
     conductivity κ, g the `given` values at the boundary.
     """
 
@@ -268,11 +250,10 @@ class _Solve(torch.autograd.Function):
     def backward(ctx: Any, g: Tensor) -> tuple[Any, ...]:  # pyright: ignore
         time, u, conductivity, given = ctx.saved_tensors
         lb, tolerance = ctx.rest
-        w = solve_columns(lb, g, time, tolerance, True).to(g.dtype)  # pyright: ignore[reportCallIssue]
+        w = solve_columns(lb, g, time, tolerance).to(g.dtype)  # pyright: ignore[reportCallIssue]
         grad_t = None
         if time is not None and ctx.needs_input_grad[1]:
-            slope = _product(lb, 0, u) if lb.has_weak_form else -lb(u)
-            grad_t = -(w * slope).sum(0).to(time)
+            grad_t = -(w * _product(lb, 0, u)).sum(0).to(time)
         grad_kappa = None
         if conductivity is not None and ctx.needs_input_grad[2]:
             whole = u if given is None else u + given

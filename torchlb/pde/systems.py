@@ -1,7 +1,7 @@
-"""The linear systems behind implicit steps and Poisson problems, by the weak pair or by the stencil.
+"""The linear systems behind implicit steps and Poisson problems.
 
 A system is a K + b M, K with what a Robin condition adds to it, with the rows and columns of Dirichlet points taken
-out. The weak pair is solved by conjugate gradients; the factor of the linear pair, which is spectrally close and 20
+out. It is solved by conjugate gradients; the factor of the linear pair, which is spectrally close and 20
 times sparser, preconditions them (`method.md`, section 10). Where rows of the fits have large weights, K is up to
 thirty times stiffer than K₁ at single points, in functions that live there: smoothing before and after the factor's
 solve then takes a third of the steps. Many times of one call share factors, those of powers of four. Factors are kept
@@ -26,13 +26,12 @@ from torch import Tensor
 from torch.utils.weak import WeakIdKeyDictionary
 
 from torchlb.linalg.conjugate_gradients import Linear, conjugate_gradients
-from torchlb.linalg.factor import Factor, factorized
+from torchlb.linalg.factor import Factor
 from torchlb.linalg.sparse import multiply, to_scipy
 from torchlb.linalg.two_levels import Matrix, absolute_row_sums, main_entries, two_levels
 from torchlb.operator.batching import shapes_of
 from torchlb.operator.laplace_beltrami import LaplaceBeltrami
 from torchlb.pde.conduction import Conducting
-from torchlb.stability.null_vector import has_outflow
 
 KEPT = 8
 """Factors that are kept for each operator."""
@@ -58,12 +57,6 @@ def pair_system(lb: Operator) -> PairSystem:
     return _kept(kept, None, lambda: PairSystem(lb))
 
 
-def stencil_system(lb: Operator, t: float | None) -> StencilSystem:
-    """That of an implicit step of a time t, or of a Poisson problem for None, by the stencil."""
-    kept = _SYSTEMS.setdefault(lb.values, OrderedDict())
-    return _kept(kept, t, lambda: StencilSystem(lb, t))
-
-
 def _kept(kept: OrderedDict[Any, Any], key: Any, make: Callable[[], Any]) -> Any:
     """What is kept under a key, made where it is not; what was not used for longest goes."""
     if key not in kept:
@@ -79,44 +72,30 @@ def solve_columns(
     b: Float[Tensor, "N C"],
     time: Float[Tensor, " C"] | None,
     tolerance: float | None,
-    transposed: bool = False,
 ) -> Float[Tensor, "N C"]:
-    """(M + tK)⁻¹b of every column by its time, or K⁻¹b for a time of None; with the stencil 1 − tL and −L.
+    """(M + tK)⁻¹b of every column by its time, or K⁻¹b for a time of None.
 
-    A time of 0 has M, or 1, to invert. A tolerance of None takes linear elements for the pair.
+    A time of 0 has M to invert. A tolerance of None takes linear elements for the pair.
     """
     shapes = shapes_of(lb)
-    if shapes and all(shape.has_weak_form == lb.has_weak_form for shape in shapes):
+    if shapes:
         blocks = zip(shapes, b.split([shape.num_points for shape in shapes]), strict=True)
-        parts = [solve_columns(s, part, time, tolerance, transposed) for s, part in blocks]
-        return torch.cat(parts)
-    time = None if time is None else time.detach()
-    if lb.has_weak_form:
-        return pair_system(lb).solve(b, time, tolerance)
-    if time is None:
-        return stencil_system(lb, None).solve(b, transposed)
-    u = torch.zeros_like(b, dtype=torch.float64)
-    for t in time.unique().tolist():
-        u[:, time == t] = stencil_system(lb, t).solve(b[:, time == t], transposed)
-    return u
+        return torch.cat([solve_columns(s, part, time, tolerance) for s, part in blocks])
+    return pair_system(lb).solve(b, None if time is None else time.detach(), tolerance)
 
 
 class _Components:
     """Means over the connected components of a shape, and which of them a condition holds: on these K is regular."""
 
-    def __init__(self, lb: Operator, held_rows: np.ndarray | None = None) -> None:
-        if isinstance(lb, LaplaceBeltrami) and not lb.has_weak_form:
-            crow, col = lb.crow, lb.col
-        else:
-            crow, col, _ = lb.linear_pair
+    def __init__(self, lb: Operator) -> None:
+        crow, col, _ = lb.linear_pair
         where = (np.ones(len(col)), col.cpu().numpy(), crow.cpu().numpy())
         graph = sparse.csr_array(where, shape=lb.shape)
         self.count, number = csgraph.connected_components(graph, directed=False)
         self.of = torch.from_numpy(number.astype(np.int64)).to(col.device)
         held = torch.zeros(self.count, device=col.device)
-        rows = lb.losing if held_rows is None else torch.from_numpy(held_rows).to(col.device)
-        if rows is not None:
-            held = held.index_add(0, self.of, rows.float())
+        if lb.losing is not None:
+            held = held.index_add(0, self.of, lb.losing.float())
         if self.count > 1:
             held = held[self.of]
         self.free = (held == 0)[
@@ -296,53 +275,3 @@ class PairSystem:
     def inside(self, x: Tensor) -> Tensor:
         """x, zero at Dirichlet points."""
         return x if self.free is None else x * self.free.to(x)
-
-
-class StencilSystem:
-    """−L, or 1 − tL, of a stencil L, by sparse LU on the CPU.
-
-    Where constants are in the null space of −L, the diagonal entry of one point of the component is made larger: the
-    solution is then zero there, and that of −L, for a right side that the left null vector is orthogonal to.
-    """
-
-    def __init__(self, lb: Operator, t: float | None) -> None:
-        assert isinstance(lb, LaplaceBeltrami)
-        matrix = -sparse.csr_array(lb.to_scipy(), dtype=np.float64)
-        sums = matrix.sum(axis=1)
-        outflow = has_outflow(matrix, torch.finfo(lb.dtype).eps) & lb.loses
-        sums[outflow] = 0
-        matrix = matrix - sparse.diags_array(sums)  # in float32 constants would decay
-        self.free = None if lb.fixed is None else (~lb.fixed).double()[:, None]
-        self.components = _Components(lb, outflow) if t is None else None
-        if self.components is None:
-            matrix = sparse.eye_array(lb.num_points) + t * matrix
-            self.lu = factorized(sparse.csc_array(matrix), 1e-2)
-        else:
-            self.mass = lb.mass.detach().double()[:, None]
-            first = np.unique(self.components.of.cpu(), return_index=True)[1]
-            pin = torch.zeros_like(self.mass)
-            pin[first] = float(np.median(matrix.diagonal()))
-            pin = (pin * self.components.free).cpu().numpy()
-            self.lu = factorized(sparse.csc_array(matrix + sparse.diags_array(pin[:, 0])), 1e-2)
-            self.left_null = torch.from_numpy(self.lu.solve(pin, "T")).to(self.mass)
-
-    def solve(self, b: Float[Tensor, "N C"], transposed: bool = False) -> Float[Tensor, "N C"]:
-        """As for the pair, but exact; `transposed` for the transposed matrix."""
-        b = b.double() if self.free is None else b.double() * self.free
-        if self.components is not None:
-            b = self._without(b, self.mass if transposed else self.left_null, transposed)
-        x = self.lu.solve(b.detach().cpu().numpy(), "T" if transposed else "N")
-        result = torch.from_numpy(x).to(b)
-        result = result if self.free is None else result * self.free
-        if self.components is None:
-            return result
-        return self._without(result, self.left_null if transposed else self.mass, transposed)
-
-    def _without(self, x: Tensor, weights: Tensor, transposed: bool) -> Tensor:
-        """Without constants, in the sense of the weights, or without the weights, in the sum."""
-        assert self.components is not None
-        ones = torch.ones_like(weights)
-        area = self.components.sums(ones, weights)
-        one, other = (ones, weights) if transposed else (weights, ones)
-        less = other * self.components.sums(one, x) / area
-        return x - torch.where(self.components.free, less, 0.0)

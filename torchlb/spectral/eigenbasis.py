@@ -42,26 +42,24 @@ class Spectral(Protocol):
 
 
 class Eigenbasis:
-    """Eigenpairs of −Δ: real, ascending, orthonormal in the mass.
+    """Eigenpairs of −Δ, K φ = λ M φ: real, ascending, orthonormal in M.
 
     Attributes
     ----------
-    eigenvalues : (k,), 1/ℓ², ≥ 0 and ascending, exactly 0 once for every connected component (but one with a Dirichlet
-        boundary); (S, k) for a batch of S shapes, each with its own.
-    eigenvectors : Φ, (N, k), ΦᵀΠΦ = I; the first is constant. For a batch, those of each shape on its own rows; a
-        shape of fewer than k points has zero columns at the end.
-    mass : π, (N,), ℓ^d.
-    left : W, (N, k), WᵀΦ = I: left eigenvectors of Δ, for the oblique projector ΦWᵀ. Equal to ΠΦ if ΠΔ is symmetric,
-        to MΦ for a symmetric pair (K, M).
-    sizes : numbers of points of the shapes of a batch; None for a single shape.
-    decay_rates : (2, k) or (S, 2, k): real and imaginary parts of the eigenvalues of B = −WᵀΔΦ, in 1/ℓ².
-    modal_transform : (3, k, k) or (S, 3, k, k): V, V⁻¹ and JV⁻¹ with BV = V(decay_rates[0] − decay_rates[1] J), J a
-        quarter turn in each conjugate pair. Both are there only where the span is invariant: see `is_invariant`.
-    is_symmetric : whether they are eigenpairs of a symmetric pair, KΦ = MΦΛ with ΦᵀMΦ = I. Coefficients are then those
-        of the full mass matrix, decay rates the eigenvalues, every part of the span is invariant, and the two above
-        are None.
-    relative_errors : (k,) or (S, k), estimates for the eigenvalues of a symmetric pair; None if they were not made. NaN
-        for the other shapes of a batch of both kinds, in which those of a pair have the two above, too.
+    eigenvalues
+        (k,), 1/ℓ², ≥ 0 and ascending, exactly 0 once for every connected component (but one where a condition takes
+        something away); (S, k) for a batch of S shapes, each with its own.
+    eigenvectors
+        Φ, (N, k), ΦᵀMΦ = I; the first is constant. For a batch, those of each shape on its own rows; a shape of fewer
+        than k points has zero columns at the end.
+    mass
+        (N,), ℓ^d: the weights of the operator.
+    left
+        MΦ, (N, k): what functions are multiplied by for their coefficients.
+    sizes
+        Numbers of points of the shapes of a batch; None for a single shape.
+    relative_errors
+        (k,) or (S, k), estimates for the eigenvalues; None if they were not made.
     """
 
     def __init__(
@@ -71,16 +69,11 @@ class Eigenbasis:
         mass: Float[Tensor, " N"],
         left: Float[Tensor, "N k"],
         sizes: tuple[int, ...] | None = None,
-        decay_rates: Float[Tensor, "*S 2 k"] | None = None,
-        modal_transform: Float[Tensor, "*S 3 k k"] | None = None,
-        *,
-        is_symmetric: bool = False,
         relative_errors: Float[Tensor, "*S k"] | None = None,
     ) -> None:
         self.eigenvalues, self.eigenvectors = eigenvalues, eigenvectors
         self.mass, self.left, self.sizes = mass, left, sizes
-        self.decay_rates, self.modal_transform = decay_rates, modal_transform
-        self.is_symmetric, self.relative_errors = is_symmetric, relative_errors
+        self.relative_errors = relative_errors
 
     def __repr__(self) -> str:
         n, k = self.eigenvectors.shape
@@ -88,44 +81,25 @@ class Eigenbasis:
         last = float(self.eigenvalues.max()) if k else 0.0
         return f"Eigenbasis({k} pairs of {n} points{shapes}, eigenvalues 0 to {last:.4g})"
 
-    @property
-    def is_invariant(self) -> bool:
-        """Whether the span is invariant under Δ, and the exact e^{tΔ} on it is at hand."""
-        return self.is_symmetric or self.modal_transform is not None
-
     def truncate(self, k: int) -> Eigenbasis:
         """The first k of the pairs; itself if there are no more."""
         if k >= self.eigenvectors.shape[1]:
             return self
         cut = (self.eigenvalues[..., :k], self.eigenvectors[:, :k], self.mass, self.left[:, :k])
         errors = None if self.relative_errors is None else self.relative_errors[..., :k]
-        symmetric = {"is_symmetric": self.is_symmetric, "relative_errors": errors}
-        return Eigenbasis(*cut, sizes=self.sizes, **symmetric)
+        return Eigenbasis(*cut, sizes=self.sizes, relative_errors=errors)
 
     def to_basis(
         self, f: Shaped[Tensor, "*B N C"] | Shaped[Tensor, " N"]
     ) -> Float[Tensor, "*S k C"] | Float[Tensor, "*S k"]:
-        """Coefficients Φᵀ(πf), ΦᵀMf for a symmetric pair, (…, k, C), or (…, S, k, C) for a batch of shapes.
+        """Coefficients ΦᵀMf, (…, k, C), or (…, S, k, C) for a batch of shapes.
 
         (k,), or (S, k), for f (N,). In the type of f, that of the basis where f are integers; computed in that of f,
         at least float32. InputError for another number of points, and for NaN or infinity in f.
         """
-        coefficients = self.analyse(self.functionals, f)
-        check_finite(f)
-        return coefficients
-
-    def to_basis_obliquely(
-        self, f: Shaped[Tensor, "*B N C"] | Shaped[Tensor, " N"]
-    ) -> Float[Tensor, "*S k C"] | Float[Tensor, "*S k"]:
-        """Coefficients Wᵀf: zero on every left-over eigenvector of Δ, which Φᵀ(πf) is not."""
         coefficients = self.analyse(self.left, f)
         check_finite(f)
         return coefficients
-
-    @property
-    def functionals(self) -> Float[Tensor, "N k"]:
-        """ΠΦ, or MΦ for a symmetric pair: what `to_basis` multiplies by."""
-        return self.left if self.is_symmetric else self.mass[:, None] * self.eigenvectors
 
     def from_basis(
         self, coefficients: Shaped[Tensor, "*S k C"] | Shaped[Tensor, "*S k"]
@@ -199,13 +173,7 @@ def unstack_eigenbases(basis: Eigenbasis) -> list[Eigenbasis]:
         k = int((vectors != 0).any(0).sum())
         pairs = (basis.eigenvalues[s, :k], vectors[:, :k], mass, left[:, :k])
         errors = None if basis.relative_errors is None else basis.relative_errors[s, :k]
-        if errors is not None and not errors.isnan().any():
-            parts.append(Eigenbasis(*pairs, is_symmetric=True, relative_errors=errors))
-        elif basis.decay_rates is None or basis.modal_transform is None:
-            parts.append(Eigenbasis(*pairs, is_symmetric=basis.is_symmetric))
-        else:
-            modes = (basis.decay_rates[s, :, :k], basis.modal_transform[s, :, :k, :k])
-            parts.append(Eigenbasis(*pairs, None, *modes))
+        parts.append(Eigenbasis(*pairs, relative_errors=errors))
     return parts
 
 
@@ -213,39 +181,21 @@ def stack_eigenbases(bases: list[Eigenbasis]) -> Eigenbasis:
     """One basis of a batch from those of its shapes, padded to the longest by zero columns."""
     k = max(basis.eigenvectors.shape[1] for basis in bases)
 
-    def padded(t: Tensor, sides: int) -> Tensor:
-        return torch.nn.functional.pad(t, (0, k - t.shape[-1]) * sides)
+    def padded(t: Tensor) -> Tensor:
+        return torch.nn.functional.pad(t, (0, k - t.shape[-1]))
 
     def extended(t: Tensor) -> Tensor:
         return torch.cat([t, t[-1:].expand(k - len(t))])
 
-    is_symmetric = all(basis.is_symmetric for basis in bases)
-    decay_rates = modal_transform = relative_errors = None
-    if any(basis.relative_errors is not None for basis in bases):
-        unknown = torch.nan * bases[0].eigenvalues
-        errors = [unknown[:1] if b.relative_errors is None else b.relative_errors for b in bases]
+    relative_errors = None
+    if all(basis.relative_errors is not None for basis in bases):
+        errors = [b.relative_errors for b in bases if b.relative_errors is not None]
         relative_errors = torch.stack([extended(each) for each in errors])
-    if all(basis.is_invariant for basis in bases) and not is_symmetric:
-        modes = [_modes(basis) for basis in bases]
-        decay_rates = torch.stack([padded(rates, 1) for rates, _ in modes])
-        modal_transform = torch.stack([padded(transform, 2) for _, transform in modes])
     return Eigenbasis(
         torch.stack([extended(b.eigenvalues) for b in bases]),
-        torch.cat([padded(b.eigenvectors, 1) for b in bases]),
+        torch.cat([padded(b.eigenvectors) for b in bases]),
         torch.cat([b.mass for b in bases]),
-        torch.cat([padded(b.left, 1) for b in bases]),
+        torch.cat([padded(b.left) for b in bases]),
         tuple(len(b.mass) for b in bases),
-        decay_rates,
-        modal_transform,
-        is_symmetric=is_symmetric,
-        relative_errors=relative_errors,
+        relative_errors,
     )
-
-
-def _modes(basis: Eigenbasis) -> tuple[Tensor, Tensor]:
-    """Decay rates and modal transform; of a symmetric pair the eigenvalues and 1, 1, 0."""
-    if basis.decay_rates is not None and basis.modal_transform is not None:
-        return basis.decay_rates, basis.modal_transform
-    rates = basis.eigenvalues
-    one = torch.eye(len(rates)).to(rates)
-    return torch.stack([rates, 0 * rates]), torch.stack([one, one, 0 * one])

@@ -26,8 +26,8 @@ from torchlb.linalg.krylov import prefers_krylov
 from torchlb.linalg.lanczos import Inverse, lanczos_of_pair
 from torchlb.linalg.sparse import multiply, on_one_pattern
 from torchlb.linalg.two_levels import Matrix, absolute_row_sums, main_entries, two_levels
+from torchlb.spectral.components import GAP, constants, members
 from torchlb.spectral.eigenbasis import Eigenbasis
-from torchlb.spectral.eigensolver import GAP, constants, members
 
 TOLERANCE, LOOSEST = 1.5e-8, 1e-3
 """Times k², since errors of quadratic elements grow with λ², and at most: one sweep, in general, or one and a half."""
@@ -393,6 +393,4 @@ def _merged(
     arrays = (values / square, phi, left, errors)
     eigenvalues, eigenvectors, left, errors = (torch.from_numpy(x) for x in arrays)
     mass = mass.detach().cpu().double()
-    return Eigenbasis(
-        eigenvalues, eigenvectors, mass, left, is_symmetric=True, relative_errors=errors
-    )
+    return Eigenbasis(eigenvalues, eigenvectors, mass, left, relative_errors=errors)

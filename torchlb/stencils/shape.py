@@ -205,8 +205,8 @@ def mesh_shape(
 
     `condition` holds on its boundary, or on the part of it that is the mask `boundary`; None leaves it alone. With
     `areas` given there are no low-order rows. `fit_degrees` asks for `fits` of the first of them that passes. Where
-    faces overlap, `shares` says which part of each counts, and only `boundary` where the shape ends. Triangles that are not
-    given, but found through a cloud, are not `on_mesh`.
+    faces overlap, `shares` says which part of each counts, and only `boundary` where the shape ends. Triangles that are
+    not given, but found through a cloud, are not `on_mesh`.
     """
     sides = None
     hypersurface = faces.shape[1] == vertices.shape[1] and faces.shape[1] < 4

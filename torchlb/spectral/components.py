@@ -1,0 +1,48 @@
+"""Connected components of a shape, and the functions that are constant on each: the null space of K."""
+
+from __future__ import annotations
+
+import numpy as np
+from jaxtyping import Float
+from scipy import linalg
+
+GAP = 1e-7
+"""Eigenvalues closer than this, relatively, are not separated: exact multiplicities stay whole."""
+
+
+def members(component: np.ndarray) -> list[np.ndarray]:
+    """The points of every component, ascending, of the component of each point.
+
+    >>> members(np.array([0, 1, 0]))
+    [array([0, 2]), array([1])]
+    """
+    order = np.argsort(component, kind="stable")
+    return np.split(order, np.cumsum(np.bincount(component))[:-1])
+
+
+def constants(
+    component: np.ndarray, areas: Float[np.ndarray, " P"], k: int
+) -> Float[np.ndarray, "N k"]:
+    """The first k of orthonormal functions that are constant on every component; the first is so everywhere.
+
+    They vanish on components whose area is given as 0; k is at most the number of the others.
+
+    >>> constants(np.array([0, 0, 1]), np.array([2.0, 2.0]), 2)
+    array([[ 0.5,  0.5],
+           [ 0.5,  0.5],
+           [ 0.5, -0.5]])
+    """
+    if k == 0:
+        return np.zeros((len(component), 0))
+    on = areas > 0
+    root = np.sqrt(areas[on])
+    values = np.zeros((len(areas), k))
+    values[on] = global_first(root, k) / root[:, None]
+    values[on, 0] = 1 / linalg.norm(root)
+    return values[component]
+
+
+def global_first(root: Float[np.ndarray, " P"], k: int) -> Float[np.ndarray, "P k"]:
+    """Orthonormal columns, the first along √area, with which the constants of components are recombined."""
+    t = np.linalg.qr(np.column_stack([root, np.eye(len(root), k - 1)]))[0]
+    return t * np.sign(t[0, 0])
