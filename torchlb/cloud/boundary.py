@@ -10,18 +10,12 @@ from scipy.spatial import KDTree
 from torch import Tensor
 
 from torchlb.cloud.frames import cloud_frames
-from torchlb.cloud.voronoi import cell_volume, largest_gap, nearest_graph, unrolled
-from torchlb.errors import InputError
+from torchlb.cloud.voronoi import cell_volume, nearest_graph, unrolled
 from torchlb.geometry.boundary import BoundaryPlan
-from torchlb.geometry.neighbors import AT_ONCE, GraphBalls, nearest_neighbors
+from torchlb.geometry.neighbors import nearest_neighbors
 
 INSIDE = 4
 """Nearest points off the boundary, on whose side the shape is."""
-
-
-OPEN_ANGLE, NEAREST = 2.3, 32
-"""Radians of the tangent plane without any of so many nearest points that make a point of a cloud a boundary point.
-Of 16, two in a hundred random points leave as much open, of 32 none in a thousand."""
 
 
 @dataclass(frozen=True)
@@ -73,20 +67,3 @@ def boundary_of_cloud(
     if dim == 1:
         return plan
     return plan.with_fits(points, nearest_graph(own, plan.initial(points), near), degree)
-
-
-def detect_boundary(
-    points: Float[Tensor, "N n"], frames: Float[Tensor, "N n d"], balls: GraphBalls
-) -> Bool[Tensor, " N"]:
-    """Points of a surface cloud whose 32 nearest leave an angle of 130° or more open in the tangent plane.
-
-    Raises ValueError for other dimensions: give the mask there.
-    """
-    if frames.shape[-1] != 2:
-        raise InputError("boundary: can be detected on surfaces only; give the mask of its points")
-    masks = []
-    for centers in torch.arange(len(points)).split(AT_ONCE):
-        index, count = balls(centers, NEAREST)
-        coords = (points[index[:, 1:]] - points[centers, None]) @ frames[centers]
-        masks.append(largest_gap(coords, torch.arange(1, NEAREST) < count[:, None]) > OPEN_ANGLE)
-    return torch.cat(masks)

@@ -19,6 +19,9 @@ from torch import Tensor
 from torchlb.geometry.admission import mutually_admissible, planes_of
 from torchlb.geometry.neighbors import adjacency
 
+VOID = 1.5
+"""A natural neighbour on a surface or beyond may be this many times farther than the nearest ones; at an open end all
+else would be. A curve has two, and one at its end."""
 AHEAD = 0.5
 """Least cosine between a neighbour and a direction in which it lies."""
 
@@ -114,49 +117,6 @@ def cell_volume(
     return unit_ball * volume.mean(1)
 
 
-def cell_laplacian(
-    coords: Float[Tensor, "B K d"], valid: Bool[Tensor, "B K"], volume: Float[Tensor, " B"]
-) -> Float[Tensor, "B K"]:
-    r"""Finite-volume weights w_j ≥ 0 of Δf ≈ Σ_j w_j (f_j − f_i), 1/ℓ².
-
-    .. math:: w_j = \frac{A_j}{V |y_j|} = \frac{2 d\, s_j}{|y_j|^2}
-
-    with A_j the face towards j, V the `volume` of the cell and s_j the share of V that lies before the face. An
-    M-matrix row: stable, with the right trace, though not consistent on uneven points. Open parts of the cell let no
-    flux through.
-    On surfaces the faces are exact, so that linear functions have Δ = 0 wherever the cell is closed.
-    """
-    square = coords.square().sum(-1).clamp_min(torch.finfo(coords.dtype).tiny)
-    dim = coords.shape[-1]
-    if dim == 2:
-        weights = _star_cotangents(coords, valid) / volume[:, None]
-    else:
-        directions = _directions(coords, valid)
-        inverse, first = _inverse_radius(coords, valid, directions).max(dim=1)
-        closed = inverse >= 2 / square.sqrt().amax(1, keepdim=True)
-        part = torch.where(closed, inverse, torch.inf).pow(-dim)
-        share = torch.zeros_like(square).scatter_add_(1, first, part)
-        total = part.sum(1, keepdim=True).clamp_min(torch.finfo(coords.dtype).tiny)
-        weights = 2 * dim * (share / total) / square
-    # Where no face is left, an equal share for every neighbour: the trace is right and the point stays joined.
-    equal = 2 * dim * valid / (valid.sum(1, keepdim=True).clamp_min(1) * square)
-    return torch.where(weights.sum(1, keepdim=True) > 0, weights, equal)
-
-
-def largest_gap(coords: Float[Tensor, "B K 2"], valid: Bool[Tensor, "B K"]) -> Float[Tensor, " B"]:
-    """Largest angle between neighbours that follow each other around the point, in radians.
-
-    >>> corner = torch.tensor([[[1.0, 0.0], [0.0, 1.0]]])
-    >>> round(float(largest_gap(corner, torch.ones(1, 2, dtype=torch.bool))), 3)
-    4.712
-    """
-    angle = torch.atan2(coords[..., 1], coords[..., 0])
-    low = angle.masked_fill(~valid, torch.inf).amin(1, keepdim=True)
-    ordered = torch.where(valid, angle, low).sort(dim=1).values  # the invalid repeat the first
-    turn = torch.cat([ordered, low + 2 * pi], dim=1)
-    return turn.diff(dim=1).amax(1)
-
-
 def star_of(
     coords: Float[Tensor, "B K 2"], natural: Bool[Tensor, "B K"]
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
@@ -182,36 +142,6 @@ def unrolled(
     coords = offset @ frames
     length = coords.norm(dim=-1, keepdim=True).clamp_min(torch.finfo(coords.dtype).tiny)
     return coords * (offset.norm(dim=-1, keepdim=True) / length)
-
-
-def _star_cotangents(
-    coords: Float[Tensor, "B K 2"], valid: Bool[Tensor, "B K"]
-) -> Float[Tensor, "B K"]:
-    """½(cot α + cot β) over the triangles of the star: the natural neighbours in turn around the point.
-
-    A gap of nearly a half-turn (177°) or more is open and has no triangle. Negative values, at obtuse ends, become 0.
-    """
-    natural = natural_neighbors(coords, valid)
-    angle, order, following, real = star_of(coords, natural)
-    here = coords.take_along_dim(order[..., None], dim=1)
-    there = here.take_along_dim(following[..., None], dim=1)
-    twice_area = here[..., 0] * there[..., 1] - here[..., 1] * there[..., 0]
-    flat = 0.05 * here.norm(dim=-1) * there.norm(dim=-1)
-    triangle = real & (twice_area > flat)
-    denominator = torch.where(triangle, twice_area, 1.0)
-    # The angle opposite the edge to `here` sits at `there`, and the other way round.
-    at_there = ((there - here) * there).sum(-1) / denominator
-    at_here = ((here - there) * here).sum(-1) / denominator
-    weights = torch.zeros_like(angle)
-    weights += torch.where(triangle, at_there, 0.0) / 2
-    weights.scatter_add_(1, following, torch.where(triangle, at_here, 0.0) / 2)
-    result = torch.zeros_like(weights).scatter_(1, order, weights)
-    return torch.where(natural, result.clamp_min(0), 0.0)
-
-
-VOID = 1.5
-"""A natural neighbour on a surface or beyond may be this many times farther than the nearest ones; at an open end all
-else would be. A curve has two, and one at its end."""
 
 
 def nearest_graph(
