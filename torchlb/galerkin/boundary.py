@@ -24,7 +24,7 @@ from torchlb.galerkin.elements import inner, subsets
 from torchlb.galerkin.nodes import Nodes, lagrange_nodes
 from torchlb.galerkin.prolongation import prolongation
 from torchlb.galerkin.rim import RimPlan, rim_plan
-from torchlb.geometry.boundary import boundary_creases
+from torchlb.geometry.boundary import boundary_creases, outer_faces
 from torchlb.geometry.fit_search import FitSearch
 from torchlb.geometry.frames import mesh_frames
 from torchlb.geometry.local_fits import FitPlan, LocalFits
@@ -164,10 +164,8 @@ class OnSurface:
     ) -> OnSurface:
         """Decide: the fits are of these degrees."""
         facets, on_edge = nodes.sides[3], nodes.degree - 1
-        cell, place = (facets.uses[facets.of] == 1).nonzero(as_tuple=True)
-        outer = facets.of[cell, place]
-        outside = _facing_out(points, facets.corners[outer], nodes.cells[cell])
-        vertices, cells = torch.unique(outside, return_inverse=True)
+        outer = (facets.uses == 1).nonzero()[:, 0]
+        vertices, cells = torch.unique(outer_faces(points, nodes.cells), return_inverse=True)
         places, count = points[vertices], len(vertices)
         balls = GraphBalls(places, mesh_graph(cells, count), mesh_frames(places, cells))
         plan, fits = FitSearch(balls, 0, degrees).finish()
@@ -201,15 +199,3 @@ class OnSurface:
         weights = torch.from_numpy(p.tocoo().data)[kept]
         entries = self.here[node[kept]], self.vertices[vertex[kept]], weights
         return BoundaryNodes(moved, self.here[self.inside], entries)
-
-
-def _facing_out(
-    points: Float[Tensor, "N n"], corners: Int[Tensor, "G 3"], cells: Int[Tensor, "G 4"]
-) -> Int[Tensor, "G 3"]:
-    """Facets of these cells, in R³ wound so that their normals point away from the fourth corners."""
-    if points.shape[1] != 3:
-        return corners
-    a, b, c = points[corners].unbind(1)
-    inward = points[cells.sum(1) - corners.sum(1)] - a
-    turned = (torch.linalg.cross(b - a, c - a) * inward).sum(1) > 0
-    return torch.where(turned[:, None], corners.flip(1), corners)

@@ -9,6 +9,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from torchlb.galerkin.elements import facet_nodes, inner, subsets
+from torchlb.geometry.boundary import sub_simplices
 from torchlb.geometry.vectors import at
 
 
@@ -123,7 +124,7 @@ def lagrange_nodes(
     sides = {1: _vertices(cells, num_points)} if dim == 1 else {}
     corners, shares, elements = [], [], [cells]
     for size in range(2, corners_of_cell + 1):
-        side = sides[size] = _sides(cells, num_points, size, degree, sides.get(2))
+        side = sides[size] = _sides(cells, size, degree, sides.get(2))
         if side.nodes == 0:
             continue
         number = count + side.of[..., None] * side.nodes + torch.arange(side.nodes)
@@ -152,22 +153,14 @@ def _vertices(cells: Int[Tensor, "F corners"], num_points: int) -> Sides:
     return Sides(every, cells, every[:, :0], uses, 0)
 
 
-def _sides(
-    cells: Int[Tensor, "F corners"], num_points: int, size: int, degree: int, edges: Sides | None
-) -> Sides:
+def _sides(cells: Int[Tensor, "F corners"], size: int, degree: int, edges: Sides | None) -> Sides:
     """The sub-simplices with `size` corners, in the order of their corners; the cells themselves as they are."""
     dim, nodes = cells.shape[1] - 1, len(inner(size, degree))
     if size == dim + 1:
         corners, of = cells, torch.arange(len(cells))[:, None]
         uses = torch.ones(len(cells), dtype=torch.int64)
     else:
-        every = torch.stack([cells[:, list(subset)] for subset in subsets(dim, size)], 1)
-        key = every[..., 0]
-        for column in every[..., 1:].unbind(-1):
-            key = key * num_points + column
-        key, of, uses = torch.unique(key, return_inverse=True, return_counts=True)
-        columns = [key // num_points**power % num_points for power in reversed(range(size))]
-        corners = torch.stack(columns, 1)
+        corners, of, uses = sub_simplices(cells, subsets(dim, size))
     if edges is None:
         return Sides(corners, of, torch.arange(len(corners))[:, None], uses, nodes)
     places = {pair: place for place, pair in enumerate(subsets(dim, 2))}

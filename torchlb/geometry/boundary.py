@@ -7,7 +7,9 @@ mesh has a crease, or a corner, ν is the mean of the outer normals around.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from itertools import combinations
 from math import cos, factorial, radians
 
 import torch
@@ -92,7 +94,7 @@ class BoundaryPlan:
         self, points: Float[Tensor, "N n"]
     ) -> tuple[Float[Tensor, "b n"], Float[Tensor, " b"], Float[Tensor, " b"]]:
         """Vectors that leave the shape; sizes and folds, as in `Boundary`."""
-        outward, size = _outward_sums(points, self.sides, self.opposite)
+        outward, size = outward_sums(points, self.sides, self.opposite)
         outward, size = outward[self.members], size[self.members]
         length = outward.norm(dim=1)
         folds = torch.where(self.crease & (length > 0), size / length, 1.0)
@@ -107,33 +109,47 @@ class BoundaryPlan:
         return replace(self, fits=search.finish()[0])
 
 
+def sub_simplices(
+    cells: Int[Tensor, "F v"], places: Sequence[Sequence[int]]
+) -> tuple[Int[Tensor, "S size"], Int[Tensor, "F c"], Int[Tensor, " S"]]:
+    """With corners at these places of cells: each once, ascending; which a cell has; how many cells have each."""
+    ascending = cells.sort(1).values
+    every = torch.stack([ascending[:, list(corners)] for corners in places], 1)
+    base = int(cells.max()) + 1 if len(cells) else 1
+    key = every[..., 0]
+    for column in every[..., 1:].unbind(-1):
+        key = key * base + column
+    key, of, uses = torch.unique(key, return_inverse=True, return_counts=True)
+    columns = [key // base**power % base for power in reversed(range(every.shape[2]))]
+    return torch.stack(columns, 1), of, uses
+
+
 def boundary_faces(faces: Int[Tensor, "F v"]) -> Int[Tensor, "G w"]:
     """Sides of the faces that belong to one face only: edges of triangles, ends of segments.
 
     >>> boundary_faces(torch.tensor([[0, 1, 2], [1, 3, 2]])).tolist()
     [[0, 1], [0, 2], [1, 3], [2, 3]]
     """
-    return _open_sides(faces)[0]
+    return open_sides(faces)[0]
 
 
-def _open_sides(faces: Int[Tensor, "F v"]) -> tuple[Int[Tensor, "G w"], Int[Tensor, " G"]]:
-    """`boundary_faces`, and of each the corner of its face that lies opposite."""
-    corners = faces.shape[1]
-    sides = torch.cat(
-        [faces[:, [c for c in range(corners) if c != left]] for left in range(corners)]
-    )
-    opposite = faces.T.reshape(-1)
-    if len(faces) == 0:
-        return sides, opposite
-    sides = sides.sort(dim=1).values
-    base = int(faces.max()) + 1
-    key = sides[:, 0]
-    for column in sides.T[1:]:
-        key = key * base + column
-    order = key.argsort(stable=True)
-    _, count = torch.unique_consecutive(key[order], return_counts=True)
-    first = order[(count.cumsum(0) - count)[count == 1]]
-    return sides[first], opposite[first]
+def open_sides(cells: Int[Tensor, "F v"]) -> tuple[Int[Tensor, "G w"], Int[Tensor, " G"]]:
+    """`boundary_faces`, and of each the corner of its cell that lies opposite."""
+    count = cells.shape[1]
+    sides, of, uses = sub_simplices(cells, list(combinations(range(count), count - 1)))
+    cell, place = (uses[of] == 1).nonzero(as_tuple=True)
+    number, order = of[cell, place].sort()
+    return sides[number], cells[cell[order]].sum(1) - sides[number].sum(1)
+
+
+def outer_faces(points: Float[Tensor, "N n"], cells: Int[Tensor, "F 4"]) -> Int[Tensor, "G 3"]:
+    """The boundary of tetrahedra, in R³ wound so that normals point outwards."""
+    sides, opposite = open_sides(cells)
+    if points.shape[1] != 3:
+        return sides
+    a, b, c = points[sides].unbind(1)
+    turned = (torch.linalg.cross(b - a, c - a) * (points[opposite] - a)).sum(1) > 0
+    return torch.where(turned[:, None], sides.flip(1), sides)
 
 
 def boundary_of_mesh(
@@ -143,13 +159,13 @@ def boundary_of_mesh(
 
     `degree` is that of the fits to the boundary's tangents.
     """
-    sides, opposite = _open_sides(faces)
+    sides, opposite = open_sides(faces)
     if len(sides) == 0:
         return None
     mask = torch.zeros(len(vertices), dtype=torch.bool)
     mask[sides.reshape(-1)] = True
     members = mask.nonzero()[:, 0]
-    outward, size = _outward_sums(vertices, sides, opposite)
+    outward, size = outward_sums(vertices, sides, opposite)
     crease = (outward.norm(dim=1) < SMOOTH * size)[members]
     plan = BoundaryPlan(mask, members, None, sides, opposite, crease)
     if sides.shape[1] == 1:
@@ -162,14 +178,17 @@ def boundary_creases(
     vertices: Float[Tensor, "N n"], cells: Int[Tensor, "F v"]
 ) -> Bool[Tensor, " N"]:
     """Vertices where the boundary of a mesh turns by 60° and more: at the edges and corners of a cube."""
-    outward, size = _outward_sums(vertices, *_open_sides(cells))
+    outward, size = outward_sums(vertices, *open_sides(cells))
     return outward.norm(dim=1) < SHARP * size
 
 
-def _outward_sums(
+def outward_sums(
     vertices: Float[Tensor, "N n"], sides: Int[Tensor, "G w"], opposite: Int[Tensor, " G"]
 ) -> tuple[Float[Tensor, "N n"], Float[Tensor, " N"]]:
-    """Sums at every vertex over its boundary sides: of their outer normals, weighted by their sizes, and of these."""
+    """Sums at every vertex over its boundary sides: of their outer normals, weighted by their sizes, and of these.
+
+    The size of a side is (d − 1)! times its volume.
+    """
     corners = vertices[sides]
     basis, triangle = torch.linalg.qr((corners[:, 1:] - corners[:, :1]).mT)
     size = torch.diagonal(triangle, dim1=-2, dim2=-1).prod(-1).abs()

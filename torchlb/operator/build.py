@@ -16,7 +16,7 @@ from torchlb.galerkin.coarse import lying_triangles, with_area
 from torchlb.galerkin.flips import flipped
 from torchlb.galerkin.nodes import lagrange_nodes
 from torchlb.galerkin.pair import PairPlan, SparsePair, WeakPair, mesh_pair
-from torchlb.geometry.boundary import boundary_faces
+from torchlb.geometry.boundary import open_sides, outward_sums
 from torchlb.geometry.numbering import Numbering
 from torchlb.linalg.threads import threads_for
 from torchlb.operator.assembled import AssembledOperator
@@ -169,11 +169,9 @@ def build_cotangent(vertices: ArrayLike, faces: ArrayLike) -> AssembledOperator:
     row = centers.repeat_interleave(rows.length)
     diagonal = row == rows.col
     weak = [-mass[row] * rows.laplacian, mass[row] * diagonal]
-    rim = boundary_faces(corners)
-    if len(rim):  # lumped, as the mass is
-        length = (vertices[rim[:, 0]] - vertices[rim[:, 1]]).norm(dim=1)
-        share = torch.zeros_like(mass).index_add(0, rim.flatten(), length.repeat_interleave(2) / 2)
-        weak.append(share[row] * diagonal)
+    _, length = outward_sums(vertices, *open_sides(corners))
+    if length.any():  # lumped, as the mass is
+        weak.append(length[row] / 2 * diagonal)
     pair = WeakPair(SparsePair(rows.crow, rows.col, torch.stack(weak)))
     return replace(AssembledOperator.of(rows, shape, pair, "cotangent", {}), faces=corners)
 

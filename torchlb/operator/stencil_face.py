@@ -34,8 +34,8 @@ class StencilFace(OperatorStorage):
     def forward(self, f: Float[Tensor, "*batch N C"] | Float[Tensor, " N"]) -> Tensor:
         """Δf, of the shape of f: (N,), (N, C) or (B, N, C) on one surface. Units of f by 1/ℓ².
 
-        Near a boundary that of functions which satisfy its condition, ∂f/∂ν = 0 or f = 0; of any other it is far off
-        there, and `divergence(gradient(f))` is right.
+        Near a boundary that of functions which satisfy its condition, ∂f/∂ν + a f = 0 or f = 0; of any other it is
+        far off there, and `divergence(gradient(f))` is right.
         """
         return self._apply_rows(self.values, f)
 

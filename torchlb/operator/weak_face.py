@@ -46,8 +46,9 @@ class WeakFace(OperatorStorage):
     def stiffness(self) -> Tensor:
         """K, torch sparse CSR (N, N), ℓ^{d−2}: uᵀKv = ∫∇u·∇v. Symmetric, positive semidefinite, K1 = 0.
 
-        A view of the buffers. A Dirichlet condition leaves it as it is: K also says what values at the boundary, where
-        `fixed` is set, do inside; solves take out its rows and columns. Raises InputError without a weak pair.
+        A view of the buffers. A condition leaves it as it is: K also says what values at a Dirichlet boundary, where
+        `fixed` is set, do inside, and solves take out its rows and columns; what Robin's adds to it is in `pair`.
+        Raises InputError without a weak pair.
         """
         return csr_tensor(*self.parts_of("stiffness"), self.num_points)
 

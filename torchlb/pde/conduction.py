@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from torch import Tensor
 
 from torchlb.errors import InputError, first_few
@@ -27,47 +27,14 @@ class Conducting:
     pair: tuple[Tensor, Tensor, Tensor]
     linear_pair: tuple[Tensor, Tensor, Tensor]
 
-    has_weak_form = True
+    def __getattr__(self, name: str) -> Any:
+        """What κ does not change, as of the operator."""
+        return getattr(self.lb, name)
 
     @property
     def values(self) -> Tensor:
         """What factors are kept by."""
         return self.pair[2]
-
-    @property
-    def linear_crow(self) -> Tensor:
-        """Empty where (K, M) is linear itself."""
-        return self.lb.linear_crow
-
-    @property
-    def fixed(self) -> Bool[Tensor, " N"] | None:
-        """As of the operator."""
-        return self.lb.fixed
-
-    @property
-    def losing(self) -> Bool[Tensor, " N"] | None:
-        """As of the operator."""
-        return self.lb.losing
-
-    @property
-    def mass(self) -> Tensor:
-        """As of the operator."""
-        return self.lb.mass
-
-    @property
-    def num_points(self) -> int:
-        """N."""
-        return self.lb.num_points
-
-    @property
-    def dim(self) -> int:
-        """Dimension d."""
-        return self.lb.dim
-
-    @property
-    def shape(self) -> tuple[int, int]:
-        """(N, N)."""
-        return self.lb.shape
 
     def slope(
         self, conductivity: Tensor, w: Float[Tensor, "N C"], u: Float[Tensor, "N C"]

@@ -130,10 +130,10 @@ def potential(
     *,
     tolerance: float | None = None,
 ) -> Float[Tensor, "*B N C"]:
-    """u with −Δu = s − ∇·v, of mean zero, for a tangent field v, given in the frames, and a source s; differentiable.
+    """u with −Δu = s − ∇·v for a tangent field v, given in the frames, and a source s; differentiable.
 
-    Ku = Σ_c G_cᵀ(π v_c) + π s, G the rows of the gradient and π the mass. For a field alone u's gradient is closest to
-    it; where v = ∇f it is f less its mean, up to the order.
+    Ku = Σ_c G_cᵀ(π v_c) + π s, G the rows of the gradient and π the mass. Of mean zero, where no condition holds u. For
+    a field alone u's gradient is closest to it; where v = ∇f it is f less its mean, up to the order.
 
     Parameters
     ----------

@@ -98,9 +98,7 @@ class _Components:
             held = held.index_add(0, self.of, lb.losing.float())
         if self.count > 1:
             held = held[self.of]
-        self.free = (held == 0)[
-            :, None
-        ]  # points of components without; one for all if there is one
+        self.free = (held == 0)[:, None]  # of the points; one for all if there is one component
 
     def sums(self, weights: Float[Tensor, "N 1"], x: Float[Tensor, "N C"]) -> Float[Tensor, "_ C"]:
         """Of every point the weighted sum over its component; one row for all where there is one component."""

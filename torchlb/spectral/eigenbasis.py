@@ -50,8 +50,8 @@ class Eigenbasis:
         (k,), 1/ℓ², ≥ 0 and ascending, exactly 0 once for every connected component (but one where a condition takes
         something away); (S, k) for a batch of S shapes, each with its own.
     eigenvectors
-        Φ, (N, k), ΦᵀMΦ = I; the first is constant. For a batch, those of each shape on its own rows; a shape of fewer
-        than k points has zero columns at the end.
+        Φ, (N, k), ΦᵀMΦ = I; the first is constant where its eigenvalue is 0. For a batch, those of each shape on its
+        own rows; a shape of fewer than k points has zero columns at the end.
     mass
         (N,), ℓ^d: the weights of the operator.
     left

@@ -169,8 +169,8 @@ def diffusion_map(
 ) -> Float[Tensor, "N dim"]:
     """Coordinates e^{−λ_k t} φ_k(x) in which distances are diffusion distances (Coifman, Lafon 2006); ℓ^{−d/2}.
 
-    The constants, of λ_0 = 0, are left out; a shape with a Dirichlet condition has none. `k` at least dim + 1 may be
-    given to share a basis. The time is in ℓ². On a cloud of any ambient dimension this is its diffusion map.
+    The constants, of λ_0 = 0, are left out; a shape with a Dirichlet or Robin condition has none. `k` at least dim + 1
+    may be given to share a basis. The time is in ℓ². On a cloud of any ambient dimension this is its diffusion map.
     """
     basis = lb.eigenbasis(max(dim + 1, k or 0))
     values = basis.eigenvalues

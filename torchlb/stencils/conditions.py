@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from copy import copy
 from dataclasses import replace
 from typing import Any, ClassVar, Literal
 
@@ -40,7 +41,7 @@ class Condition:
     """
 
     known: ClassVar[dict[str | None, type[Condition]]] = {}
-    name: ClassVar[str]
+    name: ClassVar[str] = "none"
     conserves: ClassVar[bool] = True
     fixes: ClassVar[bool] = False
     share: float | Float[Tensor, " N"] | None = None
@@ -55,12 +56,26 @@ class Condition:
         """The condition in plain types: its name, or {name: data}."""
         return self.name if self.data is None else {self.name: self.data}
 
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, Condition) and self.plain == other.plain
+
+    def __hash__(self) -> int:
+        return hash(str(self.plain))
+
     def __repr__(self) -> str:
         return repr(self.plain)
 
     def taken(self, points: Int[Tensor, " N"], count: int) -> Condition:
         """That of the points in another order; InputError if it is not one of `count` points."""
-        return self
+        if not isinstance(self.share, Tensor):
+            return self
+        if len(self.share) != count:
+            raise InputError(
+                f"{self!r}: expected one a, or one of each of {count} points, got {len(self.share)}"
+            )
+        other = copy(self)
+        other.share = self.share[points]
+        return other
 
     def finish(
         self,
@@ -70,8 +85,13 @@ class Condition:
         centers: Int[Tensor, " B"],
         rows: Rows,
     ) -> Rows:
-        """The rows of `centers` as they stand in the operator."""
-        return rows
+        """The rows of `centers` as they stand: those of low order, without data, lose a f through their share."""
+        if self.share is None or self.conserves:
+            return rows
+        lost = self.share * boundary.sizes / areas
+        local = torch.arange(len(centers)).repeat_interleave(rows.length)
+        own = (centers[local] == rows.col) & (rows.order == 0)[local]
+        return replace(rows, laplacian=rows.laplacian - torch.where(own, lost[rows.col], 0.0))
 
 
 Condition.known[None] = Condition
@@ -153,45 +173,11 @@ class Robin(Condition):
                 f"Robin: expected finite a ≥ 0, got {float(share.reshape(-1)[bad[0]]):.3g}{where}; with a < 0 more "
                 "comes in the more there is, and Δ may have positive eigenvalues"
             )
-        self._a, self.share = share, share if share.ndim else float(share)
-
-    @property
-    def data(self) -> float | list[float]:
-        """a, as a number or a list."""
-        return self._a.tolist()
-
-    def __eq__(self, other: object) -> bool:
-        return isinstance(other, Robin) and self.data == other.data
-
-    def __hash__(self) -> int:
-        return hash(str(self.data))
+        self.data, self.share = share.tolist(), share if share.ndim else float(share)
 
     def __repr__(self) -> str:
-        return f"Robin(a of {len(self._a)} points)" if self._a.ndim else f"Robin({self.share})"
-
-    def taken(self, points: Int[Tensor, " N"], count: int) -> Robin:
-        """With a of the points in another order."""
-        if self._a.ndim == 0:
-            return self
-        if len(self._a) != count:
-            raise InputError(
-                f"Robin: expected one a, or one of each of {count} points, got {len(self._a)}"
-            )
-        return Robin(self._a[points])
-
-    def finish(
-        self,
-        points: Float[Tensor, "N n"],
-        areas: Float[Tensor, " N"],
-        boundary: Boundary,
-        centers: Int[Tensor, " B"],
-        rows: Rows,
-    ) -> Rows:
-        """Low-order rows lose a f through their share of the boundary; others have the condition as data."""
-        lost = self._a.to(areas) * boundary.sizes / areas
-        local = torch.arange(len(centers)).repeat_interleave(rows.length)
-        own = (centers[local] == rows.col) & (rows.order == 0)[local]
-        return replace(rows, laplacian=rows.laplacian - torch.where(own, lost[rows.col], 0.0))
+        many = isinstance(self.data, list)
+        return f"Robin(a of {len(self.data)} points)" if many else f"Robin({self.data})"
 
 
 ConditionName = Literal["neumann", "dirichlet"]
