@@ -30,7 +30,7 @@ from torchlb.geometry.boundary import boundary_of_cloud, boundary_of_mesh
 from torchlb.geometry.frames import mesh_frames
 from torchlb.linalg.sparse import to_scipy
 from torchlb.stencils.assemble import Stencils, assemble
-from torchlb.stencils.conditions import Condition, condition_of
+from torchlb.stencils.conditions import Condition, condition_of, kind_of
 from torchlb.stencils.shape import cloud_shape, mesh_shape
 from torchlb.surfaces import Sphere, UnitDisk
 
@@ -207,7 +207,7 @@ def test_values_of_a_belong_to_the_points_in_whichever_order_they_are_given():
 
 
 def test_on_a_part_of_the_boundary():
-    """A quarter of an annulus's worth: the condition on the right end of an interval alone, u = x + 1/a there."""
+    """The right end of an interval alone: the left one stays free, −u″ = 1 has u = (1 − x²)/2 + 1/a."""
     points, segments = interval(60)
     x, right = points[:, 0], torch.arange(60) == 59
     lb = LaplaceBeltrami.from_mesh(points, segments, condition=Robin(A), boundary=right)
@@ -459,6 +459,8 @@ def test_conditions_that_are_not_known_are_refused_by_name(unchecked):
     with pytest.raises(InputError, match="expected one a, or one of each of 200 points, got 3"):
         LaplaceBeltrami.from_mesh(vertices, faces, condition=Robin([1.0, 2.0, 3.0]))
     assert condition_of(Robin([1.0, 2.0]).plain) == Robin([1.0, 2.0])
+    with pytest.raises(InputError, match="'skin' is none; a class of yours has to be imported"):
+        kind_of({"skin": 1.0})
 
 
 def test_another_condition_is_one_class(monkeypatch, tmp_path):
