@@ -14,7 +14,7 @@ import trimesh
 
 import torchlb
 from torchlb import DiffusionNet, LaplaceBeltrami
-from torchlb.surfaces import Circle, Sphere, UnitDisk
+from torchlb.surfaces import Circle, CliffordTorus, Sphere, UnitDisk
 
 ROOT = Path(__file__).parents[1]
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
@@ -130,8 +130,8 @@ TRIGGERS = {
         LaplaceBeltrami.from_mesh(VERTICES, FACES), 0 * VERTICES[:, 0], boundary_values=1.0
     ),
     "boundary_values: only": lambda: torchlb.poisson_solve(
-        LaplaceBeltrami.from_points(Circle().points(30), order=1),
-        torch.zeros(30),
+        LaplaceBeltrami.from_points(CliffordTorus().points(60), dim=2, order=1),
+        torch.zeros(60),
         boundary_values=1.0,
     ),
     "f: expected finite": lambda: torchlb.heat_flow(
