@@ -229,7 +229,7 @@ def _cut(
         ends = points[np.append(chain, chain[:1])] if closed else points[chain]
         step = np.diff(ends, axis=0)
         length = lengths(step)
-        usual = _usual(length, closed)
+        usual = _usual(length, closed) if len(length) > 1 else length
         cosine = inner(step, np.roll(step, 1, 0)) / np.maximum(length * np.roll(length, 1), TINY)
         turn = np.arccos(np.clip(cosine, -1, 1))
         if not closed:

@@ -84,22 +84,24 @@ def warn_of_buried(cells: Int[Tensor, "F corners"], boundary: Bool[Tensor, " N"]
         )
 
 
-def warn_of_near_duplicates(points: Float[Tensor, "N n"], neighbors: Int[Tensor, "N K"]) -> None:
-    """A warning that names points of a surface which are closer to another than chance explains, as if scanned twice.
+def warn_of_near_duplicates(
+    points: Float[Tensor, "N n"], neighbors: Int[Tensor, "N K"], dim: int
+) -> None:
+    """A warning that names points which are closer to another than chance explains, as if scanned twice.
 
     Of points at random the nearest is closer than t times the distance to the one of number m with the probability
-    1 − (1 − t²)^(m − 1), about (m − 1)t², whatever their density.
+    1 − (1 − t^d)^(m − 1), about (m − 1)t^d, whatever their density.
     """
     last = min(CLOSE, neighbors.shape[1] - 1)
     distance = (points[neighbors[:, 1:]] - points[:, None]).norm(dim=-1)
     nearest, wide = distance.amin(1), distance.amax(1)
-    squares = (last - 1) * (nearest / distance[:, last - 1]).square()
+    share = (last - 1) * (nearest / distance[:, last - 1]).pow(dim)
     tight = (wide < CLUSTER * wide.median()).nonzero()[:, 0]
     if len(tight):  # more than K in one place
         far = min(CROWD, len(points) - 1)
         reach, _ = KDTree(points.numpy()).query(points[tight].numpy(), k=far + 1)
-        squares[tight] = (far - 1) * (nearest[tight] / torch.from_numpy(reach)[:, -1]).square()
-    ordered, order = squares.sort()
+        share[tight] = (far - 1) * (nearest[tight] / torch.from_numpy(reach)[:, -1]).pow(dim)
+    ordered, order = share.sort()
     number = torch.arange(1, len(points) + 1)
     expected = len(points) * ordered
     chance = pdtrc((number // 2 - 1).clamp_min(0).numpy(), expected.numpy() / 2)

@@ -21,10 +21,11 @@ from torchlb.cloud.doubts import (
     warn_of_near_duplicates,
 )
 from torchlb.cloud.reconstruction import reconstruct
-from torchlb.cloud.surface import CloudSurface
+from torchlb.cloud.surface import NEAREST, CloudSurface
 from torchlb.errors import InputError, renumbered
 from torchlb.galerkin.flips import flipped
 from torchlb.galerkin.pair import mesh_pair
+from torchlb.geometry.neighbors import nearest_neighbors
 from torchlb.geometry.numbering import Numbering
 from torchlb.linalg.threads import threads_for
 from torchlb.operator.assembled import AssembledOperator
@@ -92,6 +93,7 @@ def build_cloud(
         if isinstance(found, CloudSurface):
             built = _on_surface(here, found, options, mask, numbering, progress)
             return built.restored(numbering, points, built.faces)
+        warn_of_near_duplicates(here, nearest_neighbors(here, min(NEAREST, len(here))), d)
     cells, edge = numbering.given[found.cells], None
     if isinstance(where, Tensor):
         edge = where if found.shares is not None else where & on_rim(cells, len(points))
@@ -130,7 +132,7 @@ def _on_surface(
 ) -> AssembledOperator:
     """Operator on a cloud in R² or R³, by the surface through it."""
     ambient = points.shape[1]
-    warn_of_near_duplicates(points, surface.neighbors)
+    warn_of_near_duplicates(points, surface.neighbors, 2)
     if ambient == 3:
         warn_of_layers(points)
     surface = replace(surface, cells=flipped(surface.points, surface.cells))
