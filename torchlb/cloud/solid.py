@@ -58,7 +58,7 @@ def cloud_solid(points: Float[Tensor, "N 3"]) -> Complex:
     count = near.shape[1] - 1
     even = count * np.mean((lengths(places[near[:, 1]] - places) / reach) ** 3)
     chance = (np.log(CELLS * len(points)) + SURE) / count / max(1.0, even / EVEN)
-    kept = ~_outside(flat | (radius <= chance ** (1 / 3) * np.sort(reach[cells], 1)[:, 1]), beside)
+    kept = ~_outside(flat | (radius <= chance ** (1 / 3) * np.sort(reach[cells], 1)[:, 2]), beside)
     beyond = np.append(kept, False)  # of the last, which −1 is, nothing is kept
     while (peeled := kept & flat & ~beyond[beside].all(1)).any():
         kept &= ~peeled

@@ -93,7 +93,8 @@ def build_cloud(
         if isinstance(found, CloudSurface):
             built = _on_surface(here, found, options, mask, numbering, progress)
             return built.restored(numbering, points, built.faces)
-        warn_of_near_duplicates(here, nearest_neighbors(here, min(NEAREST, len(here))), d)
+        if d == 1:
+            warn_of_near_duplicates(here, nearest_neighbors(here, min(NEAREST, len(here))), 1)
     cells, edge = numbering.given[found.cells], None
     if isinstance(where, Tensor):
         edge = where if found.shares is not None else where & on_rim(cells, len(points))
