@@ -79,8 +79,9 @@ def _order(key: Int[np.ndarray, " K"], count: int) -> Int[np.ndarray, " K"]:
     >>> _order(np.array([5, 3, 5, 0]), 6).tolist()
     [3, 1, 0, 2]
     """
-    size = len(key)
-    rows = sparse.csr_array((np.ones(size, np.int8), key, np.arange(size + 1)), (size, count))
+    size, narrow = len(key), key.astype(np.int32)  # which SciPy would look through wide ones for
+    ends = np.arange(size + 1, dtype=np.int32)
+    rows = sparse.csr_array((np.ones(size, np.int8), narrow, ends), (size, count))
     return rows.tocsc().indices.astype(np.int64)
 
 
