@@ -32,6 +32,9 @@ __all__ = ["main"]
 
 FILE = click.Path(exists=True, dir_okay=False, path_type=Path)
 COUNT = click.IntRange(min=1)
+PROJECTION = "Onto the tangent plane, or along the normals."
+CERTIFY = "Prove the stencil stable; by default where there is no weak pair."
+SETTINGS = {"help_option_names": ["-h", "--help"], "show_default": True}
 
 
 class _Commands(click.Group):
@@ -54,34 +57,15 @@ def _show(message: Warning | str, category: type[Warning], *_: Any) -> None:
 
 def _stencil_options(command: Callable[..., Any]) -> Callable[..., Any]:
     """The options of the operator that the commands share."""
-    for option in (
-        click.option(
-            "--order", type=COUNT, default=3, show_default=True, help="Order p of accuracy."
-        ),
-        click.option(
-            "--projection",
-            type=click.Choice(get_args(Projection)),
-            default="tangent",
-            show_default=True,
-            help="Onto the tangent plane, or along the normals.",
-        ),
-        click.option(
-            "--weights",
-            type=click.Choice(get_args(WeightsName)),
-            default="least_squares",
-            show_default=True,
-            help="How the weights are found.",
-        ),
-        click.option(
-            "--certify/--no-certify",
-            default=None,
-            help="Prove the stencil stable; by default where there is no weak pair.",
-        ),
-        click.option(
-            "--clean", is_flag=True, help="Leave out vertices of no face, and points twice."
-        ),
+    projections, weights = (click.Choice(get_args(names)) for names in (Projection, WeightsName))
+    for name, settings in (
+        ("--order", {"type": COUNT, "default": 3, "help": "Order p of accuracy."}),
+        ("--projection", {"type": projections, "default": "tangent", "help": PROJECTION}),
+        ("--weights", {"type": weights, "default": "least_squares", "help": "How they are found."}),
+        ("--certify/--no-certify", {"default": None, "help": CERTIFY}),
+        ("--clean", {"is_flag": True, "help": "Leave out vertices of no face, and points twice."}),
     ):
-        command = option(command)
+        command = click.option(name, **settings)(command)
     return command
 
 
@@ -92,7 +76,7 @@ def _stability(lb: LaplaceBeltrami) -> str:
     return "\n".join(filter(None, known)) or "no certificate"
 
 
-@click.group(cls=_Commands, context_settings={"help_option_names": ["-h", "--help"]})
+@click.group(cls=_Commands, context_settings=SETTINGS)
 @click.version_option(__version__, prog_name="torchlb")
 def main() -> None:
     """High-order Laplace–Beltrami operators on meshes and point clouds.
@@ -107,7 +91,7 @@ def main() -> None:
 
 @main.command()
 @click.argument("mesh", type=FILE)
-@click.option("-k", type=COUNT, default=20, show_default=True, help="Number of eigenvalues.")
+@click.option("-k", type=COUNT, default=20, help="Number of eigenvalues.")
 @click.option(
     "--out", type=click.Path(path_type=Path), help="Picture; MESH_compare.png if left out."
 )
@@ -152,13 +136,9 @@ def compare(mesh: Path, k: int, out: Path | None, clean: bool, **options: Any) -
 @click.option(
     "--out", type=click.Path(file_okay=False, path_type=Path), required=True, help="Cache to fill."
 )
-@click.option(
-    "--operator", type=click.Choice(get_args(Operator)), default="stencil", show_default=True
-)
-@click.option("-k", type=click.IntRange(min=0), default=0, show_default=True, help="Eigenpairs.")
-@click.option(
-    "--workers", type=int, default=-1, show_default=True, help="Processes; -1: all cores."
-)
+@click.option("--operator", type=click.Choice(get_args(Operator)), default="stencil")
+@click.option("-k", type=click.IntRange(min=0), default=0, help="Eigenpairs.")
+@click.option("--workers", type=int, default=-1, help="Processes; -1: all cores.")
 @click.option("--quiet", is_flag=True, help="No progress bar.")
 @_stencil_options
 def precompute(
@@ -183,22 +163,13 @@ def precompute(
     """
     if operator == "cotangent":
         context = click.get_current_context()
-        given = [
-            n for n in options if context.get_parameter_source(n) is not ParameterSource.DEFAULT
-        ]
+        default = ParameterSource.DEFAULT
+        given = [name for name in options if context.get_parameter_source(name) != default]
         if given:
             raise click.UsageError(f"the cotangent operator has no --{' --'.join(given)}")
         options = {}
-    report = precompute_operators(
-        folder,
-        out,
-        operator=operator,
-        k=k,
-        workers=workers,
-        clean=clean,
-        progress=not quiet,
-        **options,
-    )
+    settings: dict[str, Any] = {"k": k, "workers": workers, "clean": clean, **options}
+    report = precompute_operators(folder, out, operator=operator, progress=not quiet, **settings)
     click.echo(str(report))
     if report.failed:
         sys.exit(1)

@@ -12,8 +12,10 @@ import hashlib
 import json
 import os
 import uuid
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
 import numpy as np
 import torch
@@ -179,11 +181,18 @@ def save_operator(lb: LaplaceBeltrami, path: str | Path, *, key: str = "") -> No
         arrays[name] = _compact(tensor.detach().cpu()).numpy()
     arrays["header"] = np.array(json.dumps(header))
     path.parent.mkdir(parents=True, exist_ok=True)
+    with written_whole(path, "xb") as file:
+        np.savez(file, **arrays)
+
+
+@contextmanager
+def written_whole(path: Path, mode: str, **options: Any) -> Iterator[IO[Any]]:
+    """A file beside its place, which takes it when all is on the disk; nothing is left of it where that fails."""
     # Not tempfile: its files are readable by their owner alone, and a cache is shared.
     beside = path.with_name(f".{path.name}.{uuid.uuid4().hex}.tmp")
     try:
-        with open(beside, "xb") as file:
-            np.savez(file, **arrays)
+        with open(beside, mode, **options) as file:
+            yield file
             file.flush()
             os.fsync(file.fileno())
         os.replace(beside, path)

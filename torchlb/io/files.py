@@ -11,6 +11,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from torchlb.errors import InputError
+from torchlb.geometry.manifold import edges_of
 from torchlb.io.formats import READERS, begins_with_points
 from torchlb.operator.cleaning import merged, proper_faces, triangles_of
 from torchlb.operator.inputs import as_tensor
@@ -112,11 +113,9 @@ def _sewn(vertices: Float[Tensor, "N 3"], faces: Int[Tensor, "F 3"]) -> tuple[Te
     """
     vertices, number = torch.unique(vertices, dim=0, return_inverse=True)
     faces = number[faces]
-    proper = proper_faces(faces)
-    edges = torch.cat([proper[:, [a, a - 1]] for a in range(3)]).sort(1).values
-    code, count = torch.unique(edges[:, 0] * len(vertices) + edges[:, 1], return_counts=True)
-    edges = torch.stack([code // len(vertices), code % len(vertices)], 1)
-    rim = torch.unique(edges[count == 1])
+    found = edges_of(proper_faces(faces).numpy(), len(vertices))
+    edges = torch.from_numpy(np.stack(np.divmod(found.keys, len(vertices)), 1))
+    rim = torch.unique(edges[found.uses == 1])
     if len(rim) == 0:
         return vertices, faces
     place = torch.full((len(vertices),), -1).index_put((rim,), torch.arange(len(rim)))

@@ -177,27 +177,19 @@ def read_pcd(path: Path) -> Polygons:
         key, *words = line.decode("ascii", "replace").split() or ["#"]
         header[key] = words
     kind = header["DATA"][0]
-    sizes, types = header["SIZE"], header["TYPE"]
-    repeats = [int(word) for word in header.get("COUNT", ["1"] * len(sizes))]
-    fields = [
-        (f"{i} {name}", f"<{t.lower()}{size}", (repeat,))
-        for i, (name, t, size, repeat) in enumerate(
-            zip(header["FIELDS"], types, sizes, repeats, strict=True)
-        )
-    ]
-    titles = {name: title for name, (title, *_) in zip(header["FIELDS"], fields, strict=True)}
-    count = int(header["POINTS"][0])
-    if kind == "binary":
-        table: Any = np.frombuffer(data, np.dtype(fields), count, at)
-        points = np.stack([table[titles[axis]][:, 0].astype(float) for axis in "xyz"], 1)
-    elif kind == "ascii":
-        starts = dict(zip(header["FIELDS"], np.cumsum([0, *repeats]), strict=False))
-        table = np.array(data[at:].split()).astype(float).reshape(count, sum(repeats))
-        points = table[:, [starts[axis] for axis in "xyz"]]
-    else:
+    if kind == "ascii":
+        data, at = np.array(data[at:].split()).astype("<f8").tobytes(), 0
+    elif kind != "binary":
         raise InputError(
             f"its data are {kind}; write them as binary or ascii, as pcl_convert_pcd_ascii_binary does"
         )
+    names, repeats = header["FIELDS"], header.get("COUNT", ["1"] * len(header["SIZE"]))
+    columns = zip(header["TYPE"], header["SIZE"], repeats, strict=True)
+    types = [("<f8" if kind == "ascii" else f"<{t.lower()}{n}", int(c)) for t, n, c in columns]
+    row = np.dtype([(str(i), *field) for i, field in enumerate(types)])
+    table: Any = np.frombuffer(data, row, int(header["POINTS"][0]), at)
+    places = [table[str(names.index(axis))].reshape(len(table), -1)[:, 0] for axis in "xyz"]
+    points = np.stack(places, 1).astype(float)
     return _polygons(points[~np.isnan(points).any(1)], [])
 
 

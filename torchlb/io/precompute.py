@@ -8,10 +8,7 @@ machines of a Dask or Ray cluster (`docs/precompute.md`).
 from __future__ import annotations
 
 import csv
-import io
-import os
 import time
-import uuid
 import warnings
 from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
@@ -19,12 +16,12 @@ from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import Any
 
-import torch
 from tqdm import tqdm
 
 from torchlb.errors import InputError
-from torchlb.io.cache import load_or_build, operator_key
+from torchlb.io.cache import load_or_build, operator_key, written_whole
 from torchlb.io.files import SUFFIXES, may_be_shape, read_shape
+from torchlb.linalg.threads import threads_for
 from torchlb.operator.cleaning import cleaned
 from torchlb.operator.dispatch import Operator, check_options_of
 
@@ -81,12 +78,9 @@ class PrecomputeReport:
 
     def __str__(self) -> str:
         """Counts, then a line for each shape that failed or was warned of."""
-        counts = {
-            s: sum(r.status == s for r in self.results) for s in ("built", "cached", "failed")
-        }
-        lines = [
-            ", ".join([f"{len(self.results)} shapes"] + [f"{n} {s}" for s, n in counts.items()])
-        ]
+        counts = Counter(result.status for result in self.results)
+        parts = [f"{counts[status]} {status}" for status in ("built", "cached", "failed")]
+        lines = [", ".join([f"{len(self.results)} shapes", *parts])]
         for title, chosen in (
             ("failed", self.failed),
             ("warned", [r for r in self.results if r.message and r.status != "failed"]),
@@ -231,11 +225,8 @@ def _parallel(workers: int, tasks: dict[int, _Task]) -> Iterable[tuple[int, Shap
 
     backend, _ = joblib.parallel.get_active_backend()
     lazy = getattr(backend, "supports_return_generator", False)
-    settings: dict[str, Any] = {
-        "n_jobs": workers,
-        "batch_size": 1,
-        "return_as": "generator_unordered" if lazy else "list",
-    }
+    way = "generator_unordered" if lazy else "list"
+    settings: dict[str, Any] = {"n_jobs": workers, "batch_size": 1, "return_as": way}
     calls = [joblib.delayed(_solve)(index, task) for index, task in tasks.items()]
     found: Any = joblib.Parallel(**settings)(calls)
     return found
@@ -243,26 +234,19 @@ def _parallel(workers: int, tasks: dict[int, _Task]) -> Iterable[tuple[int, Shap
 
 def _solve(index: int, task: _Task) -> tuple[int, ShapeResult]:
     """One shape on one thread; whatever goes wrong with it becomes its result."""
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
     start = time.perf_counter()
     try:
-        with warnings.catch_warnings(record=True) as caught:
+        with threads_for(0), warnings.catch_warnings(record=True) as caught:
             warnings.simplefilter("always", UserWarning)
-            vertices, faces = (
-                read_shape(task.source) if isinstance(task.source, Path) else task.source
-            )
-            status, points, file = _stored(task, vertices, faces)
+            shape = read_shape(task.source) if isinstance(task.source, Path) else task.source
+            status, points, file = _stored(task, *shape)
         notes = {str(w.message) for w in caught if concerns_the_shape(w.message)}
-        seconds = time.perf_counter() - start
-        result = ShapeResult(task.name, status, points, seconds, file, "; ".join(sorted(notes)))
+        found = status, points, file, "; ".join(sorted(notes))
     except Exception as error:
-        seconds = time.perf_counter() - start
-        reason = f"{type(error).__name__}: {error}"
-        result = ShapeResult(task.name, "failed", 0, seconds, "", reason)
-    finally:
-        torch.set_num_threads(threads)
-    return index, result
+        found = "failed", 0, "", f"{type(error).__name__}: {error}"
+    status, points, file, message = found
+    seconds = time.perf_counter() - start
+    return index, ShapeResult(task.name, status, points, seconds, file, message)
 
 
 def concerns_the_shape(warning: Warning | str) -> bool:
@@ -277,15 +261,8 @@ def _stored(task: _Task, vertices: Any, faces: Any) -> tuple[str, int, str]:
     key = operator_key(vertices, faces, operator=task.operator, **task.options)
     path = Path(task.cache) / f"{key}.npz"
     before = _identity(path)
-    lb = load_or_build(
-        vertices,
-        faces,
-        cache=task.cache,
-        operator=task.operator,
-        k=task.k,
-        progress=False,
-        **task.options,
-    )
+    settings: dict[str, Any] = {"cache": task.cache, "operator": task.operator, "k": task.k}
+    lb = load_or_build(vertices, faces, progress=False, **settings, **task.options)
     after = _identity(path)
     if after is None:
         raise OSError("its operator was built and could not be written")
@@ -312,10 +289,7 @@ def _remove_stale(cache: Path) -> None:
 
 
 def _write_table(report: PrecomputeReport, path: Path) -> None:
-    text = io.StringIO()
-    writer = csv.DictWriter(text, [field.name for field in fields(ShapeResult)])
-    writer.writeheader()
-    writer.writerows(asdict(result) for result in report.results)
-    beside = path.with_name(f".{path.name}.{uuid.uuid4().hex}.tmp")
-    beside.write_text(text.getvalue(), encoding="utf-8")
-    os.replace(beside, path)
+    with written_whole(path, "x", encoding="utf-8", newline="") as file:
+        writer = csv.DictWriter(file, [field.name for field in fields(ShapeResult)])
+        writer.writeheader()
+        writer.writerows(asdict(result) for result in report.results)

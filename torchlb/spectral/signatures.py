@@ -38,10 +38,10 @@ def _first_positive(basis: Eigenbasis) -> Tensor:
     return first
 
 
-def _log_space(start: Tensor, end: Tensor, count: int) -> Tensor:
-    """`count` points from start to end, equally spaced in the logarithm, along a new last axis."""
+def _evenly(start: Tensor, end: Tensor, count: int) -> Tensor:
+    """`count` numbers from start to end, equally spaced, along the last axis."""
     fraction = torch.linspace(0, 1, count, dtype=start.dtype, device=start.device)
-    return torch.exp(start.log() * (1 - fraction) + end.log() * fraction)
+    return start * (1 - fraction) + end * fraction
 
 
 def _numbers(name: str, given: Any, values: Tensor, least: float = 0.0) -> Float[Tensor, " T"]:
@@ -80,8 +80,8 @@ def heat_kernel_signature(
     basis = lb.eigenbasis(k)
     values = basis.eigenvalues
     if times is None:
-        bound = 4 * math.log(10)
-        times = _log_space(bound / values[..., -1:], bound / _first_positive(basis), count)
+        first, last = values[..., -1:].log(), _first_positive(basis).log()
+        times = 4 * math.log(10) / _evenly(first, last, count).exp()
     else:
         times = _numbers("times", times, values)
     decay = torch.exp(-values[..., :, None] * times[..., None, :])
@@ -111,9 +111,7 @@ def wave_kernel_signature(
     low, high = _first_positive(basis).log(), values[..., -1:].log()
     sigma = width * (high - low) / 100 + torch.finfo(values.dtype).eps
     if energies is None:
-        fraction = torch.linspace(0, 1, count, dtype=values.dtype, device=values.device)
-        start, end = low + 2 * sigma, high - 2 * sigma
-        energies = start * (1 - fraction) + end * fraction
+        energies = _evenly(low + 2 * sigma, high - 2 * sigma, count)
     else:
         energies = _numbers("energies", energies, values, -torch.inf)
     positive = (values > 0) & _present(basis)
@@ -146,11 +144,8 @@ def spectral_wavelets(
     values = basis.eigenvalues
     gains = _wavelet_gains(values, _numbers("scales", scales, values))
     coefficients = basis.to_basis(f)
-    parts = [
-        basis.from_basis(g[..., None] * coefficients)
-        for g in gains.to(coefficients.dtype).unbind(-1)
-    ]
-    return torch.stack(parts, dim=-2)
+    gains = gains.to(coefficients.dtype)[..., None]
+    return torch.stack([basis.from_basis(g * coefficients) for g in gains.unbind(-2)], dim=-2)
 
 
 def _wavelet_gains(values: Tensor, scales: Tensor) -> Tensor:
