@@ -135,6 +135,7 @@ class Tetrahedra:
         moved = points + MOVED * spacing[:, None] * random
         found = Delaunay(moved - moved.mean(0))  # far from the origin it merges what is apart
         cells, beyond = (x.astype(np.int64) for x in (found.simplices, found.neighbors))
+        del found
         centers = _circumcenters(moved, cells)
         faces, here, there, apex = [], [], [], []
         for k in range(4):
@@ -258,17 +259,19 @@ def best_manifold(points: Float[np.ndarray, "N 3"], faces: Faces) -> Faces:
     one, two = edges.twins
     contested = edges.uses > 2
     contested[edges.of[one[inner(wing[one], wing[two]) > FOLD]]] = True
-    doubt, taken = contested[edges.of], np.ones(len(faces), dtype=bool)
-    uses, first = np.zeros_like(edges.uses).tolist(), np.zeros_like(edges.uses).tolist()
-    x, y, z, of, doubtful = (part.tolist() for part in (*wing.T, edges.of, doubt))
-    for face in np.flatnonzero(doubt.reshape(-1, 3).any(1)).tolist():
-        halves = [half for half in range(3 * face, 3 * face + 3) if doubtful[half]]
-        for a in halves:
+    rows = np.flatnonzero(contested[edges.of].reshape(-1, 3).any(1))
+    taken, halves = np.ones(len(faces), dtype=bool), np.arange(3 * len(faces)).reshape(-1, 3)[rows]
+    parts = (*wing.T, edges.of, contested[edges.of])
+    x, y, z, of, doubtful = (part[halves.ravel()].tolist() for part in parts)
+    uses, first = [0] * len(edges.keys), [0] * len(edges.keys)
+    for number, face in enumerate(rows.tolist()):
+        mine = [half for half in range(3 * number, 3 * number + 3) if doubtful[half]]
+        for a in mine:
             b = first[of[a]]
             if uses[of[a]] > 1 or (uses[of[a]] and x[a] * x[b] + y[a] * y[b] + z[a] * z[b] > FOLD):
                 taken[face] = False
                 break
         else:
-            for a in halves:
+            for a in mine:
                 uses[of[a]], first[of[a]] = uses[of[a]] + 1, a
     return faces[taken]

@@ -90,8 +90,8 @@ def _joined(
 ) -> sparse.csr_array:
     """The graph of the pairs (i, j), those that are there twice apart."""
     order = _order(i, count)
-    ends = np.append(0, np.bincount(i, minlength=count).cumsum())
-    return sparse.csr_array((data[order], j[order], ends), (count, count))
+    ends = np.append(0, np.bincount(i, minlength=count).cumsum()).astype(np.int32)
+    return sparse.csr_array((data[order], j.astype(np.int32)[order], ends), (count, count))
 
 
 def edges_of(faces: Faces, count: int) -> Edges:
