@@ -11,7 +11,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from torchlb.errors import InputError
-from torchlb.geometry.manifold import edges_of
+from torchlb.geometry.complex import edges_of
 from torchlb.io.formats import READERS, begins_with_points
 from torchlb.operator.cleaning import merged, proper_faces, triangles_of
 from torchlb.operator.inputs import as_tensor
