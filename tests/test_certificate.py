@@ -15,9 +15,9 @@ from builders import stencil_of_cloud, stencil_of_mesh
 from torchlb import StabilityError, StabilityWarning
 from torchlb.cloud.surface import cloud_surface
 from torchlb.errors import warn
-from torchlb.stability.certificate import check_certificate
-from torchlb.stability.enforce import Schedule, certify
-from torchlb.stability.null_vector import left_null_vector, shared_outflow
+from torchlb.certified.certificate import check_certificate
+from torchlb.certified.enforce import Schedule, certify
+from torchlb.certified.null_vector import left_null_vector, shared_outflow
 from torchlb.stencils.assemble import Stencils, assemble
 from torchlb.stencils.shape import cloud_shape
 from torchlb.surfaces import Hemisphere, Sphere, StarShaped, ThreeSphere, Torus, smooth_function

@@ -7,22 +7,22 @@ from scipy import sparse
 
 from builders import stencil_of_cloud
 from torchlb import LaplaceBeltrami
-from torchlb.linalg.krylov import LowOrder, negative_directions
-from torchlb.stability.certificate import check_certificate
-from torchlb.stability.enforce import _feeding
-from torchlb.stability.null_vector import left_null_vector
+from torchlb.certified.krylov import LowOrder, negative_directions
+from torchlb.certified.certificate import check_certificate
+from torchlb.certified.enforce import _feeding
+from torchlb.certified.null_vector import left_null_vector
 from torchlb.surfaces import Hemisphere, Sphere, Torus, smooth_function
 
 
 @pytest.fixture
 def unfactored(monkeypatch):
     """Every operator is taken for one too large to factor, and a factorization is an error."""
-    monkeypatch.setattr("torchlb.linalg.krylov.LARGEST_FACTORED", 0)
+    monkeypatch.setattr("torchlb.certified.krylov.LARGEST_FACTORED", 0)
 
     def refuse(*_):
         raise AssertionError("factored")
 
-    monkeypatch.setattr("torchlb.stability.null_vector.factorized", refuse)
+    monkeypatch.setattr("torchlb.certified.null_vector.factorized", refuse)
 
 
 def two_scales():
@@ -49,7 +49,7 @@ def test_null_vector_and_verdict_are_those_of_the_factors(build, monkeypatch):
     matrix, areas = lb.to_scipy(), lb.mass * (1 + 0.3 * torch.sin(torch.arange(lb.num_points)))
     outflow = build is with_outflow
     expected, verdict, _ = check_certificate(matrix, areas, outflow=outflow)
-    monkeypatch.setattr("torchlb.linalg.krylov.LARGEST_FACTORED", 0)
+    monkeypatch.setattr("torchlb.certified.krylov.LARGEST_FACTORED", 0)
     mass, same_verdict, _ = check_certificate(matrix, areas, outflow=outflow)
     torch.testing.assert_close(mass, expected, rtol=1e-9, atol=0)
     assert verdict.holds
@@ -61,7 +61,7 @@ def test_what_the_factors_refuse_is_refused(monkeypatch):
     step = stencil_of_cloud(Sphere().random_points(700), order=1)
     matrix = raw.to_scipy()
     verdicts = [check_certificate(matrix, step.mass)[1]]
-    monkeypatch.setattr("torchlb.linalg.krylov.LARGEST_FACTORED", 0)
+    monkeypatch.setattr("torchlb.certified.krylov.LARGEST_FACTORED", 0)
     verdicts.append(check_certificate(matrix, step.mass)[1])
     assert [v.holds for v in verdicts] == [False, False]
     assert verdicts[0].min_pi == pytest.approx(verdicts[1].min_pi, rel=1e-3)
@@ -155,9 +155,9 @@ def test_noise_has_the_low_order_matrix_as_covariance():
 def test_factors_step_in_where_krylov_methods_do_not_converge(monkeypatch):
     lb = stencil_of_cloud(Sphere().random_points(400))
     expected = left_null_vector(lb.to_scipy(), lb.mass)[0]
-    monkeypatch.setattr("torchlb.linalg.krylov.LARGEST_FACTORED", 0)
-    monkeypatch.setattr("torchlb.linalg.krylov.CYCLES", 1)
-    monkeypatch.setattr("torchlb.linalg.krylov.MAX_ITERATIONS", 3)
+    monkeypatch.setattr("torchlb.certified.krylov.LARGEST_FACTORED", 0)
+    monkeypatch.setattr("torchlb.certified.krylov.CYCLES", 1)
+    monkeypatch.setattr("torchlb.certified.krylov.MAX_ITERATIONS", 3)
     areas = lb.mass * torch.linspace(0.5, 1.5, 400)
     with pytest.warns(UserWarning, match="did not converge on 400 points.*certify=False"):
         mass, verdict, _ = check_certificate(lb.to_scipy(), areas)

@@ -2,7 +2,7 @@
 
 The packages, lowest first: `linalg`, matrices without shapes; `fits`, weights from local polynomials; `geometry`,
 neighbours, frames, boundaries; `baseline`, libigl's cotangents; `galerkin`, the weak pair; `stencils`, rows of Δ
-and ∇; `stability`, the certificate; `spectral`, eigenpairs and signatures; `operator`, the module that holds it
+and ∇; `certified`, their certificate; `spectral`, eigenpairs and signatures; `operator`, the module that holds it
 all; `pde`, solves and flows; `nn`, layers; `io` and `interop`, files and other libraries. `surfaces` are shapes with
 exact answers.
 """
@@ -11,6 +11,7 @@ from importlib import import_module
 from typing import Any
 
 from torchlb import surfaces
+from torchlb.certified.certificate import Certificate
 from torchlb.errors import (
     CacheWarning,
     DerivativeError,
@@ -48,7 +49,6 @@ from torchlb.spectral.signatures import (
     spectral_wavelets,
     wave_kernel_signature,
 )
-from torchlb.stability.certificate import Certificate
 from torchlb.stencils.conditions import Robin
 from torchlb.version import __version__
 

@@ -9,12 +9,12 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from torchlb.certified.certificate import Certificate
 from torchlb.cloud.surface import SurfaceSummary
 from torchlb.galerkin.absorption import absorbing
 from torchlb.galerkin.pair import WeakPair
 from torchlb.geometry.boundary import boundary_faces
 from torchlb.geometry.numbering import Numbering
-from torchlb.stability.certificate import Certificate
 from torchlb.stencils.conditions import condition_of
 from torchlb.stencils.rows import Rows
 from torchlb.stencils.shape import Shape

@@ -11,6 +11,7 @@ from torch import Tensor
 from torch.nn.functional import pad
 
 from torchlb.baseline.cotangent import cotangent_laplacian
+from torchlb.certified.enforce import certify
 from torchlb.errors import InputError, first_few, renumbered, warn
 from torchlb.galerkin.coarse import lying_triangles, with_area
 from torchlb.galerkin.flips import flipped
@@ -29,7 +30,6 @@ from torchlb.operator.checks import (
 from torchlb.operator.inputs import ArrayLike, check_points
 from torchlb.operator.options import Options
 from torchlb.operator.plan import Plan, stencils_of
-from torchlb.stability.enforce import certify
 from torchlb.stencils.assemble import assemble
 from torchlb.stencils.conditions import Condition
 from torchlb.stencils.low_order import MeshLowOrder

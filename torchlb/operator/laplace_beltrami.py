@@ -9,6 +9,7 @@ from typing import Any, Literal
 import torch
 from torch import Tensor
 
+from torchlb.certified.certificate import Certificate
 from torchlb.cloud.surface import SurfaceSummary
 from torchlb.errors import InputError, InputTypeError
 from torchlb.fits.rules import WeightsName
@@ -31,7 +32,6 @@ from torchlb.spectral.eigenbasis import (
     stack_eigenbases,
     unstack_eigenbases,
 )
-from torchlb.stability.certificate import Certificate
 from torchlb.stencils.conditions import Condition, ConditionName
 
 

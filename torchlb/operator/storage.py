@@ -10,13 +10,13 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
+from torchlb.certified.certificate import Certificate
 from torchlb.cloud.surface import SurfaceSummary
 from torchlb.errors import InputError, warn
 from torchlb.linalg.exponential import spectral_radius
 from torchlb.linalg.sparse import to_scipy, transpose_pattern
 from torchlb.operator.checks import check_same_points
 from torchlb.spectral.eigenbasis import Eigenbasis
-from torchlb.stability.certificate import Certificate
 from torchlb.stencils.conditions import Condition, condition_of, kind_of
 
 REAL_FIELDS = ("growth", "condition", "off_diagonal_ratio")

@@ -22,7 +22,6 @@ from scipy.sparse import csgraph
 from torch import Tensor
 
 from torchlb.errors import EigenbasisError, warn
-from torchlb.linalg.krylov import prefers_krylov
 from torchlb.linalg.lanczos import Inverse, lanczos_of_pair
 from torchlb.linalg.sparse import multiply, on_one_pattern
 from torchlb.linalg.two_levels import Matrix, absolute_row_sums, main_entries, two_levels
@@ -48,6 +47,8 @@ ROUGH = 0.5
 SAFETY = 4.0
 """On the estimated errors, which the preconditioner makes too small where K is softer than it takes it for."""
 
+LARGEST_FACTORED = 100_000
+"""Points up to which the pair itself is factored where there is no linear one."""
 TINY, DEPENDENT = 1e-300, 1e-12
 
 Sparse = sparse.csr_array
@@ -278,7 +279,7 @@ def _swept(
         if sweep:
             new = tuple(np.column_stack(both) for both in zip(known, new, strict=True))
         values, known = _ritz(new, count)
-    if prefers_krylov(len(part.points)):
+    if len(part.points) > LARGEST_FACTORED:
         raise EigenbasisError(
             f"eigenbasis: after {SWEEPS} sweeps the estimated relative error of some of {k} eigenvalues is above "
             f"{tolerance:.1g}; ask for a larger tolerance"

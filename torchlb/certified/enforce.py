@@ -17,10 +17,10 @@ from scipy.sparse import csgraph
 from torch import Tensor
 from tqdm import tqdm
 
+from torchlb.certified.certificate import Certificate, check_certificate
+from torchlb.certified.krylov import prefers_krylov
 from torchlb.errors import StabilityWarning, as_given, warn
-from torchlb.linalg.krylov import prefers_krylov
 from torchlb.linalg.sparse import to_scipy
-from torchlb.stability.certificate import Certificate, check_certificate
 from torchlb.stencils.rows import Reason, Rows
 
 MARGIN = 0.02

@@ -9,9 +9,9 @@ from scipy import sparse
 from scipy.sparse import csgraph
 from torch import Tensor
 
+from torchlb.certified.krylov import backward_error, krylov_or_factors, null_density, rescaled
 from torchlb.errors import StabilityError
 from torchlb.linalg.factor import factorized
-from torchlb.linalg.krylov import backward_error, krylov_or_factors, null_density, rescaled
 
 ROW_SUM = 1e-9
 """Share of its size from which on a row sum is not rounding."""

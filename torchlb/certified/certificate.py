@@ -14,9 +14,9 @@ from jaxtyping import Float
 from scipy import sparse
 from torch import Tensor
 
+from torchlb.certified.krylov import krylov_or_factors, negative_directions
+from torchlb.certified.null_vector import CONSERVED, left_null_vector, shared_outflow
 from torchlb.linalg.factor import factorized
-from torchlb.linalg.krylov import krylov_or_factors, negative_directions
-from torchlb.stability.null_vector import CONSERVED, left_null_vector, shared_outflow
 
 STRICTNESS = 1e-12
 """S passes if it is negative up to this share of the size of each of its rows; a hundred times their rounding."""
