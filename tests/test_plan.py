@@ -12,7 +12,16 @@ from scipy.spatial import Delaunay
 from torchlb import LaplaceBeltrami
 from torchlb.errors import InputError
 from torchlb.operator.plan import evaluate
-from torchlb.surfaces import Ellipsoid, Hemisphere, SpaceCurve, Sphere, Torus, UnitDisk
+from torchlb.surfaces import (
+    CliffordTorus,
+    Ellipsoid,
+    Hemisphere,
+    SpaceCurve,
+    Sphere,
+    ThreeSphere,
+    Torus,
+    UnitDisk,
+)
 
 
 def grid(n):
@@ -59,6 +68,9 @@ MESHES = {
     "solid": lambda: LaplaceBeltrami.from_mesh(*tetrahedra(6)),
     "solid, held": lambda: LaplaceBeltrami.from_mesh(*tetrahedra(6), condition="dirichlet"),
     "cloud": lambda: LaplaceBeltrami.from_points(Ellipsoid().points(400)),
+    "cloud in R⁴": lambda: LaplaceBeltrami.from_points(CliffordTorus().points(400), dim=2),
+    "three-sphere": lambda: LaplaceBeltrami.from_points(ThreeSphere().points(300)),
+    "curve of points": lambda: LaplaceBeltrami.from_points(SpaceCurve().points(100), dim=1),
     "cloud of a disk": lambda: LaplaceBeltrami.from_points(UnitDisk().points(300)),
 }
 built = cache(lambda name: MESHES[name]())
@@ -150,9 +162,22 @@ def test_what_has_no_plan_says_so():
             other.at(other.points)
 
 
-def test_a_noisy_cloud_is_not_smoothed_again():
+def test_a_noisy_cloud_stays_as_smooth_as_it_was():
+    """What its points are moved by turns and scales with them."""
     points = Sphere().points(800)
     noise = torch.randn(points.shape, generator=torch.Generator().manual_seed(2)).double()
     lb = LaplaceBeltrami.from_points(points + 0.03 * noise)
+    assert lb.surface.noise > 0.02
+    torch.testing.assert_close(lb.at(lb.points).weak_values, lb.weak_values, rtol=0, atol=1e-12)
+    turn, _ = torch.linalg.qr(torch.randn(3, 3, dtype=torch.float64))
+    ours, theirs = (b.eigenbasis(6).eigenvalues[1:] for b in (lb, lb.at(2 * lb.points @ turn + 1)))
+    torch.testing.assert_close(4 * theirs, ours, rtol=1e-9, atol=0)
+
+
+def test_a_noisy_curve_has_no_plan_of_its_noise():
+    angle = 2 * math.pi * torch.arange(200, dtype=torch.float64) / 200
+    circle = torch.stack([angle.cos(), angle.sin()], 1)
+    noise = torch.randn(circle.shape, generator=torch.Generator().manual_seed(3)).double()
+    lb = LaplaceBeltrami.from_points(circle + 4e-3 * noise)
     with pytest.raises(InputError, match="put elsewhere"):
         lb.at(lb.points)

@@ -138,9 +138,8 @@ def _on_surface(
         warn_of_layers(points)
     surface = replace(surface, cells=flipped(surface.points, surface.cells))
     degree, degrees = options.elements
-    places = surface.points[:, :ambient]
     shape = surface_shape(
-        places,
+        points,
         surface,
         options.q,
         num_neighbors=options.num_neighbors,
@@ -154,7 +153,7 @@ def _on_surface(
         assert shape.plan is not None
         assert shape.fits is not None
         own = surface.cells, shape.plan.fits, shape.fits, degree, degrees
-        plan, pair = mesh_pair(places, *own, surface.stars, shape.held)
+        plan, pair = mesh_pair(shape.points, *own, surface.stars, shape.held)
         assert pair.mass is not None
         shape = replace(shape, areas=pair.mass)
         warn_of_doubts(surface, plan.fits, pair.mass)
@@ -162,8 +161,8 @@ def _on_surface(
     built = finished(shape, "points", options, progress, pair, plan)
     faces = numbering.given[surface.cells]
     built = replace(built, faces=faces, surface=surface.summary)
-    moved = (places != points).any(1).nonzero()[:, 0]
-    return with_plan(built, shape, plan, options, numbering, torch.arange(len(faces)), moved)
+    every = torch.arange(len(faces))
+    return with_plan(built, shape, plan, options, numbering, every, moved=every[:0])
 
 
 def built_again(lb: OperatorStorage) -> AssembledOperator:

@@ -43,7 +43,7 @@ class Plan:
     on_mesh
         Whether they are given, and not a surface through a cloud.
     moved
-        Points of a noisy cloud, and lone ones, that were put elsewhere.
+        Points of a noisy curve, which were put elsewhere.
     source, options
         As of the operator.
     """
@@ -69,14 +69,14 @@ class Plan:
         """The elements of the weak pair at the user's points, in the user's numbers."""
         here = self._sorted(points)
         _, fits = self.shape.at(here)
-        forms, _ = self.pair.forms(here, fits)
+        forms, _ = self.pair.forms(fits.points, fits)
         return forms.restored(self.numbering, self.order, len(self.faces))
 
     def _sorted(self, points: Float[Tensor, "N n"]) -> Float[Tensor, "N n"]:
         if len(self.moved):
             raise InputError(
-                f"points: {len(self.moved)} of the cloud were put elsewhere when its surface was found, since they are "
-                "noisy or stand in mid-air, and there is no plan of that; build the operator again"
+                f"points: {len(self.moved)} of the cloud were put elsewhere when the curve through it was found, since "
+                "they are noisy, and there is no plan of that; build the operator again"
             )
         return self.numbering.sorted(points)
 
@@ -86,14 +86,14 @@ def evaluate(plan: Plan, points: Float[Tensor, "N n"]) -> AssembledOperator:
     here, options = plan._sorted(points), plan.options
     with renumbered(plan.numbering.given), threads_for(len(points)):
         placed, fits = plan.shape.at(here)
-        pair = plan.pair.at(here, fits)
+        pair = plan.pair.at(fits.points, fits)
         assert pair.mass is not None
         shape = Shape(
             **vars(placed),
             normal_order=plan.shape.fits.order,
             balls=None,
             areas=pair.mass,
-            low_order=MeshLowOrder(here, plan.shape.cells, plan.flips, plan.shape.shares),
+            low_order=MeshLowOrder(fits.points, plan.shape.cells, plan.flips, plan.shape.shares),
             condition=options.held(plan.numbering) or Condition(),
             on_mesh=plan.on_mesh,
         )

@@ -3,151 +3,34 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import NamedTuple
 
 import torch
 from jaxtyping import Bool, Float, Int
 from scipy import sparse
 from torch import Tensor
-from torch.nn.functional import normalize
 from tqdm import tqdm
 
 from torchlb.cloud.boundary import boundary_of_cloud
 from torchlb.cloud.surface import CloudSurface
 from torchlb.errors import InputError, first_few
 from torchlb.geometry.admission import thin_sides
-from torchlb.geometry.boundary import Boundary, BoundaryPlan, boundary_of_mesh
+from torchlb.geometry.boundary import BoundaryPlan, boundary_of_mesh
 from torchlb.geometry.complex import consistently_wound
 from torchlb.geometry.fit_search import FitSearch
 from torchlb.geometry.frames import (
-    complete_frames,
     mesh_frames,
     normals_of_frames,
     vertex_normals,
 )
 from torchlb.geometry.local_fits import FitPlan, LocalFits
 from torchlb.geometry.neighbors import AT_ONCE, GraphBalls, mesh_graph, nearest_neighbors
-from torchlb.geometry.vectors import dot
 from torchlb.stencils.conditions import Condition, Neumann
 from torchlb.stencils.low_order import MeshLowOrder
+from torchlb.stencils.placed import Beside, Placed, ShapePlan, first_frames, righthanded, turned
 
 NEUMANN = Neumann()
 NEAREST = 24
 """Nearest points among which those on the other side of a thin shape are."""
-
-
-class FirstNormals(NamedTuple):
-    """Normals of a surface in R³ that are better than those of its triangles, as what they are beside these.
-
-    Attributes
-    ----------
-    neighbor
-        (N,), a point beside each, towards which the first tangent is.
-    components
-        (N, 3), along the triangles' normal, that tangent, and the vector orthogonal to both.
-    """
-
-    neighbor: Int[Tensor, " N"]
-    components: Float[Tensor, "N 3"]
-
-
-def _axes(
-    points: Float[Tensor, "N 3"], triangles: Int[Tensor, "F 3"], neighbor: Int[Tensor, " N"]
-) -> Float[Tensor, "N 3 3"]:
-    """Of each point the normal of the triangles around it, and two tangents; any where there are none."""
-    normal = vertex_normals(points, triangles)
-    normal = torch.where((normal == 0).all(1, keepdim=True), normal.new_tensor([0.0, 0, 1]), normal)
-    along = points[neighbor] - points
-    along = along - dot(along, normal)[:, None] * normal
-    flat = dot(along, along)[:, None] == 0
-    along = normalize(torch.where(flat, complete_frames(normal)[..., 0], along))
-    return torch.stack([normal, along, torch.linalg.cross(normal, along)], 1)
-
-
-def first_normals(
-    points: Float[Tensor, "N 3"], triangles: Int[Tensor, "F 3"], normals: Float[Tensor, "N 3"]
-) -> FirstNormals:
-    """What given normals are beside those of the triangles."""
-    neighbor = torch.arange(len(points))
-    neighbor[triangles.flatten()] = triangles.roll(1, 1).flatten()
-    axes = _axes(points, triangles, neighbor)
-    return FirstNormals(neighbor, (axes @ normals[..., None])[..., 0])
-
-
-def first_frames(
-    points: Float[Tensor, "N n"], cells: Int[Tensor, "F corners"], start: FirstNormals | None
-) -> Float[Tensor, "N n d"]:
-    """The frames that fits are over."""
-    if start is None:
-        return mesh_frames(points, cells)
-    axes = _axes(points, cells, start.neighbor)
-    normal = normalize((start.components[:, None] @ axes)[:, 0])
-    first = normalize(axes[:, 1] - dot(axes[:, 1], normal)[:, None] * normal)
-    return torch.stack([first, torch.linalg.cross(normal, first)], -1)
-
-
-@dataclass(frozen=True)
-class ShapePlan:
-    """What is decided about a shape of simplices.
-
-    Attributes
-    ----------
-    cells
-        (F, d + 1), whose planes the frames start from.
-    shares
-        (F,), which part of each counts; None where all of them do.
-    fits
-        Of heights, and of functions where there is to be a weak pair.
-    start
-        The first normals of a cloud's surface; None where frames start from the planes of the cells.
-    side
-        (N,), ±1: on which side of the normal of the cells around a vertex its own is; None for shapes without sides.
-    boundary
-        None for a closed shape, or where no condition holds.
-    """
-
-    cells: Int[Tensor, "F corners"]
-    shares: Float[Tensor, " F"] | None
-    fits: FitPlan
-    start: FirstNormals | None
-    side: Int[Tensor, " N"] | None
-    boundary: BoundaryPlan | None
-
-    def at(self, points: Float[Tensor, "N n"]) -> tuple[Placed, LocalFits]:
-        """Frames, normals and boundary at these points, and the fits behind them."""
-        fits = LocalFits.at(self.fits, points, first_frames(points, self.cells, self.start))
-        return self.placed(fits), fits
-
-    def placed(self, fits: LocalFits) -> Placed:
-        """The same from fits that are there."""
-        frames, normals = _righthanded(fits.frames, None)
-        if self.side is not None:
-            reference = self.side[:, None] * vertex_normals(fits.points, self.cells)
-            frames, normals = _righthanded(fits.frames, reference)
-        boundary = None if self.boundary is None else self.boundary.at(fits.points, frames)
-        return Placed(fits.points, frames, normals, boundary)
-
-
-@dataclass(frozen=True)
-class Placed:
-    """Where a shape is.
-
-    Attributes
-    ----------
-    points
-        (N, n), ℓ, float64.
-    frames
-        (N, n, d), orthonormal; [frames, normal] is right-handed where there is a normal.
-    normals
-        (N, n) unit normals of a hypersurface, else None. Oriented by the cells, or consistently on a cloud.
-    boundary
-        Its points and conormals; None for a closed shape, or where no condition holds.
-    """
-
-    points: Float[Tensor, "N n"]
-    frames: Float[Tensor, "N n d"]
-    normals: Float[Tensor, "N n"] | None
-    boundary: Boundary | None
 
 
 @dataclass(frozen=True)
@@ -236,7 +119,7 @@ def mesh_shape(
 
 
 def surface_shape(
-    points: Float[Tensor, "N n"],
+    given: Float[Tensor, "N n"],
     surface: CloudSurface,
     normal_order: int,
     *,
@@ -251,7 +134,7 @@ def surface_shape(
     The boundary is that of the surface, but for points at local stars; or the mask `boundary`. Lone points are in no
     neighbourhood but their own.
     """
-    flat = points.shape[1] == 2
+    flat, points = given.shape[1] == 2, surface.points[:, : given.shape[1]]
     triangles = torch.cat([surface.cells, surface.stars])
     sides = None if flat else thin_sides(points, surface.normals, surface.neighbors)
     graph = mesh_graph(triangles, len(points))
@@ -259,8 +142,9 @@ def surface_shape(
         others = sparse.diags_array((~surface.lone).numpy().astype(graph.dtype))
         graph = sparse.csr_array(others @ graph @ others)
         graph.eliminate_zeros()
-    start = None if flat else first_normals(points, triangles, surface.normals)
-    balls = GraphBalls(points, graph, first_frames(points, triangles, start), sides)
+    beside = Beside.of(given, surface.points, triangles, surface.neighbors[:, 1], surface.normals)
+    points = beside.places(given, triangles)
+    balls = GraphBalls(points, graph, first_frames(points, triangles, beside), sides)
     plan, fits = _searched(balls, normal_order, num_neighbors, progress, fit_degrees)
     edge = None
     if condition is not None:
@@ -272,12 +156,12 @@ def surface_shape(
             edge = boundary_of_cloud(points, boundary, 2, normal_order)
     side = None
     if not flat:
-        _, own = _righthanded(fits.frames, surface.normals)
+        _, own = righthanded(fits.frames, surface.normals)
         assert own is not None
         against = (own * vertex_normals(points, triangles)).sum(1) < 0
         side = torch.where(against, -1, 1).to(torch.int8)
     low_order = MeshLowOrder(points, triangles)
-    whole = ShapePlan(triangles, None, plan, start, side, edge)
+    whole = ShapePlan(triangles, None, plan, beside, side, edge)
     return _shape(whole, fits, balls, low_order.areas(), low_order, condition)
 
 
@@ -320,12 +204,7 @@ def _follow(sides: Tensor | None, frames: Tensor) -> Tensor | None:
     """The sides by the normals of the refined frames, where they were set."""
     if sides is None:
         return None
-    return _turned(normals_of_frames(frames), sides) * (sides != 0).any(1, keepdim=True)
-
-
-def _turned(normals: Tensor, reference: Tensor) -> Tensor:
-    """The normals, on the side of `reference`."""
-    return torch.where(((normals * reference).sum(1) < 0)[:, None], -normals, normals)
+    return turned(normals_of_frames(frames), sides) * (sides != 0).any(1, keepdim=True)
 
 
 def _searched(
@@ -345,15 +224,3 @@ def _searched(
         for centers in tqdm(parts, "tangent frames", delay=2, disable=not progress, leave=False):
             search.refine(centers)
     return search.finish()
-
-
-def _righthanded(
-    frames: Float[Tensor, "N n d"], reference: Float[Tensor, "N n"] | None
-) -> tuple[Float[Tensor, "N n d"], Float[Tensor, "N n"] | None]:
-    """Frames turned so that [frames, normal] is right-handed, normals of hypersurfaces on the side of `reference`."""
-    if frames.shape[2] != frames.shape[1] - 1:
-        return frames, None
-    righthanded = normals_of_frames(frames)
-    normals = righthanded if reference is None else _turned(righthanded, reference)
-    hand = (normals * righthanded).sum(1)[:, None, None].sign()
-    return torch.cat([hand * frames[..., :1], frames[..., 1:]], -1), normals

@@ -1,0 +1,189 @@
+"""What is decided about where a shape is: its frames, normals and boundary, and what follows at given points."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+from torch.nn.functional import normalize, pad
+
+from torchlb.geometry.boundary import Boundary, BoundaryPlan
+from torchlb.geometry.frames import (
+    complete_frames,
+    mesh_frames,
+    normals_of_frames,
+    vertex_normals,
+)
+from torchlb.geometry.local_fits import FitPlan, LocalFits
+from torchlb.geometry.vectors import dot
+
+
+class Beside(NamedTuple):
+    """What a cloud's surface has beside that of its triangles, as multiples of what these have: without a unit.
+
+    Attributes
+    ----------
+    neighbor
+        (N,), a point beside each, towards which the first tangent is.
+    normals
+        (N, 3), the first normals, along the triangles' normal, that tangent, and the vector orthogonal to both.
+    moved
+        (m,), points that are put elsewhere: noisy ones, and those in mid-air.
+    offsets
+        (m, 3), to where, along the same three, over the distance to the neighbour.
+    """
+
+    neighbor: Int[Tensor, " N"]
+    normals: Float[Tensor, "N 3"]
+    moved: Int[Tensor, " m"]
+    offsets: Float[Tensor, "m 3"]
+
+    @classmethod
+    def of(
+        cls,
+        given: Float[Tensor, "N n"],
+        places: Float[Tensor, "N 3"],
+        triangles: Int[Tensor, "F 3"],
+        nearest: Int[Tensor, " N"],
+        normals: Float[Tensor, "N 3"],
+    ) -> Beside:
+        """Of points that stand at other places, and have these normals there."""
+        neighbor = nearest.clone()
+        neighbor[triangles.flatten()] = triangles.roll(1, 1).flatten()
+        given = pad(given, (0, 3 - given.shape[1]))
+        moved = (places != given).any(1).nonzero()[:, 0]
+        axes, size = _axes(given, triangles, neighbor)
+        offset = (places - given)[moved] / size[moved, None]
+        axes, offsets = _axes(places, triangles, neighbor)[0], (axes[moved] @ offset[..., None])
+        return cls(neighbor, (axes @ normals[..., None])[..., 0], moved, offsets[..., 0])
+
+    def places(
+        self, points: Float[Tensor, "N n"], triangles: Int[Tensor, "F 3"]
+    ) -> Float[Tensor, "N n"]:
+        """Where the surface is at given points."""
+        if len(self.moved) == 0:
+            return points
+        space = pad(points, (0, 3 - points.shape[1]))
+        axes, size = _axes(space, triangles, self.neighbor)
+        offset = (self.offsets[:, None] @ axes[self.moved])[:, 0] * size[self.moved, None]
+        return space.index_add(0, self.moved, offset)[:, : points.shape[1]]
+
+    def frames(
+        self, places: Float[Tensor, "N 3"], triangles: Int[Tensor, "F 3"]
+    ) -> Float[Tensor, "N 3 2"]:
+        """Frames under the first normals."""
+        axes, _ = _axes(places, triangles, self.neighbor)
+        normal = normalize((self.normals[:, None] @ axes)[:, 0])
+        first = normalize(axes[:, 1] - dot(axes[:, 1], normal)[:, None] * normal)
+        return torch.stack([first, torch.linalg.cross(normal, first)], -1)
+
+
+def _axes(
+    points: Float[Tensor, "N 3"], triangles: Int[Tensor, "F 3"], neighbor: Int[Tensor, " N"]
+) -> tuple[Float[Tensor, "N 3 3"], Float[Tensor, " N"]]:
+    """Of each point the normal of the triangles around it, and two tangents; any where there are none.
+
+    And the distance to the neighbour that the first of them points to.
+    """
+    normal = vertex_normals(points, triangles)
+    normal = torch.where((normal == 0).all(1, keepdim=True), normal.new_tensor([0.0, 0, 1]), normal)
+    edge = points[neighbor] - points
+    along = edge - dot(edge, normal)[:, None] * normal
+    flat = dot(along, along)[:, None] == 0
+    along = normalize(torch.where(flat, complete_frames(normal)[..., 0], along))
+    return torch.stack([normal, along, torch.linalg.cross(normal, along)], 1), edge.norm(dim=1)
+
+
+@dataclass(frozen=True)
+class ShapePlan:
+    """What is decided about a shape of simplices.
+
+    Attributes
+    ----------
+    cells
+        (F, d + 1), whose planes the frames start from.
+    shares
+        (F,), which part of each counts; None where all of them do.
+    fits
+        Of heights, and of functions where there is to be a weak pair.
+    beside
+        Of the surface through a cloud; None where points stand as given, and frames start from the planes of the cells.
+    side
+        (N,), ±1: on which side of the normal of the cells around a vertex its own is; None for shapes without sides.
+    boundary
+        None for a closed shape, or where no condition holds.
+    """
+
+    cells: Int[Tensor, "F corners"]
+    shares: Float[Tensor, " F"] | None
+    fits: FitPlan
+    beside: Beside | None
+    side: Int[Tensor, " N"] | None
+    boundary: BoundaryPlan | None
+
+    def at(self, points: Float[Tensor, "N n"]) -> tuple[Placed, LocalFits]:
+        """Frames, normals and boundary at these points, and the fits behind them."""
+        places = points if self.beside is None else self.beside.places(points, self.cells)
+        initial = first_frames(places, self.cells, self.beside)
+        fits = LocalFits.at(self.fits, places, initial)
+        return self.placed(fits), fits
+
+    def placed(self, fits: LocalFits) -> Placed:
+        """The same from fits that are there."""
+        frames, normals = righthanded(fits.frames, None)
+        if self.side is not None:
+            reference = self.side[:, None] * vertex_normals(fits.points, self.cells)
+            frames, normals = righthanded(fits.frames, reference)
+        boundary = None if self.boundary is None else self.boundary.at(fits.points, frames)
+        return Placed(fits.points, frames, normals, boundary)
+
+
+@dataclass(frozen=True)
+class Placed:
+    """Where a shape is.
+
+    Attributes
+    ----------
+    points
+        (N, n), ℓ, float64.
+    frames
+        (N, n, d), orthonormal; [frames, normal] is right-handed where there is a normal.
+    normals
+        (N, n) unit normals of a hypersurface, else None. Oriented by the cells, or consistently on a cloud.
+    boundary
+        Its points and conormals; None for a closed shape, or where no condition holds.
+    """
+
+    points: Float[Tensor, "N n"]
+    frames: Float[Tensor, "N n d"]
+    normals: Float[Tensor, "N n"] | None
+    boundary: Boundary | None
+
+
+def first_frames(
+    places: Float[Tensor, "N n"], cells: Int[Tensor, "F corners"], beside: Beside | None
+) -> Float[Tensor, "N n d"]:
+    """The frames that fits are over."""
+    if beside is None or places.shape[1] == 2:
+        return mesh_frames(places, cells)
+    return beside.frames(places, cells)
+
+
+def turned(normals: Tensor, reference: Tensor) -> Tensor:
+    """The normals, on the side of `reference`."""
+    return torch.where(((normals * reference).sum(1) < 0)[:, None], -normals, normals)
+
+
+def righthanded(
+    frames: Float[Tensor, "N n d"], reference: Float[Tensor, "N n"] | None
+) -> tuple[Float[Tensor, "N n d"], Float[Tensor, "N n"] | None]:
+    """Frames turned so that [frames, normal] is right-handed, normals of hypersurfaces on the side of `reference`."""
+    if frames.shape[2] != frames.shape[1] - 1:
+        return frames, None
+    righthanded = normals_of_frames(frames)
+    normals = righthanded if reference is None else turned(righthanded, reference)
+    hand = (normals * righthanded).sum(1)[:, None, None].sign()
+    return torch.cat([hand * frames[..., :1], frames[..., 1:]], -1), normals
