@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property, reduce
+from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -103,18 +104,16 @@ class Tetrahedra:
     Attributes
     ----------
     cells : (T, 4).
-    centers : (T, 3), ℓ, of the circumscribed spheres.
+    centers : (T + H, 3), ℓ, of the circumscribed spheres; then, beyond each triangle of the hull, a point far away.
     triangles : (F, 3), each once.
-    ends : centers of the spheres on its two sides, (F, 3) each; beyond the convex hull a point far away.
-    sides : numbers of the tetrahedra there, (F,) each; the triangles of the hull have numbers after them.
+    sides : numbers of the tetrahedra on its two sides, (F,) each; the triangles of the hull have numbers after them.
     hull : (F,), which triangles are on the convex hull.
     """
 
     points: Float[np.ndarray, "N 3"]
     cells: Int[np.ndarray, "T 4"]
-    centers: Float[np.ndarray, "T 3"]
+    centers: Float[np.ndarray, "_ 3"]
     triangles: Faces
-    ends: tuple[Float[np.ndarray, "F 3"], Float[np.ndarray, "F 3"]]
     sides: tuple[Int[np.ndarray, " F"], Int[np.ndarray, " F"]]
     hull: Bool[np.ndarray, " F"]
 
@@ -150,22 +149,27 @@ class Tetrahedra:
             np.concatenate(there),
         )
         hull = second < 0
-        ends = centers[first], centers[second]
         a, b, c = moved[triangles[hull]].swapaxes(0, 1)
         normal = np.cross(b - a, c - a)
         normal /= np.maximum(lengths(normal), TINY)[:, None]
         inside = a - moved[np.concatenate(apex)[hull]]
         away = np.sign(inner(inside, normal))[:, None] * normal
-        ends[1][hull] = ends[0][hull] + FAR * np.ptp(points, axis=0).max() * away
+        far = centers[first[hull]] + FAR * np.ptp(points, axis=0).max() * away
         second[hull] = len(cells) + np.arange(hull.sum())
-        return cls(points, cells, centers, triangles, ends, (first, second), hull)
+        centers = np.concatenate([centers, far])
+        return cls(points, cells, centers, triangles, (first, second), hull)
+
+    def ends(self, triangles: Any = slice(None)) -> tuple[np.ndarray, np.ndarray]:
+        """Centers of the spheres on the two sides of triangles, (F, 3) each, ℓ."""
+        one, two = (self.centers[side[triangles]] for side in self.sides)
+        return one, two
 
     def candidates(self, cloud: Cloud, side: Float[np.ndarray, " S"]) -> Candidates:
         """Small triangles that may be of the surface; `side` tells the spheres outside of it from those inside."""
         radius, normal = cloud.circles(self.triangles)
         kept = radius <= cloud.limits(self.triangles)
         triangles, radius, normal = self.triangles[kept], radius[kept], normal[kept]
-        ends = tuple(end[kept] for end in self.ends)
+        ends = self.ends(kept)
         alignment = cloud.alignment(normal, triangles)
         tangent = alignment > TILTED
         for corner in triangles.T:

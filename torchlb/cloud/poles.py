@@ -61,7 +61,8 @@ class Poles:
         outer = tetrahedra.triangles[hull]
         point = np.concatenate([cells[solid].ravel(), outer.ravel()])
         ball = np.concatenate([solid.repeat(4), tetrahedra.sides[1][hull].repeat(3)])
-        center = [tetrahedra.centers[solid].repeat(4, 0), tetrahedra.ends[1][hull].repeat(3, 0)]
+        far = tetrahedra.ends(hull)[1]
+        center = [tetrahedra.centers[solid].repeat(4, 0), far.repeat(3, 0)]
         ray = np.concatenate(center) - points.take(point, 0)
         return cls(tetrahedra, *(torch.from_numpy(x) for x in (point, ball, ray)))
 
@@ -131,8 +132,9 @@ class Poles:
         """Spheres that share a triangle, or an edge of the convex hull; and the cosine of their radii there."""
         tetrahedra = self.tetrahedra
         apex, outer = tetrahedra.points[tetrahedra.triangles[:, 0]], tetrahedra.hull
-        radii = [torch.from_numpy(end - apex) for end in tetrahedra.ends]
-        away = torch.from_numpy(tetrahedra.ends[1][outer] - tetrahedra.ends[0][outer])
+        radii = [torch.from_numpy(end - apex) for end in tetrahedra.ends()]
+        near, far = tetrahedra.ends(outer)
+        away = torch.from_numpy(far - near)
         left, right = (
             half // 3
             for half in edges_of(tetrahedra.triangles[outer], len(tetrahedra.points)).twins
