@@ -150,6 +150,13 @@ def test_copies_and_files_decide_anew(tmp_path):
         torch.testing.assert_close(again.values, lb.values)
 
 
+def test_a_plan_that_is_let_go_is_made_again():
+    lb = LaplaceBeltrami.from_mesh(*Torus().mesh(200))
+    moved = lb.at(1.1 * lb.points)
+    del lb.plan
+    torch.testing.assert_close(lb.at(1.1 * lb.points).weak_values, moved.weak_values)
+
+
 def test_what_has_no_plan_says_so():
     lb = built("sphere")
     with pytest.raises(InputError, match="as the operator has"):

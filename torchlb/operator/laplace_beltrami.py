@@ -234,6 +234,11 @@ class LaplaceBeltrami(StencilFace, WeakFace):
             )
         return self._plan
 
+    @plan.deleter
+    def plan(self) -> None:
+        """``del lb.plan`` lets it go, with some kilobytes a point; it is made again when it is asked for."""
+        self._plan = None
+
     def at(self, points: ArrayLike) -> LaplaceBeltrami:
         """The operator of the shape that has moved to other points, by the same decisions: neighbours, degrees, cells.
 
