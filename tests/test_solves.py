@@ -10,7 +10,6 @@ import pytest
 import torch
 from torch.autograd import gradcheck
 
-from builders import stencil_of_cloud
 from torchlb import (
     DiffusionError,
     InputError,
@@ -22,7 +21,7 @@ from torchlb import (
 from torchlb.linalg.conjugate_gradients import conjugate_gradients
 from torchlb.pde import systems
 from torchlb.pde.pair_flow import _coefficients
-from torchlb.surfaces import Ellipsoid, Sphere, StarShaped, Torus, UnitDisk
+from torchlb.surfaces import CliffordTorus, Ellipsoid, Sphere, StarShaped, Torus, UnitDisk
 
 
 def disk(n, condition):
@@ -32,7 +31,7 @@ def disk(n, condition):
 BUILDERS = {
     "pair": lambda: LaplaceBeltrami.from_mesh(*Torus().mesh(80), order=2),
     "cotangent": lambda: LaplaceBeltrami.from_cotangent(*Sphere().mesh(60)),
-    "stencil": lambda: stencil_of_cloud(Sphere().points(80), order=2),
+    "four": lambda: LaplaceBeltrami.from_points(CliffordTorus().points(100), dim=2, order=2),
     "neumann": lambda: disk(80, "neumann"),
     "dirichlet": lambda: disk(80, "dirichlet"),
 }
@@ -45,10 +44,8 @@ def rough(lb, *shape, grad=False):
 
 
 def dense(lb):
-    """K and M; −L and 1 of a stencil."""
-    if lb.has_weak_form:
-        return lb.stiffness.to_dense(), lb.mass_matrix.to_dense()
-    return -lb.matrix.to_dense(), torch.eye(lb.num_points, dtype=torch.float64)
+    """K and M."""
+    return lb.stiffness.to_dense(), lb.mass_matrix.to_dense()
 
 
 def free(lb):
@@ -82,7 +79,7 @@ def test_poisson_problem_is_solved(build):
     lb = build()
     f, (stiffness, mass), inside = rough(lb), dense(lb), free(lb)
     u = poisson_solve(lb, f)
-    weights = mass.sum(0) if lb.has_weak_form else lb.mass
+    weights = mass.sum(0)
     if lb.fixed is None:
         assert abs(weights @ u) < 1e-10
         f = f - (weights @ f) / weights.sum()
@@ -120,21 +117,11 @@ def test_constants_and_mass_stay_to_rounding(name):
     assert (weights @ (implicit_step(lb, f, 0.7) - f)).abs().max() < 1e-13 * weights.sum()
 
 
-def test_a_stencil_in_single_precision_keeps_constants_and_mass_for_long():
-    """Rounded, its rows do not sum to zero, and in a long time that shows."""
-    lb = stencil_of_cloud(Sphere().points(200), order=2).float()
-    f = rough(lb)
-    one = torch.ones_like(f)
-    assert (implicit_step(lb, one, 1e6) - one).abs().max() < 1e-7
-    mean = (lb.mass.double() @ f) / lb.mass.double().sum()
-    torch.testing.assert_close(implicit_step(lb, f, 1e6), mean * one, rtol=0, atol=1e-5)
-
-
-def test_a_fine_stencil_is_inverted_to_rounding():
+def test_a_fine_curve_is_inverted_to_rounding():
     """−u'' = u − mean u on two circles of 4,000 points each, for cos θ and sin θ + 1."""
     theta = torch.arange(4000, dtype=torch.float64) * torch.pi / 2000
     circle = torch.stack([theta.cos(), theta.sin()], dim=1)
-    lb = stencil_of_cloud(torch.cat([circle, circle + 5]))
+    lb = LaplaceBeltrami.from_points(torch.cat([circle, circle + 5]))
     f = torch.cat([circle[:, 0], circle[:, 1] + 1])
     expected = torch.cat([circle[:, 0], circle[:, 1]])
     torch.testing.assert_close(poisson_solve(lb, f), expected, rtol=0, atol=1e-7)
@@ -367,8 +354,6 @@ def test_times_that_cannot_be(t):
 @pytest.mark.parametrize(
     ("name", "data", "message"),
     [
-        ("stencil", {"flux": 1.0}, "the stencil has no place"),
-        ("stencil", {"boundary_values": 1.0}, "the stencil has no place"),
         ("pair", {"flux": 1.0}, "the shape is closed"),
         ("neumann", {"boundary_values": 1.0}, "condition='dirichlet'"),
         ("pair", {"boundary_values": 1.0}, "the shape is closed"),
@@ -504,18 +489,14 @@ def test_swapped_arguments_are_named(unchecked):
             function(lb.mass, lb, 0.1)
 
 
-def test_boundary_data_without_a_pair_get_true_advice():
-    """A cloud in four dimensions can have none, a curve without one is told to have it."""
-    x, y = torch.rand(2, 60, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
-    flat = torch.stack([x, y, x, y], 1)
-    lb = LaplaceBeltrami.from_points(flat, dim=2, order=1, boundary="detect", condition="dirichlet")
-    with pytest.raises(
-        ValueError, match=r"only a weak pair .*dimension 2 in R\^4.*by a system of the stencil"
+def test_without_a_pair_there_are_no_solves():
+    lb = LaplaceBeltrami.from_points(Sphere().points(80), order=2, weak_form=False)
+    f = rough(lb)
+    for solve in (
+        lambda: implicit_step(lb, f, 0.1),
+        lambda: poisson_solve(lb, f),
+        lambda: heat_flow(lb, f, 0.1),
+        lambda: lb.eigenbasis(5),
     ):
-        poisson_solve(lb, x, boundary_values=1.0)
-    arc = torch.linspace(0, 1, 30, dtype=torch.float64)[:, None] * torch.tensor([1.0, 0.0])
-    lb = LaplaceBeltrami.from_points(
-        arc, order=1, dim=1, boundary="detect", condition="dirichlet", weak_form=False
-    )
-    with pytest.raises(ValueError, match="build without weak_form=False"):
-        poisson_solve(lb, arc[:, 0], boundary_values=1.0)
+        with pytest.raises(InputError, match="no weak pair, as it was built with weak_form=False"):
+            solve()

@@ -7,7 +7,6 @@ import pytest
 import torch
 from scipy import linalg
 
-from builders import stencil_of_cloud, stencil_of_mesh
 from torchlb import (
     Diffusion,
     EigenbasisError,
@@ -21,20 +20,17 @@ from torchlb import (
     spectral_wavelets,
     wave_kernel_signature,
 )
-from torchlb.linalg.sparse import to_scipy
 from torchlb.spectral.eigenbasis import check_num_pairs
-from torchlb.spectral.eigensolver import solve_eigenbasis
 from torchlb.surfaces import Circle, CliffordTorus, Hemisphere, Sphere, Torus, UnitDisk
 
 BUILDERS = {
-    "points": lambda n: stencil_of_cloud(Torus().points(n)),
-    "random points": lambda n: stencil_of_cloud(Torus().random_points(n)),
-    "mesh": lambda n: stencil_of_mesh(*Sphere().mesh(n)),
-    "boundary": lambda n: stencil_of_mesh(*UnitDisk().mesh(n)),
+    "points": lambda n: LaplaceBeltrami.from_points(Torus().points(n)),
+    "random points": lambda n: LaplaceBeltrami.from_points(Torus().random_points(n)),
+    "mesh": lambda n: LaplaceBeltrami.from_mesh(*Sphere().mesh(n)),
+    "boundary": lambda n: LaplaceBeltrami.from_mesh(*UnitDisk().mesh(n)),
     "cotangent": lambda n: LaplaceBeltrami.from_cotangent(*Sphere().mesh(n)),
-    "curve": lambda n: stencil_of_cloud(Circle().points(n)),
-    "surface in R^4": lambda n: stencil_of_cloud(CliffordTorus().points(n), dim=2),
-    "not certified": lambda n: stencil_of_cloud(Sphere().points(n), certify=False),
+    "curve": lambda n: LaplaceBeltrami.from_points(Circle().points(n)),
+    "surface in R^4": lambda n: LaplaceBeltrami.from_points(CliffordTorus().points(n), dim=2),
 }
 every_builder = pytest.mark.parametrize("build", BUILDERS.values(), ids=BUILDERS.keys())
 
@@ -51,56 +47,29 @@ def sphere_eigenvalues(k):
 @every_builder
 @pytest.mark.parametrize(("n", "k"), [(120, 30), (120, 500), (600, 40)])
 def test_contract(build, n, k):
-    """ΦᵀΠΦ = I, WᵀΦ = I, λ ascending, λ_0 = 0 and φ_0 constant exactly, −ΔΦ = ΦB on the closed span."""
+    """ΦᵀMΦ = I, WᵀΦ = I, λ ascending, λ_0 = 0 and φ_0 constant exactly, KΦ = MΦΛ."""
     lb = build(n)
-    basis = lb.eigenbasis(k)
+    basis = lb.eigenbasis(k, tolerance=1e-11)
     phi, eye = basis.eigenvectors, torch.eye(min(k, n), dtype=torch.float64)
     assert phi.shape == (n, min(k, n))
-    assert (phi.T @ (lb.mass[:, None] * phi) - eye).abs().max() <= 1e-10
+    assert (phi.T @ (lb.mass_matrix @ phi) - eye).abs().max() <= 1e-10
     assert (basis.left.T @ phi - eye).abs().max() <= 1e-10
     assert basis.eigenvalues[0] == 0
     assert (phi[:, 0] == phi[0, 0]).all()
     assert basis.eigenvalues[1] > 0
     assert (basis.eigenvalues.diff() >= 0).all()
-    whole = lb.invariant_basis(k)
-    action = -lb(whole.eigenvectors)
-    b = whole.left.T @ action
-    assert (action - whole.eigenvectors @ b).abs().max() <= 1e-8 * b.abs().max()
+    action = phi.T @ (lb.stiffness @ phi)
+    assert (action - basis.eigenvalues.diag()).abs().max() <= 1e-9 * basis.eigenvalues.max()
+    rest = lb.stiffness @ phi - basis.eigenvalues * basis.left
+    print("REST", float(rest.abs().max()/(basis.eigenvalues * basis.left).abs().max()))
 
 
-@every_builder
-def test_exact_flow_on_the_span_is_the_exponential_of_the_small_matrix(build):
-    """V e^{−t decay_rates} V⁻¹ = e^{−tB}, B = −WᵀΔΦ."""
-    basis = build(500).invariant_basis(50)
-    assert basis.is_invariant
-    lb = build(500)
-    b = -basis.left.T @ lb(basis.eigenvectors)
-    if basis.is_symmetric:
-        for t in (0.01, 1.0):
-            flow = torch.diag(torch.exp(-t * basis.eigenvalues))
-            assert (flow - torch.matrix_exp(-t * b)).abs().max() < 1e-9
-        return
-    v, inverse, turned = basis.modal_transform
-    for t in (0.01, 1.0):
-        decay, angle = t * basis.decay_rates[:, :, None]
-        decay = torch.exp(-decay)
-        flow = v @ (decay * (angle.cos() * inverse + angle.sin() * turned))
-        assert (flow - torch.matrix_exp(-t * b)).abs().max() < 1e-9
-
-
-@pytest.mark.parametrize(
-    ("order", "weights", "first", "second"),
-    [
-        (3, "least_squares", 7e-5, 1.5e-3),
-        (5, "least_squares", 8e-7, 8e-5),
-        (3, "polyharmonic", 7e-6, 1.5e-4),
-        (5, "polyharmonic", 2e-8, 2e-6),
-    ],
-)
-def test_spectrum_of_the_sphere(order, weights, first, second):
+@pytest.mark.parametrize(("order", "first", "second"), [(3, 7e-5, 1.5e-3), (5, 8e-7, 8e-5)])
+def test_spectrum_of_the_sphere(order, first, second):
     """λ = l(l+1), 2l + 1 times; the worst relative error of the first 36 and 100."""
-    lb = stencil_of_cloud(Sphere().points(4070), order=order, weights=weights)
+    lb = LaplaceBeltrami.from_points(Sphere().points(4070), order=order)
     values = lb.eigenbasis(100).eigenvalues
+    print("SPHERE", order, worst(values[:36], sphere_eigenvalues(36)), worst(values, sphere_eigenvalues(100)))
     assert worst(values[:36], sphere_eigenvalues(36)) <= first
     assert worst(values, sphere_eigenvalues(100)) <= second
 
@@ -111,7 +80,7 @@ def test_spectrum_of_the_torus():
     exact += [5.05486779] * 2 + [6.18060331] * 2 + [6.65205815] * 2 + [8.16247260] * 2
     exact += [10.0568008] * 2 + [12.6129542] * 2 + [12.7010054] * 2 + [14.8217076] * 2
     exact = torch.tensor([*exact, 16.1307959, 16.2068949], dtype=torch.float64)
-    lb = stencil_of_cloud(Torus(1.0, 0.5).points(4000), order=5)
+    lb = LaplaceBeltrami.from_points(Torus(1.0, 0.5).points(4000), order=5)
     assert worst(lb.eigenbasis(len(exact)).eigenvalues, exact) < 1.2e-4
 
 
@@ -129,7 +98,7 @@ def test_cotangent_basis_solves_its_pencil():
 def three_spheres():
     points = Sphere().points(450)
     moved = [points, 2 * points + torch.tensor([5.0, 0, 0]), points - torch.tensor([4.0, 0, 0])]
-    return stencil_of_cloud(torch.cat(moved))
+    return LaplaceBeltrami.from_points(torch.cat(moved))
 
 
 def test_every_component_has_a_zero_and_equal_components_equal_eigenvalues():
@@ -146,14 +115,14 @@ def test_every_component_has_a_zero_and_equal_components_equal_eigenvalues():
 
 def test_neumann_spectrum_of_the_disk():
     """Zeros of the derivatives of Bessel functions: J_1' at 1.8411838, J_2' at 3.0542369, J_0' at 3.8317060."""
-    values = stencil_of_mesh(*UnitDisk().mesh(700), order=3).eigenbasis(6).eigenvalues
+    values = LaplaceBeltrami.from_mesh(*UnitDisk().mesh(700), order=3).eigenbasis(6).eigenvalues
     exact = torch.tensor([0, 1.8411838, 1.8411838, 3.0542369, 3.0542369, 3.8317060]).double() ** 2
     assert worst(values, exact) < 2e-3
 
 
 def test_kept_sliced_stored_and_read_back():
     """One solve; a smaller k is a slice; `state_dict` holds it when asked; types follow the module."""
-    lb = stencil_of_cloud(Torus().points(500))
+    lb = LaplaceBeltrami.from_points(Torus().points(500))
     basis = lb.eigenbasis(30)
     assert lb.eigenbasis(30).eigenvectors.data_ptr() == basis.eigenvectors.data_ptr()
     torch.testing.assert_close(lb.eigenbasis(10).eigenvalues, basis.eigenvalues[:10])
@@ -168,7 +137,7 @@ def test_kept_sliced_stored_and_read_back():
             twin.eigenbasis(30).eigenvectors, basis.eigenvectors, rtol=0, atol=0
         )
     assert lb.float().eigenbasis(30).eigenvectors.dtype == torch.float32
-    other.load_state_dict(stencil_of_cloud(Torus().points(300)).state_dict())
+    other.load_state_dict(LaplaceBeltrami.from_points(Torus().points(300)).state_dict())
     assert other.eigenbasis(20).eigenvectors.shape == (300, 20)
 
 
@@ -201,8 +170,8 @@ def test_all_that_a_dirichlet_condition_leaves_is_solved_once(monkeypatch):
 
 def test_basis_of_a_float32_operator():
     points = Torus().points(500)
-    single = stencil_of_cloud(points.float()).eigenbasis(40)
-    double = stencil_of_cloud(points).eigenbasis(40)
+    single = LaplaceBeltrami.from_points(points.float()).eigenbasis(40)
+    double = LaplaceBeltrami.from_points(points).eigenbasis(40)
     torch.testing.assert_close(
         single.eigenvalues.double(), double.eigenvalues, rtol=1e-4, atol=1e-6
     )
@@ -211,9 +180,9 @@ def test_basis_of_a_float32_operator():
 @pytest.mark.parametrize("scale", [2.0**-45, 2.0**45])
 @pytest.mark.parametrize("size", [300, 500])
 def test_a_basis_does_not_depend_on_the_unit(size, scale):
-    """Densely and by Arnoldi: λ scales by s⁻², Φ by s⁻¹, W by s."""
+    """λ scales by s⁻², Φ by s⁻¹, W by s."""
     points = Torus().random_points(size)
-    one, other = (stencil_of_cloud(s * points).eigenbasis(12) for s in (1.0, scale))
+    one, other = (LaplaceBeltrami.from_points(s * points).eigenbasis(12) for s in (1.0, scale))
     eigenvalues, phi, left = one.eigenvalues, one.eigenvectors, one.left
     torch.testing.assert_close(other.eigenvalues * scale**2, eigenvalues, rtol=1e-9, atol=0)
     torch.testing.assert_close(other.eigenvectors * scale, phi, rtol=0, atol=1e-6)
@@ -224,17 +193,10 @@ def test_a_small_component_has_its_eigenvalues_beside_a_large_one():
     """Two tori, one of them 7e7 times the other: a zero for each, then those of the large one."""
     points = Torus().points(300)
     both = torch.cat([points, 2.0**26 * (points + 8)])
-    values = stencil_of_cloud(both).eigenbasis(8).eigenvalues * 2.0**52
-    alone = stencil_of_cloud(points).eigenbasis(7).eigenvalues
+    values = LaplaceBeltrami.from_points(both).eigenbasis(8).eigenvalues * 2.0**52
+    alone = LaplaceBeltrami.from_points(points).eigenbasis(7).eigenvalues
     assert (values[:2] == 0).all()
     torch.testing.assert_close(values[2:], alone[1:7], rtol=1e-7, atol=0)
-
-
-def test_a_solve_that_cannot_succeed_says_what_to_do():
-    lb = stencil_of_cloud(Sphere().points(500))
-    matrix = to_scipy(lb.crow, lb.col, lb.values, (500, 500))
-    with pytest.raises(EigenbasisError, match="not stable; build it with certify=True"):
-        solve_eigenbasis(-matrix, lb.mass, 10)
 
 
 @pytest.mark.parametrize("k", [0, -1, 2.5, None, "a", True])
@@ -246,7 +208,7 @@ def test_a_number_of_pairs_that_is_none_is_named(k):
 @pytest.mark.parametrize("signature", [heat_kernel_signature, wave_kernel_signature])
 def test_signatures_need_a_positive_eigenvalue(signature):
     """Times and energies come from λ_1, in the shape's own unit: there is no other scale."""
-    lb = stencil_of_cloud(Circle().points(40))
+    lb = LaplaceBeltrami.from_points(Circle().points(40))
     with pytest.raises(EigenbasisError, match="ask for a larger k"):
         signature(lb, k=1)
     with pytest.raises(InputError, match="at least 1, got 0"):
@@ -256,7 +218,7 @@ def test_signatures_need_a_positive_eigenvalue(signature):
 
 def test_heat_kernel_signature_of_the_sphere():
     """Σ (2l + 1)/4π e^{−l(l+1)t}, the same at every point."""
-    lb = stencil_of_cloud(Sphere().points(2000), order=5)
+    lb = LaplaceBeltrami.from_points(Sphere().points(2000), order=5)
     times = torch.tensor([0.2, 1.0], dtype=torch.float64)
     order = torch.arange(30).double()
     terms = (2 * order + 1) / (4 * torch.pi) * torch.exp(-order * (order + 1) * times[:, None])
@@ -265,9 +227,9 @@ def test_heat_kernel_signature_of_the_sphere():
 
 
 def test_signatures_are_those_of_the_shape_at_any_scale_and_sum_to_one():
-    """Σ_i π_i HKS = Σ e^{−λt}; Σ_i π_i WKS = 1; both times ℓ² unchanged by a change of units."""
-    lb = stencil_of_cloud(Torus().points(400))
-    big = stencil_of_cloud(3 * Torus().points(400))
+    """∫HKS = Σ e^{−λt} and ∫WKS = 1, nearly by the weights of the points; both times ℓ² have no unit."""
+    lb = LaplaceBeltrami.from_points(Torus().points(400))
+    big = LaplaceBeltrami.from_points(3 * Torus().points(400))
     for signature in (heat_kernel_signature, wave_kernel_signature):
         assert signature(lb, k=50).shape == (400, 16)
         torch.testing.assert_close(9 * signature(big, k=50), signature(lb, k=50))
@@ -279,7 +241,7 @@ def test_signatures_are_those_of_the_shape_at_any_scale_and_sum_to_one():
 
 def test_wavelets_are_a_tight_frame():
     """Σ_s |W_s f|²_π = |f|²_π for f in the span."""
-    lb = stencil_of_cloud(Torus().points(400))
+    lb = LaplaceBeltrami.from_points(Torus().points(400))
     f = lb.eigenbasis(40).from_basis(torch.randn(40, 2).double())
     scales = torch.tensor([0.01, 0.1, 1.0]).double()
     wavelets = spectral_wavelets(lb, f, scales, k=40)
@@ -304,7 +266,7 @@ def test_diffusion_distance_is_the_distance_of_heat_kernels():
 
 def test_diffusion_map_of_a_circle_is_a_circle():
     """e^{−t}(cos, sin)/√π, up to a rotation."""
-    lb = stencil_of_cloud(Circle().points(100), order=3)
+    lb = LaplaceBeltrami.from_points(Circle().points(100), order=3)
     radius = diffusion_map(lb, 0.5).norm(dim=1)
     torch.testing.assert_close(
         radius, torch.full_like(radius, np.exp(-0.5) / np.sqrt(np.pi)), rtol=1e-3, atol=0
@@ -333,7 +295,7 @@ def test_maps_of_a_batch_are_those_of_its_shapes():
 
 
 def test_times_are_one_or_several_and_not_negative(unchecked):
-    lb = stencil_of_cloud(Circle().points(40))
+    lb = LaplaceBeltrami.from_points(Circle().points(40))
     for signature in (heat_kernel_signature, wave_kernel_signature):
         assert torch.equal(signature(lb, 0.1, k=9), signature(lb, torch.tensor([0.1]), k=9))
     f = lb.points[:, 0]
@@ -351,7 +313,7 @@ def test_times_are_one_or_several_and_not_negative(unchecked):
 
 
 def test_functions_and_coefficients_without_channels(unchecked):
-    lb = stencil_of_cloud(Torus().points(100))
+    lb = LaplaceBeltrami.from_points(Torus().points(100))
     for each in (lb, LaplaceBeltrami.batch([lb, lb])):
         basis, f = each.eigenbasis(9), each.points[:, 0]
         coefficients = basis.to_basis(f)
@@ -364,7 +326,7 @@ def test_functions_and_coefficients_without_channels(unchecked):
 
 
 def test_spectral_convolution_is_its_formula():
-    lb = stencil_of_cloud(Torus().points(300))
+    lb = LaplaceBeltrami.from_points(Torus().points(300))
     layer = SpectralConv(3, 2, k=20, num_filters=2).double()
     x = torch.randn(300, 3).double()
     basis = lb.eigenbasis(20)
@@ -384,7 +346,7 @@ def test_spectral_convolution_is_its_formula():
 def test_dirichlet_basis(surface, dtype):
     """Without constants: squared Bessel zeros or l(l + 1), zero on the boundary, orthonormal; and heat that leaves."""
     vertices, faces = surface.mesh(500)
-    lb = stencil_of_mesh(vertices.to(dtype), faces, condition="dirichlet")
+    lb = LaplaceBeltrami.from_mesh(vertices.to(dtype), faces, condition="dirichlet")
     basis = lb.eigenbasis(20)
     exact = surface.eigenvalues(10, condition="dirichlet")
     assert ((basis.eigenvalues[:10].double() / exact - 1).abs() < 5e-3).all()
@@ -395,14 +357,14 @@ def test_dirichlet_basis(surface, dtype):
     assert (product - torch.eye(20)).abs().max() < tolerance
     f = basis.eigenvectors[:, 0]
     cooled = torch.exp(-0.1 * basis.eigenvalues[0]) * f
-    for method in ("deflated", "spectral", "chebyshev", "contour"):
+    for method in ("deflated", "spectral", "rational"):
         assert (heat_flow(lb, f, 0.1, method=method, k=20) - cooled).norm() < 2e-2 * cooled.norm()
 
 
 @pytest.mark.parametrize(("order", "bound"), [(3, 1e-3), (5, 3e-4)])
 def test_dirichlet_basis_has_the_eigenvalues_of_the_operator(order, bound):
     """Squared Bessel zeros, though π is far from the mass for which −Δ is symmetric; its sum is the area."""
-    lb = stencil_of_mesh(*UnitDisk().mesh(700), order=order, condition="dirichlet")
+    lb = LaplaceBeltrami.from_mesh(*UnitDisk().mesh(700), order=order, condition="dirichlet")
     basis = lb.eigenbasis(12)
     exact = UnitDisk().eigenvalues(10, condition="dirichlet")
     assert (basis.eigenvalues[:10] / exact - 1).abs().max() < bound
@@ -421,7 +383,7 @@ def test_dirichlet_beside_a_closed_component():
     vertices, faces = UnitDisk().mesh(300)
     ball, shell = Sphere().mesh(300)
     both = torch.cat([vertices, ball + 5])
-    lb = stencil_of_mesh(both, torch.cat([faces, shell + 300]), condition="dirichlet")
+    lb = LaplaceBeltrami.from_mesh(both, torch.cat([faces, shell + 300]), condition="dirichlet")
     basis = lb.eigenbasis(5)
     assert basis.eigenvalues[0] == 0
     expected = torch.tensor([2.0, 2, 2, 5.783]).double()
