@@ -13,10 +13,9 @@ from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
-from scipy.spatial import Delaunay
 
 from torchlb.cloud.manifold import face_vectors
-from torchlb.geometry.complex import Faces, edges_of
+from torchlb.geometry.complex import Faces, delaunay, edges_of
 from torchlb.geometry.vectors import TINY, inner, largest, lengths, smallest
 
 COCONE = np.sin(np.pi / 8)
@@ -132,7 +131,7 @@ class Tetrahedra:
         random = np.random.default_rng(0).standard_normal(points.shape)
         random -= (1 - RAISED) * inner(random, normals)[:, None] * normals
         moved = points + MOVED * spacing[:, None] * random
-        found = Delaunay(moved - moved.mean(0))  # far from the origin it merges what is apart
+        found = delaunay(moved)
         cells, beyond = (x.astype(np.int64) for x in (found.simplices, found.neighbors))
         del found
         centers = _circumcenters(moved, cells)

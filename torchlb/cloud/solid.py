@@ -12,12 +12,11 @@ from itertools import combinations
 import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
-from scipy.spatial import Delaunay
 from torch import Tensor
 
 from torchlb.cloud.complexes import Complex
 from torchlb.errors import InputError, first_few
-from torchlb.geometry.complex import components
+from torchlb.geometry.complex import components, delaunay
 from torchlb.geometry.neighbors import nearest_neighbors
 from torchlb.geometry.vectors import TINY, inner, lengths
 
@@ -52,7 +51,7 @@ def cloud_solid(points: Float[Tensor, "N 3"]) -> Complex:
         )
     near = nearest_neighbors(points, min(NEAREST + 1, len(points))).numpy()
     reach = lengths(places[near[:, -1]] - places)
-    found = Delaunay(places @ SHEAR)
+    found = delaunay(places @ SHEAR)
     cells, beside = (x.astype(np.int64) for x in (found.simplices, found.neighbors))
     radius, flat = _spheres(places, cells)
     count = near.shape[1] - 1

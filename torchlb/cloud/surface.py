@@ -9,7 +9,6 @@ import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
 from scipy import sparse
-from scipy.spatial import Delaunay
 from torch import Tensor
 from torch.nn.functional import normalize
 
@@ -32,7 +31,7 @@ from torchlb.cloud.poles import Poles, corrected_normals
 from torchlb.cloud.stars import gaps_between, stars_in_gaps
 from torchlb.errors import InputError
 from torchlb.geometry.admission import mutually_admissible
-from torchlb.geometry.complex import Faces, components, pieces_of
+from torchlb.geometry.complex import Faces, components, delaunay, pieces_of
 from torchlb.geometry.frames import vertex_normals
 from torchlb.geometry.neighbors import mesh_graph, nearest_neighbors
 from torchlb.geometry.vectors import lengths
@@ -358,7 +357,7 @@ def _planar_triangles(
     _, spread, axes = np.linalg.svd(centered, full_matrices=False)
     if spread[2] > FLAT * spread[0]:
         return None
-    return Delaunay(centered @ axes[:2].T).simplices.astype(np.int64), axes[2]
+    return delaunay(centered @ axes[:2].T).simplices.astype(np.int64), axes[2]
 
 
 def _contacts(cloud: Cloud, faces: Faces) -> Bool[np.ndarray, " N"]:

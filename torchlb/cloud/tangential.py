@@ -16,7 +16,7 @@ from itertools import permutations
 import numpy as np
 import torch
 from jaxtyping import Float, Int
-from scipy.spatial import Delaunay, QhullError
+from scipy.spatial import QhullError
 from torch import Tensor
 
 from torchlb.cloud.complexes import Complex
@@ -24,7 +24,7 @@ from torchlb.cloud.frames import cloud_frames
 from torchlb.cloud.manifold import boundary_loops
 from torchlb.errors import InputError, first_few
 from torchlb.geometry.admission import mutually_admissible, planes_of
-from torchlb.geometry.complex import Faces, edges_of
+from torchlb.geometry.complex import Faces, delaunay, edges_of
 from torchlb.geometry.neighbors import nearest_neighbors
 from torchlb.geometry.vectors import lengths
 
@@ -80,7 +80,7 @@ def delaunay_stars(
             continue
         places = np.concatenate([np.zeros((1, dim)), coords[point][mask]])
         try:
-            cells = Delaunay(places).simplices
+            cells = delaunay(places).simplices
         except QhullError:  # all in a line, or a plane
             continue
         cells = cells[(cells == 0).any(1)]

@@ -10,12 +10,19 @@ from functools import cached_property
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Int, Shaped
+from jaxtyping import Bool, Float, Int, Shaped
 from scipy import sparse
 from scipy.sparse import csgraph
+from scipy.spatial import Delaunay
 from torch import Tensor
 
 Faces = Int[np.ndarray, "_ 3"]
+
+
+def delaunay(points: Float[np.ndarray, "N n"]) -> Delaunay:
+    """Delaunay's simplices by Qhull, whose tolerances are lengths: around the origin, and of a size of about one."""
+    centered = points - points.mean(0)
+    return Delaunay(np.ldexp(centered, -np.frexp(np.abs(centered).max())[1]))
 
 
 @dataclass(frozen=True)

@@ -18,7 +18,7 @@ from torchlb.geometry.frames import (
     vertex_normals,
 )
 from torchlb.geometry.local_fits import FitPlan, LocalFits
-from torchlb.geometry.vectors import dot
+from torchlb.geometry.vectors import TINY, dot
 
 
 class Beside(NamedTuple):
@@ -93,7 +93,7 @@ def _axes(
     edge = points[neighbor] - points
     along = edge - dot(edge, normal)[:, None] * normal
     flat = dot(along, along)[:, None] == 0
-    along = normalize(torch.where(flat, complete_frames(normal)[..., 0], along))
+    along = normalize(torch.where(flat, complete_frames(normal)[..., 0], along), eps=TINY)
     return torch.stack([normal, along, torch.linalg.cross(normal, along)], 1), edge.norm(dim=1)
 
 
