@@ -276,12 +276,12 @@ def test_a_bad_shape_can_be_skipped():
 
 
 def test_a_batch_searches_nothing(monkeypatch):
-    """The spectral bounds come with the data, and a batch joins them."""
+    """The spectral radius comes with the data, and a batch joins them."""
     batch = Batch.from_data_list([LaplaceBeltramiTransform(order=1, k=4)(d) for d in DATA])
-    expected = LaplaceBeltrami.batch([direct(i) for i in range(3)]).spectral_bounds
-    monkeypatch.setattr(LaplaceBeltrami, "_flow_bounds", None)
+    expected = LaplaceBeltrami.batch([direct(i) for i in range(3)]).radius
+    monkeypatch.setattr("torchlb.operator.storage.spectral_radius", None)
     lb = to_operator(batch)
-    assert lb.spectral_bounds == expected
+    assert lb.radius == expected
     Diffusion(2, k=4)(torch.randn(batch.num_nodes, 2), lb.float())
 
 

@@ -1,17 +1,21 @@
 """Null vector and signs by Krylov methods: what the sparse factors say, and an operator as good in the end."""
 
+from functools import partial
+
 import numpy as np
 import pytest
 import torch
 from scipy import sparse
 
-from builders import stencil_of_cloud
 from torchlb import LaplaceBeltrami
 from torchlb.certified.krylov import LowOrder, negative_directions
 from torchlb.certified.certificate import check_certificate
 from torchlb.certified.enforce import _feeding
 from torchlb.certified.null_vector import left_null_vector
 from torchlb.surfaces import Hemisphere, Sphere, Torus, smooth_function
+
+bare = partial(LaplaceBeltrami.from_points, weak_form=False)
+certified = partial(bare, certify=True)
 
 
 @pytest.fixture
@@ -27,16 +31,16 @@ def unfactored(monkeypatch):
 
 def two_scales():
     points = torch.cat([1e-5 * Sphere().random_points(500), Torus().random_points(400) + 9])
-    return stencil_of_cloud(points, order=3)
+    return certified(points, order=3)
 
 
 def random_cloud():
-    return stencil_of_cloud(Sphere().random_points(700))
+    return certified(Sphere().random_points(700))
 
 
 def two_components():
     points = torch.cat([Sphere().random_points(400), Torus().points(400) + 6])
-    return stencil_of_cloud(points, order=2)
+    return certified(points, order=2)
 
 
 def with_outflow():
@@ -57,8 +61,8 @@ def test_null_vector_and_verdict_are_those_of_the_factors(build, monkeypatch):
 
 
 def test_what_the_factors_refuse_is_refused(monkeypatch):
-    raw = stencil_of_cloud(Sphere().random_points(700), order=1, certify=False)
-    step = stencil_of_cloud(Sphere().random_points(700), order=1)
+    raw = bare(Sphere().random_points(700), order=1)
+    step = certified(Sphere().random_points(700), order=1)
     matrix = raw.to_scipy()
     verdicts = [check_certificate(matrix, step.mass)[1]]
     monkeypatch.setattr("torchlb.certified.krylov.LARGEST_FACTORED", 0)
@@ -71,7 +75,7 @@ def test_what_the_factors_refuse_is_refused(monkeypatch):
 @pytest.mark.usefixtures("unfactored")
 def test_enforcement_ends_at_an_operator_as_good(order):
     points = Torus().random_points(900)
-    lb = stencil_of_cloud(points, order=order)
+    lb = certified(points, order=order)
     assert lb.certificate.holds
     assert lb.certificate.rounds > 0
     assert lb.report.order_counts[order] >= 0.99 * 900
@@ -79,10 +83,10 @@ def test_enforcement_ends_at_an_operator_as_good(order):
     values = torch.linalg.eigvalsh((weighted + weighted.T) / 2)
     assert values.max() <= 1e-10 * values.abs().max()
     exact = Torus().laplacian(smooth_function, points)
-    raw = stencil_of_cloud(points, order=order, certify=False)
+    raw = bare(points, order=order)
     error, raw_error = ((op(smooth_function(points)) - exact).norm() for op in (lb, raw))
     assert error <= 1.6 * raw_error
-    again = stencil_of_cloud(points, order=order)
+    again = certified(points, order=order)
     assert torch.equal(again.values, lb.values)
     assert torch.equal(again.mass, lb.mass)
 
@@ -153,7 +157,7 @@ def test_noise_has_the_low_order_matrix_as_covariance():
 
 
 def test_factors_step_in_where_krylov_methods_do_not_converge(monkeypatch):
-    lb = stencil_of_cloud(Sphere().random_points(400))
+    lb = certified(Sphere().random_points(400))
     expected = left_null_vector(lb.to_scipy(), lb.mass)[0]
     monkeypatch.setattr("torchlb.certified.krylov.LARGEST_FACTORED", 0)
     monkeypatch.setattr("torchlb.certified.krylov.CYCLES", 1)

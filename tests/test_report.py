@@ -6,12 +6,11 @@ import pytest
 import torch
 import trimesh
 
-from builders import stencil_of_cloud, stencil_of_mesh
 from torchlb import LaplaceBeltrami
 from torchlb.fits.rules import reference
 from torchlb.stencils.assemble import Stencils, assemble
 from torchlb.stencils.rows import Reason
-from torchlb.stencils.shape import cloud_shape, mesh_shape
+from torchlb.stencils.shape import mesh_shape
 from torchlb.surfaces import Sphere, Torus
 
 
@@ -22,12 +21,13 @@ def cube():
     for _ in range(3):
         mesh = mesh.subdivide()
     vertices, faces = torch.tensor(mesh.vertices), torch.tensor(mesh.faces)
-    return vertices.double(), stencil_of_mesh(vertices.double(), faces.long(), order=3)
+    lb = LaplaceBeltrami.from_mesh(vertices.double(), faces.long(), order=3, certify=True)
+    return vertices.double(), lb
 
 
 @cache
 def sphere():
-    return stencil_of_cloud(Sphere().points(500), order=3)
+    return LaplaceBeltrami.from_points(Sphere().points(500), order=3)
 
 
 def edges_near(vertices):
@@ -87,11 +87,11 @@ def test_half_the_rows_at_low_order_are_named():
     with pytest.warns(
         UserWarning, match=r"% of the points have only low-order rows.*pass its dimension"
     ):
-        stencil_of_cloud(torch.randn(300, 3).double(), order=3, certify=False)
+        LaplaceBeltrami.from_points(torch.randn(300, 3).double(), order=3)
     vertices, faces = Sphere().mesh(300)
     noisy = vertices + 0.05 * torch.randn_like(vertices)
     with pytest.warns(UserWarning, match=r"% of the points have only low-order rows.*finer mesh"):
-        stencil_of_mesh(noisy, faces, order=3, certify=False)
+        LaplaceBeltrami.from_mesh(noisy, faces, order=3)
 
 
 def test_it_prints_a_summary():
@@ -136,16 +136,16 @@ def rippled():
 
 def test_unresolved_ripples_are_reported():
     """Most points ask for more than order 3 can follow, whatever stencils would pass otherwise."""
-    report = stencil_of_mesh(*rippled(), order=3, certify=False).report
+    report = LaplaceBeltrami.from_mesh(*rippled(), order=3).report
     assert report.reason_counts["points do not resolve the surface"] > 1200
-    cloud = stencil_of_cloud(rippled()[0], order=3, certify=False).report
+    cloud = LaplaceBeltrami.from_points(rippled()[0], order=3).report
     assert cloud.reason_counts["points do not resolve the surface"] > 100
 
 
 def test_eigenvalues_of_an_unresolved_mesh_are_those_of_its_triangles():
     """Within 1 % of robust_laplacian's on the mesh refined by midpoints; smooth fits alone are 3 % above."""
     vertices, faces = rippled()
-    lb = stencil_of_mesh(vertices, faces, order=3)
+    lb = LaplaceBeltrami.from_mesh(vertices, faces, order=3)
     finer, smaller = trimesh.remesh.subdivide(vertices.numpy(), faces.numpy())
     exact = LaplaceBeltrami.from_cotangent(torch.tensor(finer), torch.tensor(smaller))
     found, expected = (each.eigenbasis(10).eigenvalues[1:] for each in (lb, exact))
@@ -180,12 +180,11 @@ def test_low_order_rows_are_m_matrix_rows():
 
 
 def test_fewer_points_than_polynomials_have_low_order_rows():
-    """A tetrahedron at order 3, mesh and cloud: M-matrix rows, and the reason is that neighbours are too few."""
+    """A tetrahedron at order 3: M-matrix rows, and the reason is that neighbours are too few."""
     signs = [[1, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1]]
     points = torch.tensor(signs, dtype=torch.float64)
     faces = torch.tensor([[0, 1, 2], [0, 3, 1], [0, 2, 3], [1, 3, 2]])
-    for shape in (mesh_shape(points, faces, 4), cloud_shape(points, 2, 4)):
-        rows = assemble(Stencils(shape, 3))
-        assert rows.order.tolist() == [0] * 4
-        assert rows.reason.tolist() == [Reason.FEW] * 4
-        torch.testing.assert_close(rows.off_diagonal_ratio, torch.ones(4).double())
+    rows = assemble(Stencils(mesh_shape(points, faces, 4), 3))
+    assert rows.order.tolist() == [0] * 4
+    assert rows.reason.tolist() == [Reason.FEW] * 4
+    torch.testing.assert_close(rows.off_diagonal_ratio, torch.ones(4).double())

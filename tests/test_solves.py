@@ -20,7 +20,7 @@ from torchlb import (
 )
 from torchlb.linalg.conjugate_gradients import conjugate_gradients
 from torchlb.pde import systems
-from torchlb.pde.pair_flow import _coefficients
+from torchlb.linalg.exponential import _coefficients
 from torchlb.surfaces import CliffordTorus, Ellipsoid, Sphere, StarShaped, Torus, UnitDisk
 
 

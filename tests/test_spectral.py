@@ -61,7 +61,7 @@ def test_contract(build, n, k):
     action = phi.T @ (lb.stiffness @ phi)
     assert (action - basis.eigenvalues.diag()).abs().max() <= 1e-9 * basis.eigenvalues.max()
     rest = lb.stiffness @ phi - basis.eigenvalues * basis.left
-    print("REST", float(rest.abs().max()/(basis.eigenvalues * basis.left).abs().max()))
+    print("REST", float(rest.abs().max() / (basis.eigenvalues * basis.left).abs().max()))
 
 
 @pytest.mark.parametrize(("order", "first", "second"), [(3, 7e-5, 1.5e-3), (5, 8e-7, 8e-5)])
@@ -69,7 +69,12 @@ def test_spectrum_of_the_sphere(order, first, second):
     """λ = l(l+1), 2l + 1 times; the worst relative error of the first 36 and 100."""
     lb = LaplaceBeltrami.from_points(Sphere().points(4070), order=order)
     values = lb.eigenbasis(100).eigenvalues
-    print("SPHERE", order, worst(values[:36], sphere_eigenvalues(36)), worst(values, sphere_eigenvalues(100)))
+    print(
+        "SPHERE",
+        order,
+        worst(values[:36], sphere_eigenvalues(36)),
+        worst(values, sphere_eigenvalues(100)),
+    )
     assert worst(values[:36], sphere_eigenvalues(36)) <= first
     assert worst(values, sphere_eigenvalues(100)) <= second
 

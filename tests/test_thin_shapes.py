@@ -6,7 +6,6 @@ from functools import cache
 import pytest
 import torch
 
-from builders import stencil_of_cloud
 from torchlb import LaplaceBeltrami
 from torchlb.surfaces import Ellipsoid, smooth_function
 
@@ -49,7 +48,7 @@ def test_no_row_crosses_between_two_sheets(sampling, order):
     count = len(sheets[0])
     height = torch.tensor([0.0, 2 / math.sqrt(count)], dtype=torch.float64)
     points = torch.cat([torch.cat(sheets), height.repeat_interleave(count)[:, None]], 1)
-    lb = stencil_of_cloud(points, order=order, certify=False)
+    lb = LaplaceBeltrami.from_points(points, order=order)
     inside = ((points[:, :2] - 0.5).abs() < 0.35).all(1)
     assert crossings(lb, torch.arange(2 * count) >= count, inside) == 0
     # Most rows there are of the order that was asked for.
@@ -72,9 +71,9 @@ def test_thin_closed_surface(kind, order):
     """
     surface, points, faces = lens()
     if kind == "points":
-        lb = stencil_of_cloud(points, order=order, certify=False)
+        lb = LaplaceBeltrami.from_points(points, order=order)
     else:
-        lb = LaplaceBeltrami.from_mesh(points, faces, order=order, certify=False)
+        lb = LaplaceBeltrami.from_mesh(points, faces, order=order)
     exact = surface.laplacian(smooth_function, points)
     assert (lb(smooth_function(points)) - exact).norm() < 0.85 * exact.norm()
     row = torch.arange(1000).repeat_interleave(lb.crow.diff())
@@ -87,7 +86,7 @@ def test_thin_closed_surface(kind, order):
 def test_sides_do_not_depend_on_the_unit(scale):
     """A lens given in micrometres has the rows of the one in metres."""
     _, points, faces = lens()
-    one, other = (LaplaceBeltrami.from_mesh(s * points, faces, certify=False) for s in (1.0, scale))
+    one, other = (LaplaceBeltrami.from_mesh(s * points, faces) for s in (1.0, scale))
     assert torch.equal(other.col, one.col)
     assert torch.equal(other.values * scale**2, one.values)
 
@@ -95,6 +94,6 @@ def test_sides_do_not_depend_on_the_unit(scale):
 @pytest.mark.parametrize("order", [1, 3])
 def test_thin_closed_surface_is_stable(order):
     _, points, _ = lens()
-    lb = stencil_of_cloud(points, order=order)
+    lb = LaplaceBeltrami.from_points(points, order=order, certify=True)
     assert lb.certificate.holds
     assert (lb.mass > 0).all()

@@ -56,7 +56,8 @@ def cloud_stars(points: Float[Tensor, "N n"], dim: int) -> Complex:
     else:
         cells, parts = shared(places, stars)
         shares = torch.from_numpy(parts)
-    alone = np.setdiff1d(np.arange(len(places)), cells)
+    # where all stars count, a point far from all others has one of its own
+    alone = np.setdiff1d(np.arange(len(places)), cells if shares is None else stars[:, 1:])
     if len(alone):
         raise InputError(
             f"points: no cell of dimension {dim} reaches {len(alone)} of {len(places)} "
