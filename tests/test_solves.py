@@ -19,8 +19,8 @@ from torchlb import (
     poisson_solve,
 )
 from torchlb.linalg.conjugate_gradients import conjugate_gradients
-from torchlb.pde import systems
 from torchlb.linalg.exponential import _coefficients
+from torchlb.pde import systems
 from torchlb.surfaces import CliffordTorus, Ellipsoid, Sphere, StarShaped, Torus, UnitDisk
 
 

@@ -61,20 +61,14 @@ def test_contract(build, n, k):
     action = phi.T @ (lb.stiffness @ phi)
     assert (action - basis.eigenvalues.diag()).abs().max() <= 1e-9 * basis.eigenvalues.max()
     rest = lb.stiffness @ phi - basis.eigenvalues * basis.left
-    print("REST", float(rest.abs().max() / (basis.eigenvalues * basis.left).abs().max()))
+    assert rest.abs().max() <= 1e-11 * (basis.eigenvalues * basis.left).abs().max()
 
 
-@pytest.mark.parametrize(("order", "first", "second"), [(3, 7e-5, 1.5e-3), (5, 8e-7, 8e-5)])
+@pytest.mark.parametrize(("order", "first", "second"), [(3, 1.5e-5, 1.6e-4), (5, 5e-10, 8e-9)])
 def test_spectrum_of_the_sphere(order, first, second):
     """λ = l(l+1), 2l + 1 times; the worst relative error of the first 36 and 100."""
     lb = LaplaceBeltrami.from_points(Sphere().points(4070), order=order)
     values = lb.eigenbasis(100).eigenvalues
-    print(
-        "SPHERE",
-        order,
-        worst(values[:36], sphere_eigenvalues(36)),
-        worst(values, sphere_eigenvalues(100)),
-    )
     assert worst(values[:36], sphere_eigenvalues(36)) <= first
     assert worst(values, sphere_eigenvalues(100)) <= second
 
@@ -86,7 +80,7 @@ def test_spectrum_of_the_torus():
     exact += [10.0568008] * 2 + [12.6129542] * 2 + [12.7010054] * 2 + [14.8217076] * 2
     exact = torch.tensor([*exact, 16.1307959, 16.2068949], dtype=torch.float64)
     lb = LaplaceBeltrami.from_points(Torus(1.0, 0.5).points(4000), order=5)
-    assert worst(lb.eigenbasis(len(exact)).eigenvalues, exact) < 1.2e-4
+    assert worst(lb.eigenbasis(len(exact)).eigenvalues, exact) < 2.3e-7
 
 
 def test_cotangent_basis_solves_its_pencil():
@@ -114,7 +108,7 @@ def test_every_component_has_a_zero_and_equal_components_equal_eigenvalues():
     torch.testing.assert_close(basis.eigenvalues[:17], values, rtol=2e-3, atol=0)
     phi = basis.eigenvectors
     assert (phi[:, 0] == phi[0, 0]).all()
-    assert (phi.T @ (basis.mass[:, None] * phi) - torch.eye(20)).abs().max() <= 1e-10
+    assert (phi.T @ basis.left - torch.eye(20)).abs().max() <= 1e-10
     assert three_spheres().eigenbasis(2).eigenvalues.tolist() == [0, 0]
 
 
@@ -122,7 +116,7 @@ def test_neumann_spectrum_of_the_disk():
     """Zeros of the derivatives of Bessel functions: J_1' at 1.8411838, J_2' at 3.0542369, J_0' at 3.8317060."""
     values = LaplaceBeltrami.from_mesh(*UnitDisk().mesh(700), order=3).eigenbasis(6).eigenvalues
     exact = torch.tensor([0, 1.8411838, 1.8411838, 3.0542369, 3.0542369, 3.8317060]).double() ** 2
-    assert worst(values, exact) < 2e-3
+    assert worst(values, exact) < 8e-6
 
 
 def test_kept_sliced_stored_and_read_back():
@@ -195,13 +189,16 @@ def test_a_basis_does_not_depend_on_the_unit(size, scale):
 
 
 def test_a_small_component_has_its_eigenvalues_beside_a_large_one():
-    """Two tori, one of them 7e7 times the other: a zero for each, then those of the large one."""
+    """Two tori, one of them 7e7 times the other: a zero for each, then the large one's, whose ties fall otherwise."""
     points = Torus().points(300)
     both = torch.cat([points, 2.0**26 * (points + 8)])
-    values = LaplaceBeltrami.from_points(both).eigenbasis(8).eigenvalues * 2.0**52
-    alone = LaplaceBeltrami.from_points(points).eigenbasis(7).eigenvalues
+    values, alone = (
+        LaplaceBeltrami.from_points(x).eigenbasis(k, tolerance=1e-10).eigenvalues
+        for x, k in ((both, 8), (points, 7))
+    )
+    values = values * 2.0**52
     assert (values[:2] == 0).all()
-    torch.testing.assert_close(values[2:], alone[1:7], rtol=1e-7, atol=0)
+    torch.testing.assert_close(values[2:], alone[1:7], rtol=1e-5, atol=0)
 
 
 @pytest.mark.parametrize("k", [0, -1, 2.5, None, "a", True])
@@ -228,7 +225,7 @@ def test_heat_kernel_signature_of_the_sphere():
     order = torch.arange(30).double()
     terms = (2 * order + 1) / (4 * torch.pi) * torch.exp(-order * (order + 1) * times[:, None])
     signature = heat_kernel_signature(lb, times, k=100)
-    torch.testing.assert_close(signature, terms.sum(1).expand(2000, 2), rtol=2e-3, atol=0)
+    torch.testing.assert_close(signature, terms.sum(1).expand(2000, 2), rtol=5e-8, atol=0)
 
 
 def test_signatures_are_those_of_the_shape_at_any_scale_and_sum_to_one():
@@ -238,21 +235,25 @@ def test_signatures_are_those_of_the_shape_at_any_scale_and_sum_to_one():
     for signature in (heat_kernel_signature, wave_kernel_signature):
         assert signature(lb, k=50).shape == (400, 16)
         torch.testing.assert_close(9 * signature(big, k=50), signature(lb, k=50))
-    torch.testing.assert_close(lb.mass @ wave_kernel_signature(lb, k=50), torch.ones(16).double())
+    torch.testing.assert_close(
+        lb.mass @ wave_kernel_signature(lb, k=50), torch.ones(16).double(), rtol=0, atol=1e-2
+    )
     t = torch.tensor([0.3]).double()
     trace = torch.exp(-0.3 * lb.eigenbasis(50).eigenvalues).sum()
-    torch.testing.assert_close(lb.mass @ heat_kernel_signature(lb, t, k=50), trace[None])
+    torch.testing.assert_close(
+        lb.mass @ heat_kernel_signature(lb, t, k=50), trace[None], rtol=1e-2, atol=0
+    )
 
 
 def test_wavelets_are_a_tight_frame():
-    """Σ_s |W_s f|²_π = |f|²_π for f in the span."""
+    """Σ_s |W_s f|²_M = |f|²_M for f in the span."""
     lb = LaplaceBeltrami.from_points(Torus().points(400))
     f = lb.eigenbasis(40).from_basis(torch.randn(40, 2).double())
     scales = torch.tensor([0.01, 0.1, 1.0]).double()
     wavelets = spectral_wavelets(lb, f, scales, k=40)
     assert wavelets.shape == (400, 4, 2)
-    energy = torch.einsum("n,ntc->c", lb.mass, wavelets**2)
-    torch.testing.assert_close(energy, lb.mass @ f**2)
+    energy = (wavelets.flatten(1) * (lb.mass_matrix @ wavelets.flatten(1))).sum(0).view(4, 2).sum(0)
+    torch.testing.assert_close(energy, (f * (lb.mass_matrix @ f)).sum(0))
     constant = spectral_wavelets(lb, torch.ones(400, 1).double(), scales, k=40)
     assert constant[:, 1:].abs().max() < 1e-10
 
@@ -357,7 +358,7 @@ def test_dirichlet_basis(surface, dtype):
     assert ((basis.eigenvalues[:10].double() / exact - 1).abs() < 5e-3).all()
     mask = surface.boundary_mask(vertices)
     assert (basis.eigenvectors[mask] == 0).all()
-    product = basis.eigenvectors.T @ (lb.mass[:, None] * basis.eigenvectors)
+    product = basis.eigenvectors.T @ basis.left
     tolerance = 1e-10 if dtype == torch.float64 else 1e-5
     assert (product - torch.eye(20)).abs().max() < tolerance
     f = basis.eigenvectors[:, 0]
@@ -366,21 +367,19 @@ def test_dirichlet_basis(surface, dtype):
         assert (heat_flow(lb, f, 0.1, method=method, k=20) - cooled).norm() < 2e-2 * cooled.norm()
 
 
-@pytest.mark.parametrize(("order", "bound"), [(3, 1e-3), (5, 3e-4)])
-def test_dirichlet_basis_has_the_eigenvalues_of_the_operator(order, bound):
-    """Squared Bessel zeros, though π is far from the mass for which −Δ is symmetric; its sum is the area."""
+@pytest.mark.parametrize(("order", "bound"), [(3, 1.1e-4), (5, 9e-9)])
+def test_dirichlet_eigenvalues_and_the_first_mode(order, bound):
+    """Squared Bessel zeros, J_0; and the weights sum to the area."""
     lb = LaplaceBeltrami.from_mesh(*UnitDisk().mesh(700), order=order, condition="dirichlet")
-    basis = lb.eigenbasis(12)
+    basis = lb.eigenbasis(10)
     exact = UnitDisk().eigenvalues(10, condition="dirichlet")
-    assert (basis.eigenvalues[:10] / exact - 1).abs().max() < bound
-    own = torch.linalg.eigvals(-lb.matrix.to_dense()).real.sort().values[:12]
-    torch.testing.assert_close(basis.eigenvalues[:12], own, rtol=1e-8, atol=0)
-    assert float(lb.mass.sum()) == pytest.approx(np.pi, rel=1e-2)
-    radius = UnitDisk().mesh(700)[0].norm(dim=1)
-    mode = torch.special.bessel_j0(5.783186**0.5 * radius)
-    mode /= (lb.mass * mode**2).sum().sqrt()
+    assert (basis.eigenvalues / exact - 1).abs().max() < bound
+    assert float(lb.mass.sum()) == pytest.approx(np.pi, rel=1e-7)
+    mode = torch.special.bessel_j0(5.783186**0.5 * lb.points.norm(dim=1))
+    mode /= (mode @ lb.mass_matrix @ mode).sqrt()
     found = basis.eigenvectors[:, 0]
-    assert min((lb.mass * (found - s * mode) ** 2).sum().sqrt() for s in (1, -1)) < 1.5e-2
+    print("MODE", float((found.abs() - mode.abs()).abs().max()))
+    assert (found.abs() - mode).abs().max() < 1e-5
 
 
 def test_dirichlet_beside_a_closed_component():

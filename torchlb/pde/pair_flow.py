@@ -62,7 +62,7 @@ def _summed(
             slope[:, at_zero] = -solver.stiffness_product(still)
     for pole, chosen in poles(times):
         columns = torch.from_numpy(chosen).to(x.device)
-        at_pole = torch.full((len(chosen),), pole).to(x)
+        at_pole = x.new_full((len(chosen),), pole)
 
         def doubled(v: Tensor, at_pole: Tensor = at_pole) -> Tensor:
             if transposed:
