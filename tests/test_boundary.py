@@ -2,18 +2,19 @@
 
 import itertools
 import math
-from functools import cache
+from functools import cache, partial
 
 import numpy as np
 import pytest
 import torch
 
-from builders import stencil_of_cloud, stencil_of_mesh
 from torchlb import LaplaceBeltrami
 from torchlb.geometry.boundary import boundary_of_mesh
 from torchlb.geometry.frames import mesh_frames
-from torchlb.stencils.shape import cloud_shape
 from torchlb.surfaces import Hemisphere, Sphere, Torus, UnitDisk
+
+certified_mesh = partial(LaplaceBeltrami.from_mesh, weak_form=False, certify=True)
+certified_cloud = partial(LaplaceBeltrami.from_points, weak_form=False, certify=True)
 
 
 def spectrum(lb, count):
@@ -25,8 +26,8 @@ def spectrum(lb, count):
 def operators(surface, n, order):
     vertices, faces = surface.mesh(n)
     mask = surface.boundary_mask(vertices)
-    yield stencil_of_mesh(vertices, faces, order=order)
-    yield stencil_of_cloud(vertices, dim=2, order=order, boundary=mask)
+    yield certified_mesh(vertices, faces, order=order)
+    yield certified_cloud(vertices, dim=2, order=order, boundary=mask)
 
 
 @pytest.mark.parametrize("surface", [UnitDisk(), Hemisphere()], ids=["disk", "hemisphere"])
@@ -50,7 +51,7 @@ def test_spectrum_converges_at_the_order(surface, condition, order):
     """Slope of the worst of the first 10 eigenvalues ≥ p − 0.5 over N = 350, 700, 1400 (the zero is exact)."""
     sizes, errors = [350, 700, 1400], []
     for n in sizes:
-        lb = stencil_of_mesh(*surface.mesh(n), order=order, condition=condition)
+        lb = certified_mesh(*surface.mesh(n), order=order, condition=condition)
         exact = surface.eigenvalues(10, condition=condition)
         values, _ = spectrum(lb, 10)
         errors.append(float(((values - exact).abs()[1:] / exact[1:]).max()))
@@ -68,8 +69,8 @@ def test_dirichlet_spectrum(surface, order, bound):
     mask = surface.boundary_mask(vertices)
     exact = surface.eigenvalues(10, condition="dirichlet")
     for lb in (
-        stencil_of_mesh(vertices, faces, order=order, condition="dirichlet"),
-        stencil_of_cloud(vertices, dim=2, order=order, boundary=mask, condition="dirichlet"),
+        certified_mesh(vertices, faces, order=order, condition="dirichlet"),
+        certified_cloud(vertices, dim=2, order=order, boundary=mask, condition="dirichlet"),
     ):
         values, abscissa = spectrum(lb, 10)
         assert ((values - exact).abs() / exact).max() <= bound
@@ -82,7 +83,7 @@ def test_dirichlet_rows():
     """Values on the boundary reach no other point and decay by themselves; xy(1 − r²) has the right Laplacian."""
     vertices, faces = UnitDisk().mesh(1000)
     mask = UnitDisk().boundary_mask(vertices)
-    lb = stencil_of_mesh(vertices, faces, order=3, condition="dirichlet")
+    lb = certified_mesh(vertices, faces, order=3, condition="dirichlet")
     matrix = lb.matrix.to_dense()
     assert (matrix[~mask][:, mask] == 0).all()
     assert torch.equal(matrix[mask], torch.diag(matrix.diagonal())[mask])
@@ -99,7 +100,7 @@ def test_a_close_pair_on_a_dirichlet_boundary_is_not_stiff():
     rim = points[mask][0]
     twin = rim + 1e-9 * torch.stack([-rim[1], rim[0], rim[2]])
     points, mask = torch.cat([points, twin[None]]), torch.cat([mask, torch.tensor([True])])
-    lb = stencil_of_cloud(points, dim=2, boundary=mask, condition="dirichlet")
+    lb = certified_cloud(points, dim=2, boundary=mask, condition="dirichlet")
     assert lb.certificate.holds
     own = lb.matrix.to_dense().diagonal().abs()
     assert own[mask].max() < 300 * own[~mask].max()
@@ -120,7 +121,7 @@ def test_the_sides_of_a_slit_may_coincide():
     upper = torch.arange(289).scatter(0, seam, 289 + torch.arange(len(seam)))
     above = (y[faces] >= 0.5).all(1)
     faces[above] = upper[faces[above]]
-    lb = stencil_of_mesh(
+    lb = certified_mesh(
         torch.cat([vertices, vertices[seam]]), faces, condition="dirichlet", certify=False
     )
     assert lb.values.isfinite().all()
@@ -131,7 +132,7 @@ def test_heat_leaves_through_a_dirichlet_boundary_only():
     vertices, faces = UnitDisk().mesh(300)
     ball, shell = Sphere().mesh(300)
     both = torch.cat([vertices, ball + 5])
-    lb = stencil_of_mesh(both, torch.cat([faces, shell + 300]), condition="dirichlet")
+    lb = certified_mesh(both, torch.cat([faces, shell + 300]), condition="dirichlet")
     assert lb.certificate.holds
     assert lb.certificate.components == 2
     rate = lb.mass @ lb.matrix.to_dense()
@@ -169,7 +170,7 @@ def cut_torus(n):
 
 @cache
 def first_eigenvalue(shape, condition):
-    lb = stencil_of_mesh(*shape(2000)[:2], order=3, condition=condition)
+    lb = certified_mesh(*shape(2000)[:2], order=3, condition=condition)
     return spectrum(lb, 2)[0][int(condition == "neumann")]
 
 
@@ -181,8 +182,8 @@ def test_curved_boundaries(shape, condition, order):
     vertices, faces, mask = shape(700)
     exact = first_eigenvalue(shape, condition)
     for lb in (
-        stencil_of_mesh(vertices, faces, order=order, condition=condition),
-        stencil_of_cloud(vertices, order=order, boundary=mask, condition=condition),
+        certified_mesh(vertices, faces, order=order, condition=condition),
+        certified_cloud(vertices, order=order, boundary=mask, condition=condition),
     ):
         assert lb.certificate.holds
         values, abscissa = spectrum(lb, 2)
@@ -240,8 +241,8 @@ def test_neumann_condition_at_the_edges_of_a_cube():
 
 def test_boundary_of_a_cloud_is_detected():
     points = UnitDisk().points(700)
-    asked = stencil_of_cloud(points, dim=2, boundary="detect")
-    told = stencil_of_cloud(points, dim=2, boundary=UnitDisk().boundary_mask(points))
+    asked = certified_cloud(points, dim=2, boundary="detect")
+    told = certified_cloud(points, dim=2, boundary=UnitDisk().boundary_mask(points))
     torch.testing.assert_close(asked.matrix.to_dense(), told.matrix.to_dense())
 
 
@@ -249,14 +250,14 @@ def test_boundary_of_a_cloud_is_detected():
 def test_gaps_between_random_points_are_no_boundary(surface):
     """Asking for the boundary of a closed shape changes nothing."""
     points = surface.random_points(800)
-    asked, told = (stencil_of_cloud(points, boundary=b) for b in ("detect", None))
+    asked, told = (certified_cloud(points, boundary=b) for b in ("detect", None))
     assert torch.equal(asked.values, told.values)
 
 
 def test_boundary_of_random_points_is_detected():
     """Of a hemisphere, whose rim no point is on: eigenvalues within 15 %."""
     points = Hemisphere().random_points(800)
-    values = stencil_of_cloud(points, boundary="detect").eigenbasis(6).eigenvalues
+    values = certified_cloud(points, boundary="detect").eigenbasis(6).eigenvalues
     exact = Hemisphere().eigenvalues(6)
     assert ((values - exact)[1:] / exact[1:]).abs().max() < 0.15
 
@@ -266,7 +267,7 @@ def test_boundary_of_random_points_is_detected():
 def test_a_boundary_may_be_a_few_points(count, condition):
     points = Sphere().points(300)
     mask = (points - points[0]).norm(dim=1).argsort().argsort() < count
-    lb = stencil_of_cloud(points, boundary=mask, condition=condition)
+    lb = certified_cloud(points, boundary=mask, condition=condition)
     assert lb.certificate.holds
 
 
@@ -285,7 +286,7 @@ def test_low_order_rows_and_areas_of_a_square_in_four_dimensions():
 def test_gradient_at_the_boundary_serves_any_function():
     """x has ∂x/∂ν ≠ 0 on the rim, and its gradient is e_x up to there."""
     vertices, faces = UnitDisk().mesh(700)
-    lb = stencil_of_mesh(vertices, faces, order=3)
+    lb = certified_mesh(vertices, faces, order=3)
     error = lb.gradient(vertices[:, 0]) - torch.tensor([1.0, 0, 0]).double()
     assert error.norm(dim=1).max() < 1e-8
 
@@ -293,7 +294,7 @@ def test_gradient_at_the_boundary_serves_any_function():
 def test_boundary_can_be_left_alone():
     """Without a condition x keeps Δx = 0 on the rows of full order up to the rim."""
     vertices, faces = UnitDisk().mesh(700)
-    lb = stencil_of_mesh(vertices, faces, order=2, condition=None, certify=False)
+    lb = certified_mesh(vertices, faces, order=2, condition=None, certify=False)
     exact_rows = lb.report.order == 2
     assert lb(vertices[:, 0])[exact_rows].abs().max() < 1e-8
 
@@ -301,12 +302,12 @@ def test_boundary_can_be_left_alone():
 @pytest.mark.parametrize("bad", ["dirichlet", torch.zeros(3, dtype=torch.bool), torch.zeros(300)])
 def test_bad_boundaries_are_refused(bad):
     with pytest.raises(ValueError, match="boundary"):
-        stencil_of_cloud(UnitDisk().points(300), dim=2, boundary=bad)
+        certified_cloud(UnitDisk().points(300), dim=2, boundary=bad)
 
 
 def test_bad_boundary_of_a_mesh_is_refused():
     with pytest.raises(ValueError, match="boundary"):
-        stencil_of_mesh(*UnitDisk().mesh(300), boundary="robin")
+        certified_mesh(*UnitDisk().mesh(300), boundary="robin")
 
 
 @pytest.mark.parametrize("condition", ["neumann", "dirichlet", None])

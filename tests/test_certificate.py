@@ -11,16 +11,18 @@ import trimesh
 from scipy import sparse
 
 import torchlb
-from builders import stencil_of_cloud, stencil_of_mesh
-from torchlb import StabilityError, StabilityWarning
+from torchlb import LaplaceBeltrami, StabilityError, StabilityWarning
 from torchlb.cloud.surface import cloud_surface
 from torchlb.errors import warn
 from torchlb.certified.certificate import check_certificate
 from torchlb.certified.enforce import Schedule, certify
 from torchlb.certified.null_vector import left_null_vector, shared_outflow
 from torchlb.stencils.assemble import Stencils, assemble
-from torchlb.stencils.shape import cloud_shape
+from torchlb.stencils.shape import mesh_shape
 from torchlb.surfaces import Hemisphere, Sphere, StarShaped, ThreeSphere, Torus, smooth_function
+
+certified_mesh = partial(LaplaceBeltrami.from_mesh, weak_form=False, certify=True)
+certified_cloud = partial(LaplaceBeltrami.from_points, weak_form=False, certify=True)
 
 
 def dense(lb):
@@ -43,7 +45,7 @@ def backward_error(lb):
 @pytest.mark.parametrize("surface", [Sphere(), Torus()], ids=["sphere", "torus"])
 @pytest.mark.parametrize("sampling", ["points", "random_points"])
 def test_certificate_holds_as_dense_linear_algebra_sees_it(surface, sampling, order):
-    lb = stencil_of_cloud(getattr(surface, sampling)(700), order=order)
+    lb = certified_cloud(getattr(surface, sampling)(700), order=order)
     assert lb.certificate.holds
     assert lb.mass.min() > 0
     assert backward_error(lb) < 1e-13
@@ -51,7 +53,7 @@ def test_certificate_holds_as_dense_linear_algebra_sees_it(surface, sampling, or
 
 
 def test_quasi_uniform_points_need_no_round():
-    lb = stencil_of_cloud(Torus().points(2000), order=3)
+    lb = certified_cloud(Torus().points(2000), order=3)
     assert lb.certificate.rounds <= 1
     assert lb.report.order_counts[3] >= 0.99 * 2000
 
@@ -60,8 +62,8 @@ def test_quasi_uniform_points_need_no_round():
 def test_random_clouds_keep_their_order_and_accuracy(surface):
     """A single low-order row would make the error a hundred times as large."""
     points = surface.random_points(4000)
-    lb = stencil_of_cloud(points, order=3)
-    raw = stencil_of_cloud(points, order=3, certify=False)
+    lb = certified_cloud(points, order=3)
+    raw = certified_cloud(points, order=3, certify=False)
     assert lb.certificate.holds
     assert lb.certificate.rounds > 0
     assert lb.report.order_counts[3] >= 0.995 * 4000
@@ -72,7 +74,7 @@ def test_random_clouds_keep_their_order_and_accuracy(surface):
 
 def test_diffusion_contracts_and_conserves():
     """‖e^{tL}‖_π ≤ 1 and πᵀ e^{tL} u = πᵀ u, for t over six decades."""
-    lb = stencil_of_cloud(Torus().random_points(500), order=3)
+    lb = certified_cloud(Torus().random_points(500), order=3)
     root = lb.mass.sqrt()
     f = smooth_function(lb.points)
     total = lb.mass @ f
@@ -88,7 +90,7 @@ def test_mass_is_a_quadrature_rule_of_the_order_of_the_operator():
     sizes = [500, 1000, 2000, 4000]
     errors = []
     for n in sizes:
-        lb = stencil_of_cloud(Sphere().points(n), order=3)
+        lb = certified_cloud(Sphere().points(n), order=3)
         square = lb.points[:, 2] ** 2
         errors.append(abs(float(lb.mass @ square / lb.mass.sum()) - 1 / 3))
     slope = -2 * np.polyfit(np.log(sizes), np.log(np.array(errors) + 1e-15), 1)[0]
@@ -102,15 +104,15 @@ def test_total_mass_is_the_area():
     vertices, faces = surface.mesh(1000)
     corners = vertices[faces]
     triangles = torch.linalg.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    mesh = stencil_of_mesh(vertices, faces).mass.sum()
+    mesh = certified_mesh(vertices, faces).mass.sum()
     torch.testing.assert_close(mesh, triangles.norm(dim=1).sum() / 2)
-    cloud = stencil_of_cloud(vertices).mass.sum()
+    cloud = certified_cloud(vertices).mass.sum()
     assert abs(cloud / surface.area - 1) < 0.01
 
 
 def test_three_dimensions():
     """S³ ⊂ R⁴: the certificate holds, and the mass sums to the volume 2π² up to 5 %."""
-    lb = stencil_of_cloud(ThreeSphere().points(400), order=2)
+    lb = certified_cloud(ThreeSphere().points(400), order=2)
     assert lb.certificate.holds
     assert abs(lb.mass.sum() / (2 * math.pi**2) - 1) < 0.05
 
@@ -119,7 +121,7 @@ def test_every_component_has_its_own_null_vector():
     """Two spheres of radius 1 and 2, apart: areas 4π and 16π, on each its own sum."""
     small = Sphere().points(500)
     points = torch.cat([small, 2 * Sphere().points(500, seed=1) + torch.tensor([5.0, 0, 0])])
-    lb = stencil_of_cloud(points, order=3)
+    lb = certified_cloud(points, order=3)
     assert lb.certificate.components == 2
     assert lb.certificate.holds
     ratio = lb.mass[500:].sum() / lb.mass[:500].sum()
@@ -133,7 +135,7 @@ def test_parts_of_a_mesh_may_be_of_two_scales(condition):
 
     def build(factor):
         both = torch.cat([factor * vertices, ring + 9])
-        return stencil_of_mesh(both, torch.cat([faces, corners + 500]), condition=condition)
+        return certified_mesh(both, torch.cat([faces, corners + 500]), condition=condition)
 
     unscaled, lb = build(1.0), build(2.0**-20)
     assert lb.certificate.holds
@@ -157,7 +159,7 @@ def test_components_of_two_scales_are_judged_each_by_its_own(scale):
     faces = torch.cat([cloud_surface(sphere).cells, cloud_surface(torus).cells + 750])
 
     def build(factor):
-        return stencil_of_mesh(torch.cat([factor * sphere, torus]), faces, order=3)
+        return certified_mesh(torch.cat([factor * sphere, torus]), faces, order=3)
 
     unscaled, lb = build(1.0), build(scale)
     assert lb.certificate.holds
@@ -175,7 +177,7 @@ def test_a_surface_of_many_scales_is_stable_on_all_of_them():
     radius = 0.3 * 10 ** (-6 * torch.rand(600, generator=generator).double())
     angle = 2 * math.pi * torch.rand(600, generator=generator).double()
     cap = torch.stack([radius * angle.cos(), radius * angle.sin(), (1 - radius**2).sqrt()], 1)
-    lb = stencil_of_cloud(torch.cat([Sphere().random_points(400), cap]), order=3)
+    lb = certified_cloud(torch.cat([Sphere().random_points(400), cap]), order=3)
     assert lb.certificate.holds
     assert backward_error(lb) < 1e-13
     assert largest_of_s(lb) <= 1e-11
@@ -187,7 +189,7 @@ def test_a_piece_smaller_than_a_row_hangs_together_with_what_is_near(gap, pieces
     step = 0.02 * torch.arange(5.0, dtype=torch.float64)
     y, z = torch.meshgrid(step[:4], step, indexing="ij")
     strip = torch.stack([torch.zeros(20).double(), y.flatten(), 1 + gap + z.flatten()], 1)
-    lb = stencil_of_cloud(torch.cat([Sphere().points(800), strip]))
+    lb = certified_cloud(torch.cat([Sphere().points(800), strip]))
     assert lb.certificate.holds
     assert lb.certificate.components == pieces
 
@@ -196,8 +198,8 @@ def test_points_on_a_line_are_no_surface():
     """No triangle goes through them; as a curve they are fine."""
     line = torch.nn.functional.pad(torch.arange(100.0).double()[:, None], (0, 2))
     with pytest.raises(ValueError, match=r"all 100 lie on a line.*dim=1"):
-        stencil_of_cloud(line)
-    assert stencil_of_cloud(line, dim=1, certify=True).certificate.holds
+        certified_cloud(line)
+    assert certified_cloud(line, dim=1).certificate.holds
 
 
 def test_left_null_vector_of_a_known_chain():
@@ -247,7 +249,7 @@ def test_what_has_no_null_vector_is_said():
 @pytest.mark.parametrize("order", [1, 3])
 def test_rows_that_only_widen_are_counted_apart(order):
     """Random points keep their order: what rounds change is the number of neighbours."""
-    lb = stencil_of_cloud(Sphere().random_points(700), order=order)
+    lb = certified_cloud(Sphere().random_points(700), order=order)
     assert lb.certificate.rounds > 0
     assert lb.certificate.lowered == int((lb.report.order < order).sum())
     assert lb.certificate.widened > lb.certificate.lowered
@@ -256,8 +258,8 @@ def test_rows_that_only_widen_are_counted_apart(order):
 
 def test_only_the_rows_that_lead_into_a_closed_class_are_lowered():
     """Twelve points refer to each other alone and take all of π: everywhere else it is zero, which says nothing."""
-    points = Sphere().points(800)
-    geometry = cloud_shape(points, 2, 4)
+    points, faces = Sphere().mesh(800)
+    geometry = mesh_shape(points, faces, 4)
     stencils = Stencils(geometry, 3)
     rows = assemble(stencils, progress=False)
     cap = points[:, 2].topk(12).indices
@@ -286,7 +288,7 @@ def test_meshes_of_random_vertices_keep_their_order_and_accuracy(order, bound):
     hull = trimesh.convex.convex_hull(points.numpy())
     vertices, faces = torch.as_tensor(hull.vertices), torch.as_tensor(hull.faces)
     assert len(vertices) == 2000
-    lb = stencil_of_mesh(vertices, faces, order=order)
+    lb = certified_mesh(vertices, faces, order=order)
     assert lb.certificate.holds
     assert lb.report.order_counts[order] >= 0.995 * 2000
     exact = Sphere().laplacian(smooth_function, vertices)
@@ -296,7 +298,7 @@ def test_meshes_of_random_vertices_keep_their_order_and_accuracy(order, bound):
 
 @pytest.mark.parametrize(("share", "bound"), [(0.01, 1e-3), (0.1, 1e-2)])
 def test_noise_keeps_the_operator_stable_and_its_spectrum(share, bound):
-    lb = stencil_of_cloud(noisy_sphere(2000, share), order=3)
+    lb = certified_cloud(noisy_sphere(2000, share), order=3)
     assert lb.certificate.holds
     assert spectral_error(lb) <= bound
 
@@ -304,10 +306,10 @@ def test_noise_keeps_the_operator_stable_and_its_spectrum(share, bound):
 def test_wider_stencils_of_a_fixed_size_average_noise():
     """Nothing can widen them, so they are judged as the widest of the candidates: few fall; the spectrum gains."""
     points = noisy_sphere(2000, 0.1)
-    fixed = stencil_of_cloud(points, order=3, num_neighbors=60)
+    fixed = certified_cloud(points, order=3, num_neighbors=60)
     assert fixed.certificate.holds
     assert fixed.report.order_counts[3] >= 0.99 * 2000
-    assert spectral_error(fixed) < 0.9 * spectral_error(stencil_of_cloud(points)) < 2.5e-3
+    assert spectral_error(fixed) < 0.9 * spectral_error(certified_cloud(points)) < 2.5e-3
 
 
 def noisy_sphere(count, share):
@@ -331,17 +333,17 @@ def test_coincident_vertices_have_each_its_own_row():
         half = own[: len(own) // 2]
         faces[half] = torch.where(faces[half] == vertex, len(vertices), faces[half])
         vertices = torch.cat([vertices, vertices[vertex : vertex + 1]])
-    lb = stencil_of_mesh(vertices, faces, condition=None, certify=False)
+    lb = certified_mesh(vertices, faces, condition=None, certify=False)
     diagonal = dense(lb).diagonal()
     assert diagonal.max() < 0.1 * diagonal.median()
     assert (lb.report.order == 3).all()
     error = lb(smooth_function(vertices)) - Sphere().laplacian(smooth_function, vertices)
     assert error.abs().max() < 5e-3
-    assert stencil_of_mesh(vertices, faces, condition=None).certificate.holds
+    assert certified_mesh(vertices, faces, condition=None).certificate.holds
 
 
 def test_uncertified_operator_says_so():
-    lb = stencil_of_cloud(Sphere().points(300), certify=False)
+    lb = certified_cloud(Sphere().points(300), certify=False)
     assert lb.certificate is None
     assert "certify=False" in repr(lb)
 
@@ -352,7 +354,7 @@ def test_a_certificate_that_does_not_hold_is_a_warning_with_names(monkeypatch):
     points = Sphere().random_points(500)
     message = r"does NOT hold.*where rounds end; the worst points: \d+, \d+"
     with pytest.warns(StabilityWarning, match=message):
-        lb = stencil_of_cloud(points)
+        lb = certified_cloud(points)
     assert not lb.certificate.holds
     assert "NOT STABLE" in repr(lb)
 

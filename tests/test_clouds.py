@@ -215,8 +215,8 @@ def test_points_that_are_no_solid_are_refused():
         reconstruct(points * [1, 1, 0], dim=3)
     with pytest.raises(InputError, match=r"1 \(40\) are farther from all others"):
         reconstruct(np.concatenate([points, [[9.0, 9, 9]]]), dim=3)
-    with pytest.raises(InputError, match="not 40 points of dimension 2 in R"):
-        reconstruct(np.random.default_rng(0).random((40, 4)), dim=2)
+    with pytest.raises(InputError, match="not 40 points of dimension 4 in R"):
+        reconstruct(np.random.default_rng(0).random((40, 4)), dim=4)
 
 
 def hull(points):
