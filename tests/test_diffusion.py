@@ -235,7 +235,11 @@ def test_deflated_diffusion_takes_any_spectral_radius(monkeypatch):
 
 
 def test_former_names_of_methods_are_taken_with_a_warning():
-    for former, method in (("full", "deflated"), ("chebyshev", "rational"), ("contour", "rational")):
+    for former, method in (
+        ("full", "deflated"),
+        ("chebyshev", "rational"),
+        ("contour", "rational"),
+    ):
         with pytest.warns(DeprecationWarning, match=f"'{former}' is called '{method}' now"):
             assert checked_method(former) == method
 

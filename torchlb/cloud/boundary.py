@@ -41,8 +41,9 @@ class CloudBoundaryPlan(BoundaryPlan):
         self, points: Float[Tensor, "N n"]
     ) -> tuple[Float[Tensor, "b n"], Float[Tensor, " b"], Float[Tensor, " b"]]:
         """Vectors that leave the shape; volumes of the boundary's own Voronoi cells, and no folds."""
-        own, size = points[self.members], torch.ones_like(points[self.members, 0])
-        if self.sides.shape[1] > 1:
+        own, ends = points[self.members], self.sides.shape[1] == 1
+        size = torch.full_like(own[:, 0], float(ends))  # a single point of a rim has no length
+        if self.near.shape[1] > 1:
             offset = own[self.near[:, 1:]] - own[:, None]
             valid = torch.ones_like(self.near[:, 1:], dtype=torch.bool)
             size = cell_volume(unrolled(offset, self.initial(points)), valid)

@@ -1,8 +1,4 @@
-"""Low-order rows, for points where no stencil passes: positive weights, stable, and first order at best.
-
-On the simplices of a mesh, or of the surface through a cloud, they are those of linear elements. Elsewhere they are
-finite volumes of the Voronoi cell in the tangent plane, built from admissible neighbours alone.
-"""
+"""Low-order rows, for points where no stencil passes: linear elements, stable, and first order at best."""
 
 from __future__ import annotations
 
