@@ -123,9 +123,7 @@ def test_the_sides_of_a_slit_may_coincide():
     upper = torch.arange(289).scatter(0, seam, 289 + torch.arange(len(seam)))
     above = (y[faces] >= 0.5).all(1)
     faces[above] = upper[faces[above]]
-    lb = certified_mesh(
-        torch.cat([vertices, vertices[seam]]), faces, condition="dirichlet", certify=False
-    )
+    lb = certified_mesh(torch.cat([vertices, vertices[seam]]), faces, condition="dirichlet")
     assert lb.values.isfinite().all()
 
 
@@ -236,7 +234,7 @@ def test_neumann_condition_at_the_edges_of_a_cube():
     start = (torch.cartesian_prod(*[torch.arange(9)] * 3) * across).sum(1)
     walks = [torch.tensor(p).cumsum(0) for p in itertools.permutations(across.tolist())]
     faces = [torch.stack([start, *(start + step for step in walk)], 1) for walk in walks]
-    lb = LaplaceBeltrami.from_mesh(vertices, torch.cat(faces), certify=False)
+    lb = LaplaceBeltrami.from_mesh(vertices, torch.cat(faces))
     f = torch.cos(math.pi * vertices[:, 0])
     assert (lb(f) + math.pi**2 * f).abs().max() < 0.03
 
@@ -295,7 +293,7 @@ def test_gradient_at_the_boundary_serves_any_function():
 def test_boundary_can_be_left_alone():
     """Without a condition x keeps Δx = 0 on the rows of full order up to the rim."""
     vertices, faces = UnitDisk().mesh(700)
-    lb = certified_mesh(vertices, faces, order=2, condition=None, certify=False)
+    lb = certified_mesh(vertices, faces, order=2, condition=None)
     exact_rows = lb.report.order == 2
     assert lb(vertices[:, 0])[exact_rows].abs().max() < 1e-8
 

@@ -4,7 +4,6 @@ import pytest
 import torch
 from torch.autograd import gradcheck
 
-from builders import stencil_of_mesh
 from torchlb import InputError, LaplaceBeltrami, implicit_step, poisson_solve
 from torchlb.galerkin.forms import Forms
 from torchlb.operator.medium import forms_of
@@ -144,7 +143,7 @@ def test_what_has_no_elements_or_cannot_be_a_conductivity_is_refused():
         with pytest.raises(InputError, match=message):
             implicit_step(lb, one, 0.1, conductivity=wrong)
     batch = LaplaceBeltrami.batch([lb, build("mesh")])
-    bare = stencil_of_mesh(*Torus().mesh(80))
+    bare = LaplaceBeltrami.from_mesh(*Torus().mesh(80), weak_form=False)
     for other, remedy in ((batch, "unbatch"), (bare, "weak pair")):
         ones = torch.ones(other.num_points, dtype=torch.float64)
         with pytest.raises(InputError, match=remedy):

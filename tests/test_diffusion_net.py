@@ -5,7 +5,6 @@ import re
 import pytest
 import torch
 
-from builders import stencil_of_mesh
 from torchlb import (
     DiffusionNet,
     DiffusionNetBlock,
@@ -25,7 +24,7 @@ WIDTH, HIDDEN, BLOCKS = 8, [12, 10], 2
 @pytest.fixture(scope="module")
 def mesh():
     vertices, faces = Torus().mesh(300)
-    return stencil_of_mesh(vertices, faces), faces
+    return LaplaceBeltrami.from_mesh(vertices, faces), faces
 
 
 def original_weights(rotations=True, gradients=True):
@@ -120,7 +119,7 @@ def test_published_layout_of_the_default_network():
 def test_gradient_features_do_not_depend_on_the_frames(mesh):
     """Every tangent frame turned by an angle of its own: the same features."""
     lb, _ = mesh
-    turned = stencil_of_mesh(*Torus().mesh(300))
+    turned = LaplaceBeltrami.from_mesh(*Torus().mesh(300))
     angle = torch.rand(300).double() * 6
     entry = torch.repeat_interleave(angle, lb.crow.diff())
     g = lb.gradient_values
