@@ -2,8 +2,8 @@
 
 Errors are printed as l2 / max: the relative l2 error over the points, and the largest error over the largest |Δf|.
 A slope is the least-squares fit of log error against log h over the three finest sizes, h = N^(-1/d), so an operator
-of order p is expected to show p. Operators are raw (`certify=False`) unless a table says otherwise: on quasi-uniform
-points the certificate mostly holds as it is. Peers that are not installed are left out, with a note.
+of order p is expected to show p. Stencils have no certificate unless a table says otherwise: on quasi-uniform
+points it mostly holds as they are. Peers that are not installed are left out, with a note.
 """
 
 from __future__ import annotations
@@ -125,7 +125,7 @@ def slopes(sizes: Sequence[int], errors: Sequence[Error], dim: int) -> Error:
 
 def ours(order: int, projection: str = "tangent", mesh: bool = False, **options: Any) -> Apply:
     """torchlb with the given options, on the cloud or on the mesh."""
-    options = {"certify": False, "progress": False, **options}
+    options = {"progress": False, **options}
 
     def apply(case: Case) -> tuple[Any, float, float]:
         build = LaplaceBeltrami.from_mesh if mesh else LaplaceBeltrami.from_points
@@ -325,7 +325,7 @@ def even_sizes(asked: argparse.Namespace) -> Sequence[int]:
 
 def certified(n: int) -> None:
     """What the certificate costs in accuracy on random points."""
-    print(f"\nThe same with the certificate (the default of `from_points`), N={n}, p=3, 1 seed:")
+    print(f"\nThe same with the certificate, N={n}, p=3, 1 seed:")
     rows = []
     for label, surface in bar(FOUR.items(), "orders, certified"):
         case = case_of(surface, surface.random_points(n))

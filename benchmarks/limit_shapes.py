@@ -82,7 +82,6 @@ METHODS = {
     "cotangent (libigl)": by_pair(cotangent),
     "robust_laplacian": by_pair(robust),
     "linear elements (LaPy)": by_pair(linear_elements),
-    "certified stencil, p = 3": by_torchlb(weak_form=False),
     "weak pair, p = 1": by_torchlb(order=1),
     "weak pair, p = 3": by_torchlb(),
 }

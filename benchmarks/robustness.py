@@ -171,8 +171,8 @@ def run(
             lb = LaplaceBeltrami.from_points(points, **options, **more)
         return lb, time.perf_counter() - start
 
-    stencils = build(certify=False)[1] if split else None
-    lb, whole = build()
+    stencils = build()[1] if split else None
+    lb, whole = build(certify=True)
     certificate = lb.certificate
     assert certificate is not None
     counts = lb.report.order_counts

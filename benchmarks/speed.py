@@ -151,7 +151,7 @@ CLOUD: dict[str, Method] = {
         for order in (1, 3, 5)
     },
     "torchlb, p = 3, bare stencil": (
-        ours(LaplaceBeltrami.from_points, weak_form=False, certify=False, progress=False)[0],
+        ours(LaplaceBeltrami.from_points, weak_form=False, progress=False)[0],
         None,
     ),
     "robust_laplacian": (robust, pairs),

@@ -63,8 +63,8 @@ def draw_surface(vertices, faces, lb, name, unit, path):
 
 
 def draw_reached(vertices, faces, lb, ax, view):
-    """The share of the edges at each vertex that the weak pair could curve; without a pair the order reached."""
-    if not lb.has_weak_form:
+    """The share of the edges at each vertex that the weak pair could curve; without triangles the order reached."""
+    if lb.dim != 2:
         plot_orders(vertices, faces, lb.report.order, ax=ax, view=view)
         return
     share = lb.report.curved_edges / lb.report.edges.clamp_min(1)
@@ -92,8 +92,6 @@ def main(arguments=None):
         print(f"error: {error}", file=sys.stderr)
         return 1
     print(f"\n{name}\n{lb}\nbuilt in {time.perf_counter() - start:.1f} s\n\n{lb.report}")
-    if lb.certificate is not None:
-        print(lb.certificate)
     options.output.mkdir(parents=True, exist_ok=True)
     draw_surface(vertices, faces, lb, name, unit, options.output / "surface.png")
     print(f"{options.output / 'surface.png'}\n")
