@@ -41,7 +41,7 @@ class Diffusion(LearnedTimes):
     ----------
     channels : C.
     method : "deflated" (exact at every scale), "spectral" (of the original DiffusionNet: Φe^{−λt}Φᵀπ, which drops
-        everything beyond the basis), "chebyshev" or "contour" (no basis; the latter solves on the CPU).
+        everything beyond the basis), "rational" (no basis; solves on the CPU).
     k : number of eigenpairs for the first two.
     init_time : ℓ², at the start. Shapes of radius about one are expected.
     tolerance : of all but "spectral", see `heat_flow`.
