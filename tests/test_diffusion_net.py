@@ -53,7 +53,7 @@ def original_weights(rotations=True, gradients=True):
 def original_formula(state, x, lb, k, rotations=True, gradients=True):
     """The network as its paper describes it, on plain tensors."""
     basis = lb.eigenbasis(k)
-    phi, values = basis.eigenvectors, basis.eigenvalues
+    phi, values, mass = basis.eigenvectors, basis.eigenvalues, lb.mass_matrix.to_dense()
     grad_x, grad_y = lb.local_gradient(torch.eye(lb.num_points).double()).unbind(1)
     h = x @ state["first_lin.weight"].T + state["first_lin.bias"]
     for i in range(BLOCKS):
@@ -61,7 +61,7 @@ def original_formula(state, x, lb, k, rotations=True, gradients=True):
             key.split(".", 1)[1]: v for key, v in state.items() if key.startswith(f"block_{i}.")
         }
         time = part["diffusion.diffusion_time"].clamp(min=1e-8)
-        spread = phi @ (torch.exp(-values[:, None] * time) * (phi.T @ (lb.mass[:, None] * h)))
+        spread = phi @ (torch.exp(-values[:, None] * time) * (phi.T @ (mass @ h)))
         features = [h, spread]
         if gradients:
             z = torch.complex(grad_x @ spread, grad_y @ spread)
