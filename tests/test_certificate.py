@@ -12,11 +12,11 @@ from scipy import sparse
 
 import torchlb
 from torchlb import LaplaceBeltrami, StabilityError, StabilityWarning
-from torchlb.cloud.surface import cloud_surface
-from torchlb.errors import warn
 from torchlb.certified.certificate import check_certificate
 from torchlb.certified.enforce import Schedule, certify
 from torchlb.certified.null_vector import left_null_vector, shared_outflow
+from torchlb.cloud.surface import cloud_surface
+from torchlb.errors import warn
 from torchlb.stencils.assemble import Stencils, assemble
 from torchlb.stencils.shape import mesh_shape
 from torchlb.surfaces import Hemisphere, Sphere, StarShaped, ThreeSphere, Torus, smooth_function

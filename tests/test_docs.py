@@ -14,7 +14,7 @@ import trimesh
 
 import torchlb
 from torchlb import DiffusionNet, LaplaceBeltrami
-from torchlb.surfaces import Circle, CliffordTorus, Sphere, UnitDisk
+from torchlb.surfaces import Circle, Sphere, UnitDisk
 
 ROOT = Path(__file__).parents[1]
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]

@@ -8,9 +8,9 @@ import torch
 from scipy import sparse
 
 from torchlb import LaplaceBeltrami
-from torchlb.certified.krylov import LowOrder, negative_directions
 from torchlb.certified.certificate import check_certificate
 from torchlb.certified.enforce import _feeding
+from torchlb.certified.krylov import LowOrder, negative_directions
 from torchlb.certified.null_vector import left_null_vector
 from torchlb.surfaces import Hemisphere, Sphere, Torus, smooth_function
 
