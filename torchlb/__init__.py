@@ -1,10 +1,10 @@
 """High-order Laplace–Beltrami operators on meshes and point clouds, for PyTorch.
 
 The packages, lowest first: `linalg`, matrices without shapes; `fits`, weights from local polynomials; `geometry`,
-neighbours, frames, boundaries; `cloud`, from points to a complex; `baseline`, libigl's cotangents; `galerkin`, the weak
-pair; `stencils`, rows of Δ and ∇; `certified`, their certificate; `spectral`, eigenpairs and signatures; `operator`, the
-module that holds it all, and its plan; `pde`, solves and flows; `nn`, layers; `io` and `interop`, files and other
-libraries. `surfaces` are shapes with exact answers.
+neighbours, frames, boundaries; `baseline`, libigl's cotangents; `galerkin`, the weak pair; `stencils`, rows of Δ
+and ∇; `certified`, their certificate; `spectral`, eigenpairs and signatures; `operator`, the module that holds it
+all; `pde`, solves and flows; `nn`, layers; `io` and `interop`, files and other libraries. `surfaces` are shapes with
+exact answers; `cloud`, above `geometry`, goes from points to cells.
 """
 
 from importlib import import_module
