@@ -87,6 +87,9 @@ class Original:
         self.basis = Eigenbasis(*(part.to(device) for part in parts))
         return self
 
+    def check_pair(self) -> None:
+        """Its basis stands for a pair."""
+
     def eigenbasis(self, k: int) -> Eigenbasis:
         return self.basis.truncate(k)
 
