@@ -7,8 +7,8 @@ A surface through a cloud of points, `surface`, is found in steps:
 neighbours; `noise`, where the points belong; `cocone`, tetrahedra and candidates for triangles; `poles`,
 which way is out by Voronoi cells; `manifold`, which triangles hang together; `gaps`, filled and closed; `stars`,
 where no sheet goes through. `doubtful`: what it may join or close in error, and what that does; `doubts`: warnings of
-that, which name the `places`. `voronoi`: cells in the tangent plane, and the graph of natural neighbours. `boundary`:
-one that is marked, and is not that of the complex.
+that, which name the `places`. All other shapes are `tangential`: simplices of the stars of the points. `voronoi`: cells
+in the tangent plane. `boundary`: that of the points of a mask.
 """
 
 from torchlb.cloud.complexes import Complex

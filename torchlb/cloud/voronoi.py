@@ -1,8 +1,8 @@
-"""Voronoi cells in the tangent plane: a graph, areas and low-order rows for clouds in any dimension.
+"""Voronoi cells in the tangent plane: natural neighbours, a graph and volumes for points in any dimension.
 
 Seen from a point, its Voronoi cell among neighbours at y_j ends in the direction u at
 r(u) = min_j |y_j|² / (2 y_j·u). The neighbours that attain the minimum are its natural neighbours; the mean of r^d
-over all directions is its volume; and the flux through the faces is a finite-volume Laplacian with positive weights.
+over all directions is its volume.
 """
 
 from __future__ import annotations

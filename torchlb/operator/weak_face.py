@@ -30,7 +30,7 @@ NO_PAIR = (
 
 
 class WeakFace(OperatorStorage):
-    """Stiffness and mass matrix where there is a weak pair, and the eigenbasis from it or else from the stencil."""
+    """Stiffness and mass matrix where there is a weak pair, and its eigenbasis."""
 
     @property
     def has_weak_form(self) -> bool:
