@@ -24,7 +24,7 @@ def shape():
     VERTICES, FACES = Ellipsoid().mesh(200)
     V, F = VERTICES.numpy(), FACES.numpy()
     COTANGENT = LaplaceBeltrami.from_cotangent(VERTICES, FACES)
-    STENCIL = LaplaceBeltrami.from_mesh(VERTICES, FACES, order=3, weak_form=False)
+    STENCIL = LaplaceBeltrami.from_mesh(VERTICES, FACES, order=3, weak_form=False, certify=True)
 
 
 def dense(index, weight):
