@@ -480,3 +480,12 @@ def test_another_condition_is_one_class(monkeypatch, tmp_path):
         assert largest(u - (1 - vertices.norm(dim=1) ** 2) / 4 - 1 / (2 * A)) < 1e-4
     shape = mesh_shape(vertices, faces, 4, condition=skin, progress=False)
     assert (assemble(Stencils(shape, 3), progress=False).order == 3).double().mean() > 0.95
+
+
+def test_where_the_boundary_has_no_measure_it_is_refused():
+    """Else it would hold as Neumann's, in silence."""
+    grid = np.stack(np.meshgrid(*3 * [np.linspace(0.0, 1.0, 7)], indexing="ij"), -1).reshape(-1, 3)
+    points = np.c_[grid, grid[:, 0] ** 2]
+    mask = torch.from_numpy(((grid < 1e-9) | (grid > 1 - 1e-9)).any(1))
+    with pytest.raises(InputError, match="has no measure"):
+        LaplaceBeltrami.from_points(points, dim=3, boundary=mask, condition=Robin(2.0))

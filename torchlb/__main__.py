@@ -33,7 +33,7 @@ __all__ = ["main"]
 FILE = click.Path(exists=True, dir_okay=False, path_type=Path)
 COUNT = click.IntRange(min=1)
 PROJECTION = "Onto the tangent plane, or along the normals."
-CERTIFY = "Prove the stencil stable; by default where there is no weak pair."
+CERTIFY = "Prove the stencil stable."
 SETTINGS = {"help_option_names": ["-h", "--help"], "show_default": True}
 
 
@@ -62,7 +62,7 @@ def _stencil_options(command: Callable[..., Any]) -> Callable[..., Any]:
         ("--order", {"type": COUNT, "default": 3, "help": "Order p of accuracy."}),
         ("--projection", {"type": projections, "default": "tangent", "help": PROJECTION}),
         ("--weights", {"type": weights, "default": "least_squares", "help": "How they are found."}),
-        ("--certify/--no-certify", {"default": None, "help": CERTIFY}),
+        ("--certify/--no-certify", {"default": False, "help": CERTIFY}),
         ("--clean", {"is_flag": True, "help": "Leave out vertices of no face, and points twice."}),
     ):
         command = click.option(name, **settings)(command)

@@ -1,4 +1,4 @@
-"""The boundary of a cloud that no complex goes through: its points, and the conormals there."""
+"""A boundary of a cloud that a user marks, or that is to be detected: its points, and the conormals there."""
 
 from __future__ import annotations
 

@@ -55,11 +55,11 @@ def with_plan(
     order: Int[Tensor, " G"],
     moved: Int[Tensor, " m"],
 ) -> AssembledOperator:
-    """The same with its plan, where there is one: of a weak pair without a certificate."""
-    if pair is None or shape.plan is None or built.certificate is not None:
+    """The same with its plan, where there is one: of a weak pair."""
+    if pair is None or shape.plan is None:
         return built
     assert isinstance(shape.low_order, MeshLowOrder)
-    rows = stencils_of(shape, options).plan(built.rows)
+    rows = None if built.certificate else stencils_of(shape, options).plan(built.rows)
     parts = numbering, shape.plan, rows, pair, shape.low_order.flips, built.faces, order
     plan = Plan(*parts, shape.on_mesh, moved, built.source, options)
     return replace(built, plan=plan)

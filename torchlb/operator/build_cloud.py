@@ -88,6 +88,11 @@ def build_cloud(
     with renumbered(numbering.given), threads_for(len(points)):
         if found is None:
             found = reconstruct(here, d, normals=normals, boundary=mask)
+        if found.shares is not None and held and not held.conserves and not held.fixes:
+            raise InputError(
+                f"condition={held!r}: the boundary of a cloud of dimension {d} in R^{ambient} is that of a mask, which "
+                "has no measure; 'neumann' and 'dirichlet' can hold there, and from_mesh takes every condition"
+            )
         if mask is not None and found.shares is None:
             warn_of_buried(found.cells, mask)
         if isinstance(found, CloudSurface):

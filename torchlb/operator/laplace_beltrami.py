@@ -223,14 +223,14 @@ class LaplaceBeltrami(StencilFace, WeakFace):
     def plan(self) -> Plan:
         """What is decided about the operator: integers and flags. Copies, and what comes from files, decide anew.
 
-        Raises InputError for batches, the cotangent operator, and operators with a certificate or without a weak pair.
+        Raises InputError for batches, the cotangent operator, and operators without a weak pair.
         """
         if self._plan is None and self.source in ("mesh", "points") and self.has_weak_form:
             self._plan = built_again(self).plan
         if self._plan is None:
             raise InputError(
-                f"plan: an operator of kind {self.source!r} has none, nor has one with a certificate or without a weak "
-                "pair; those of LaplaceBeltrami.from_mesh and from_points have"
+                f"plan: an operator of kind {self.source!r} has none, nor has one without a weak pair; those of "
+                "LaplaceBeltrami.from_mesh and from_points have"
             )
         return self._plan
 
@@ -242,14 +242,14 @@ class LaplaceBeltrami(StencilFace, WeakFace):
     def at(self, points: ArrayLike) -> LaplaceBeltrami:
         """The operator of the shape that has moved to other points, by the same decisions: neighbours, degrees, cells.
 
-        Takes half of the time of a build. For points that moved a little, as in an animation or a flow; what was
-        decided for others may not fit them, and `from_mesh` or `from_points` decides anew.
+        Takes some two thirds of the time of a build. For points that moved a little, as in an animation or a flow;
+        what was decided for others may not fit them, and `from_mesh` or `from_points` decides anew.
 
         Parameters
         ----------
         points : (N, n), ℓ, in the order of those that the operator was built from.
 
-        Raises InputError for another shape, and where there is no `plan`.
+        Raises InputError for another shape, where there is no `plan`, and with a certificate.
 
         >>> from torchlb.surfaces import Sphere
         >>> lb = LaplaceBeltrami.from_mesh(*Sphere().mesh(200))

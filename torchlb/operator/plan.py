@@ -35,7 +35,7 @@ class Plan:
     numbering
         From the user's order of the points, and back.
     shape, rows, pair
-        Frames, normals and boundary; the stencils; the weak pair.
+        Frames, normals and boundary; the stencils, None with a certificate; the weak pair.
     flips
         Those that make the triangles Delaunay which low-order rows are of.
     faces, order
@@ -50,7 +50,7 @@ class Plan:
 
     numbering: Numbering
     shape: ShapePlan
-    rows: RowsPlan
+    rows: RowsPlan | None
     pair: PairPlan
     flips: list[Tensor]
     faces: Int[Tensor, "F corners"]
@@ -82,8 +82,16 @@ class Plan:
 
 
 def evaluate(plan: Plan, points: Float[Tensor, "N n"]) -> AssembledOperator:
-    """The operator that follows from a plan at these points, float64 on the CPU."""
+    """The operator that follows from a plan at these points, float64 on the CPU.
+
+    Raises InputError where stencils are certified, or points of a noisy curve were moved.
+    """
     here, options = plan._sorted(points), plan.options
+    if plan.rows is None:
+        raise InputError(
+            "points: an operator with a certificate, which says something of these points alone, has no plan for "
+            "others; build it again"
+        )
     with renumbered(plan.numbering.given), threads_for(len(points)):
         placed, fits = plan.shape.at(here)
         pair = plan.pair.at(fits.points, fits)

@@ -49,8 +49,7 @@ def implicit_step(
         default. Beside that rest it counts at the next few held points, too, as the curve between points does: continue
         it smoothly to them.
     conductivity : κ > 0 of u − t div(κ∇u) = f, of the vertices (N,), its logarithm prolonged as the surface is, or of
-        the faces (F,), if they are not as many; 1 by default. On meshes, with the weak pair or the cotangent's, of one
-        shape; differentiable in it, too.
+        the faces (F,), if they are not as many; 1 by default. Of one shape; differentiable in it, too.
     tolerance : of the solver, relative.
 
     Raises
