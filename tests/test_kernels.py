@@ -8,14 +8,14 @@ import numpy as np
 import pytest
 import torch
 from scipy import sparse
-from torchlb.geometry.cocone import FOLD, best_manifold, wings
-from torchlb.geometry.manifold import components, edges_of, spanning_pairs, tree_sides
 
+from torchlb.cloud.cocone import FOLD, best_manifold, wings
 from torchlb.fits.least_squares import left_inverse
 from torchlb.fits.weights import scaled_system
 from torchlb.galerkin import pair
 from torchlb.galerkin.pair import stored, upper_product
 from torchlb.geometry.admission import MAX_SLOPE, MIN_ALIGNMENT, admissible, normal_frames
+from torchlb.geometry.complex import components, edges_of, spanning_pairs, tree_sides
 from torchlb.geometry.numbering import Numbering
 from torchlb.linalg import kernels
 
