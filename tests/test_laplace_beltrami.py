@@ -301,7 +301,6 @@ def test_the_radius_bounds_the_linear_pair_with_lumped_mass(lb):
     k, m = (to_scipy(crow, col, values, size).toarray() for values in (stiffness, mass))
     root = m.sum(1) ** -0.5
     largest = np.linalg.eigvalsh(root[:, None] * k * root).max()
-    print("RADIUS", float(lb.radius) / largest)
     assert largest <= float(lb.radius) <= 1.5 * largest
 
 

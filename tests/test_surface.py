@@ -61,7 +61,6 @@ def test_eigenvalues_and_area_of_the_pair_of_a_cloud(name, kind):
     assert lb.has_weak_form
     assert lb.certificate is None
     error = (lb.eigenbasis(16).eigenvalues[1:] / exact - 1).abs().max()
-    print("CLOUD", name, kind, float(error))
     assert error < (1e-4 if kind == "points" else 1e-3)
     assert float(lb.mass.sum()) == pytest.approx(shape.area, rel=1e-3)
 

@@ -78,7 +78,7 @@ def _stencil_options(command: Callable[..., Any]) -> Callable[..., Any]:
         click.option(
             "--certify/--no-certify",
             default=False,
-            help="Prove the stencil stable; by default where there is no weak pair.",
+            help="Prove the stencil stable.",
         ),
         click.option(
             "--clean", is_flag=True, help="Leave out vertices of no face, and points twice."
