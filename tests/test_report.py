@@ -21,7 +21,8 @@ def cube():
     for _ in range(3):
         mesh = mesh.subdivide()
     vertices, faces = torch.tensor(mesh.vertices), torch.tensor(mesh.faces)
-    lb = LaplaceBeltrami.from_mesh(vertices.double(), faces.long(), order=3, certify=True)
+    options = {"order": 3, "weak_form": False, "certify": True}
+    lb = LaplaceBeltrami.from_mesh(vertices.double(), faces.long(), **options)
     return vertices.double(), lb
 
 
