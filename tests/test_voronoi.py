@@ -55,13 +55,6 @@ def test_cells_of_the_plane_tile_it():
     assert abs(total.item() - 1) < 5e-3
 
 
-def test_boundary_points_have_half_a_cell():
-    """On a straight boundary with outward conormal e₁ the inner half of the unit cell remains."""
-    inside = SQUARE[:, SQUARE[0, :, 0] <= 0]
-    outward = torch.tensor([[1.0, 0.0]], dtype=torch.float64)
-    assert abs(cell_volume(inside, all_of(inside), outward).item() - 0.5) < 0.01
-
-
 def test_invalid_neighbours_do_not_count():
     coords = torch.cat([0.1 * torch.ones(1, 1, 2).double(), SQUARE], dim=1)
     valid = all_of(coords)

@@ -57,32 +57,13 @@ def _show(message: Warning | str, category: type[Warning], *_: Any) -> None:
 
 def _stencil_options(command: Callable[..., Any]) -> Callable[..., Any]:
     """The options of the operator that the commands share."""
-    for option in (
-        click.option(
-            "--order", type=COUNT, default=3, show_default=True, help="Order p of accuracy."
-        ),
-        click.option(
-            "--projection",
-            type=click.Choice(get_args(Projection)),
-            default="tangent",
-            show_default=True,
-            help="Onto the tangent plane, or along the normals.",
-        ),
-        click.option(
-            "--weights",
-            type=click.Choice(get_args(WeightsName)),
-            default="least_squares",
-            show_default=True,
-            help="How the weights are found.",
-        ),
-        click.option(
-            "--certify/--no-certify",
-            default=False,
-            help="Prove the stencil stable.",
-        ),
-        click.option(
-            "--clean", is_flag=True, help="Leave out vertices of no face, and points twice."
-        ),
+    projections, weights = (click.Choice(get_args(names)) for names in (Projection, WeightsName))
+    for name, settings in (
+        ("--order", {"type": COUNT, "default": 3, "help": "Order p of accuracy."}),
+        ("--projection", {"type": projections, "default": "tangent", "help": PROJECTION}),
+        ("--weights", {"type": weights, "default": "least_squares", "help": "How they are found."}),
+        ("--certify/--no-certify", {"default": False, "help": CERTIFY}),
+        ("--clean", {"is_flag": True, "help": "Leave out vertices of no face, and points twice."}),
     ):
         command = click.option(name, **settings)(command)
     return command

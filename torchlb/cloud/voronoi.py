@@ -89,13 +89,11 @@ def natural_neighbors(
 def cell_volume(
     coords: Float[Tensor, "B K d"],
     valid: Bool[Tensor, "B K"],
-    outward: Float[Tensor, "B d"] | None = None,
 ) -> Float[Tensor, " B"]:
     """Volume of the cell, ℓ^d: that of the unit ball times the mean of r^d.
 
-    At a boundary point, with its conormal `outward` (zero elsewhere), only the inner half counts. Where a cell is open
-    otherwise it ends half-way to the farthest valid neighbour; where none lies within 60°, at the point itself, as at
-    the end of a curve.
+    Where a cell is open it ends half-way to the farthest valid neighbour; where none lies within 60°, at the point
+    itself, as at the end of a curve.
 
     >>> around = torch.tensor([[[1.0, 0.0], [0.0, 1.0], [-1.0, 0.0], [0.0, -1.0], [2.0, 0.0]]])
     >>> cell_volume(around, torch.ones(1, 5, dtype=torch.bool)).round(decimals=2).tolist()
@@ -111,8 +109,6 @@ def cell_volume(
     inverse = _inverse_radius(coords, valid, directions)
     ahead = (inverse * distance[..., None] / 2).amax(1) > AHEAD
     volume = inverse.amax(1).maximum(2 / farthest).pow(-dim) * ahead
-    if outward is not None:
-        volume = volume * ((directions @ outward[..., None])[..., 0] <= 0)
     unit_ball = pi ** (dim / 2) / gamma(dim / 2 + 1)
     return unit_ball * volume.mean(1)
 
