@@ -31,14 +31,21 @@ class Certificate:
 
     Attributes
     ----------
-    holds : whether ‖e^{tL}‖_π ≤ 1 for all t ≥ 0.
-    min_pi : smallest π_i in units of the point's area; positive if the certificate holds.
-    max_s : lower bound of the largest eigenvalue of D^{-1/2} S D^{-1/2}, D the size of each row; 0.0 if there is no
+    holds
+        Whether ‖e^{tL}‖_π ≤ 1 for all t ≥ 0.
+    min_pi
+        Smallest π_i in units of the point's area; positive if the certificate holds.
+    max_s
+        Lower bound of the largest eigenvalue of D^{-1/2} S D^{-1/2}, D the size of each row; 0.0 if there is no
         positive one, beyond rounding. NaN if π is not positive or no null vector, where S means nothing.
-    components : number of connected components, each with its own π.
-    rounds : of widening and lowering that it took.
-    lowered : number of rows of a lower order than the one that they passed at on their own.
-    widened : number of rows of the same order with more points or another rule of weights.
+    components
+        Number of connected components, each with its own π.
+    rounds
+        Of widening and lowering that it took.
+    lowered
+        Number of rows of a lower order than the one that they passed at on their own.
+    widened
+        Number of rows of the same order with more points or another rule of weights.
     """
 
     holds: bool
@@ -66,9 +73,12 @@ def check_certificate(
 
     Parameters
     ----------
-    matrix : L, (N, N), 1/ℓ².
-    areas : of the points, ℓ^d.
-    outflow : whether rows may have L1 < 0, as beside a Dirichlet boundary.
+    matrix
+        L, (N, N), 1/ℓ².
+    areas
+        Of the points, ℓ^d.
+    outflow
+        Whether rows may have L1 < 0, as beside a Dirichlet boundary.
     """
     q = shared_outflow(matrix, areas) if outflow else None
     mass, component, error = left_null_vector(matrix, areas, q)
@@ -95,9 +105,12 @@ def dissipation(
 
     Returns
     -------
-    negative : whether S ≤ 0, up to rounding.
-    max_s : largest vᵀSv / vᵀDv, a lower bound of the largest eigenvalue; 0.0 if there is no v.
-    feed : (N, k), the contributions of the rows to each vᵀSv; k = 0 if there is none.
+    negative
+        Whether S ≤ 0, up to rounding.
+    max_s
+        Largest vᵀSv / vᵀDv, a lower bound of the largest eigenvalue; 0.0 if there is no v.
+    feed
+        (N, k), the contributions of the rows to each vᵀSv; k = 0 if there is none.
     """
     weighted = sparse.csr_array(sparse.diags_array(mass.numpy()) @ matrix)
     symmetric = (weighted + weighted.T) / 2

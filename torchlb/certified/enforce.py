@@ -38,8 +38,10 @@ class Schedule:
 
     Attributes
     ----------
-    single : times that it goes on by one candidate; from then on its way doubles with every second time.
-    most : rounds, after which the operator is left as it is, with a warning.
+    single
+        Times that it goes on by one candidate; from then on its way doubles with every second time.
+    most
+        Rounds, after which the operator is left as it is, with a warning.
     """
 
     single: int = 4
@@ -69,17 +71,19 @@ def certify(
 
     Parameters
     ----------
-    rows : each at the first of its candidates that passed.
-    areas : of the points, ℓ^d.
-    lower : (points, first candidates) → their rows, each at the first candidate from there on that passes.
-    bottom : number of candidates: what `Rows.candidate` is for low-order rows, which cannot change any more.
-    outflow : whether rows may have L1 < 0, as beside a Dirichlet boundary.
+    rows
+        Each at the first of its candidates that passed.
+    areas
+        Of the points, ℓ^d.
+    lower
+        (points, first candidates) → their rows, each at the first candidate from there on that passes.
+    bottom
+        Number of candidates: what `Rows.candidate` is for low-order rows, which cannot change any more.
+    outflow
+        Whether rows may have L1 < 0, as beside a Dirichlet boundary.
 
-    Returns
-    -------
-    rows : the operator that it holds for.
-    mass : π, (N,), ℓ^d.
-    certificate : what was reached; a `StabilityWarning` is issued if it does not hold.
+    Returns the rows that it holds for, the mass π, (N,), ℓ^d, and what was reached; a `StabilityWarning` is issued if
+    it does not hold.
     """
     first, count, rounds = rows, len(areas), 0
     times = torch.zeros(count, dtype=torch.int64)

@@ -63,8 +63,10 @@ class LowOrder:
 
     Parameters
     ----------
-    symmetric : (N, N).
-    loss : of each point, what the diagonal has beyond the weights of its row; negative numbers are rounding.
+    symmetric
+        (N, N).
+    loss
+        Of each point, what the diagonal has beyond the weights of its row; negative numbers are rounding.
     """
 
     def __init__(self, symmetric: sparse.csr_array, loss: Float[np.ndarray, " N"]) -> None:
@@ -135,9 +137,12 @@ def null_density(
 
     Parameters
     ----------
-    matrix, area, lost : L, the diagonal of A, the right-hand side.
-    component : of each point.
-    free : whether the scale of x on a component is, which `lost` does not fix there; see `rescaled`.
+    matrix, area, lost
+        L, the diagonal of A, the right-hand side.
+    component
+        Of each point.
+    free
+        Whether the scale of x on a component is, which `lost` does not fix there; see `rescaled`.
     """
     weighted = sparse.csr_array((sparse.diags_array(area) @ matrix).T)
     loss = -area * (matrix.sum(axis=1) + GROUND * matrix.diagonal())

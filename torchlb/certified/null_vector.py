@@ -33,19 +33,26 @@ def left_null_vector(
 
     Parameters
     ----------
-    matrix : L, (N, N), 1/ℓ².
-    areas : diagonal of A, ℓ^d.
-    outflow : q ≥ 0, ℓ^(d−2), of the points where L1 < 0, as `shared_outflow` has it; None where L1 = 0.
+    matrix
+        L, (N, N), 1/ℓ².
+    areas
+        Diagonal of A, ℓ^d.
+    outflow
+        q ≥ 0, ℓ^(d−2), of the points where L1 < 0, as `shared_outflow` has it; None where L1 = 0.
 
     Returns
     -------
-    mass : π, ℓ^d.
-    component : of each point.
-    error : componentwise backward error of π; `CONSERVED` is what rounding may leave.
+    mass
+        π, ℓ^d.
+    component
+        Of each point.
+    error
+        Componentwise backward error of π; `CONSERVED` is what rounding may leave.
 
     Raises
     ------
-    StabilityError : if there is no such π, as L is singular beyond its constants.
+    StabilityError
+        If there is no such π, as L is singular beyond its constants.
     """
     area = areas.numpy()
     lost = np.zeros(len(area)) if outflow is None else outflow

@@ -45,11 +45,16 @@ class Cloud:
 
     Attributes
     ----------
-    points : (N, 3), ℓ.
-    normals : (N, 3), unit.
-    neighbors : (N, K), nearest points, itself first.
-    reach : (N,), ℓ: of a triangle the circumradius is no larger than those of its corners; half if all are on the rim.
-    rim : (N,), points of a declared boundary.
+    points
+        (N, 3), ℓ.
+    normals
+        (N, 3), unit.
+    neighbors
+        (N, K), nearest points, itself first.
+    reach
+        (N,), ℓ: of a triangle the circumradius is no larger than those of its corners; half if all are on the rim.
+    rim
+        (N,), points of a declared boundary.
     """
 
     points: Float[np.ndarray, "N 3"]
@@ -102,11 +107,16 @@ class Tetrahedra:
 
     Attributes
     ----------
-    cells : (T, 4).
-    centers : (T + H, 3), ℓ, of the circumscribed spheres; then, beyond each triangle of the hull, a point far away.
-    triangles : (F, 3), each once.
-    sides : numbers of the tetrahedra on its two sides, (F,) each; the triangles of the hull have numbers after them.
-    hull : (F,), which triangles are on the convex hull.
+    cells
+        (T, 4).
+    centers
+        (T + H, 3), ℓ, of the circumscribed spheres; then, beyond each triangle of the hull, a point far away.
+    triangles
+        (F, 3), each once.
+    sides
+        Numbers of the tetrahedra on its two sides, (F,) each; the triangles of the hull have numbers after them.
+    hull
+        (F,), which triangles are on the convex hull.
     """
 
     points: Float[np.ndarray, "N 3"]
@@ -194,11 +204,16 @@ class Candidates:
 
     Attributes
     ----------
-    small : (P, 3), all that are within the reach of their corners, in no order.
-    triangles : (F, 3), of these the tangent and the parting ones.
-    tangent : (F,), which pass the cocone test.
-    parting : (F,), which have the outside on one side and the inside on the other.
-    outward : (N, 3), ℓ²: the sum of the normals of the small parting ones at each point, as long as their areas.
+    small
+        (P, 3), all that are within the reach of their corners, in no order.
+    triangles
+        (F, 3), of these the tangent and the parting ones.
+    tangent
+        (F,), which pass the cocone test.
+    parting
+        (F,), which have the outside on one side and the inside on the other.
+    outward
+        (N, 3), ℓ²: the sum of the normals of the small parting ones at each point, as long as their areas.
     """
 
     small: Faces

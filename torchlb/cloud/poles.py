@@ -40,9 +40,12 @@ class Poles:
 
     Attributes
     ----------
-    tetrahedra : their centres are the corners; beyond the convex hull, the far ends of its triangles are.
-    point, ball : (R,), a point, and the number of a sphere through it: of a tetrahedron, or of a triangle after them.
-    ray : (R, 3), ℓ, from the point to the centre.
+    tetrahedra
+        Their centres are the corners; beyond the convex hull, the far ends of its triangles are.
+    point, ball
+        (R,), a point, and the number of a sphere through it: of a tetrahedron, or of a triangle after them.
+    ray
+        (R, 3), ℓ, from the point to the centre.
     """
 
     tetrahedra: Tetrahedra
@@ -153,8 +156,10 @@ class _Relations:
 
     Attributes
     ----------
-    i, j, against, weight : (P,), the spheres, whether on two sides, how sure that is.
-    outside : (S,), which spheres are outside if the surface is closed.
+    i, j, against, weight
+        (P,), the spheres, whether on two sides, how sure that is.
+    outside
+        (S,), which spheres are outside if the surface is closed.
     """
 
     i: Int[np.ndarray, " P"]

@@ -58,17 +58,17 @@ class SurfaceSummary:
 
     Attributes
     ----------
-    points : number of points.
-    reached : of those that faces of the surface reach; the others have local stars alone.
-    stars : triangles of local stars.
-    holes_closed : boundary loops that were taken for gaps and closed.
-    boundary_loops : those that are left.
-    components : connected components.
-    noise : distance of the points from the surface, root mean square, ℓ; 0 if there is none to be seen.
-    contacts : points the nearest of which is on another sheet, more than three edges away: which of them belong
-        together is a guess. Shapes touch or are too thin for their points there.
-    places : where most of these are, up to eight points, ℓ.
-    lone : points in mid-air, as scanners leave them: they lie beside the surface, for all that is computed.
+    points, reached, stars
+        Number of points, and of those that faces of the surface reach; the others have triangles of local stars alone.
+    holes_closed, boundary_loops
+        Boundary loops that were taken for gaps and closed, and those that are left.
+    components, noise
+        Number of them; distance of the points from the surface, root mean square, ℓ, 0 if there is none to be seen.
+    contacts, places
+        Points the nearest of which is on another sheet, more than three edges away, where shapes touch or are too thin
+        for their points, and which belong together is a guess; and where most of these are, up to eight points, ℓ.
+    lone
+        Points in mid-air, as scanners leave them: they lie beside the surface, for all that is computed.
     """
 
     points: int
@@ -115,12 +115,16 @@ class CloudSurface(Complex):
 
     Attributes
     ----------
-    stars : (S, 3), local triangles where it has gaps, of which a third counts.
-    normals : (N, 3), unit, on the side of the faces.
-    frames : (N, 3, 2), orthonormal, under the normals; they turn with the points.
-    neighbors : (N, K), the nearest points of each, itself first.
-    lone : (N,), points in mid-air, which stand beside others; who is on the surface does not look at them.
-    summary : how that was found.
+    stars
+        (S, 3), local triangles where it has gaps, of which a third counts.
+    normals, frames
+        (N, 3), unit, on the side of the faces; (N, 3, 2), orthonormal, under the normals; they turn with the points.
+    neighbors
+        (N, K), the nearest points of each, itself first.
+    lone
+        (N,), points in mid-air, which stand beside others; who is on the surface does not look at them.
+    summary
+        How that was found.
     """
 
     stars: Int[Tensor, "S 3"]

@@ -120,9 +120,12 @@ def star_of(
 
     Returns
     -------
-    angle, order : (B, K), ascending, of the neighbours by number; infinite after the last.
-    following : (B, K), the place of the next one in this order.
-    real : (B, K), which places are taken.
+    angle, order
+        (B, K), ascending, of the neighbours by number; infinite after the last.
+    following
+        (B, K), the place of the next one in this order.
+    real
+        (B, K), which places are taken.
     """
     angle = torch.atan2(coords[..., 1], coords[..., 0]).masked_fill(~natural, torch.inf)
     angle, order = angle.sort(dim=1)

@@ -18,14 +18,18 @@ def left_inverse(
 
     Parameters
     ----------
-    values : V, K ≥ M, float64.
-    root : √ω.
+    values
+        V, K ≥ M, float64.
+    root
+        √ω.
 
     Returns
     -------
-    inverse : C.
-    condition : ‖R⁻¹‖ in the Frobenius norm, the columns of √ω V scaled to length one: as those of R have length one
-        then, ‖R‖ is between 1 and √M.
+    inverse
+        C.
+    condition
+        ‖R⁻¹‖ in the Frobenius norm, the columns of √ω V scaled to length one: as those of R have length one then, ‖R‖
+        is between 1 and √M.
 
     >>> left_inverse(torch.ones(1, 4, 1, dtype=torch.float64), torch.ones(1, 4, dtype=torch.float64))[0].tolist()
     [[[0.25, 0.25, 0.25, 0.25]]]

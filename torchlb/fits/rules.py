@@ -33,8 +33,10 @@ class Reference(NamedTuple):
 
     Attributes
     ----------
-    growth : ρ² Σ|w|.
-    off_diagonal_ratio : Σ_{j≠i}|w_j| / |w_i|.
+    growth
+        ρ² Σ|w|.
+    off_diagonal_ratio
+        Σ_{j≠i}|w_j| / |w_i|.
     """
 
     growth: float

@@ -33,14 +33,21 @@ class Weights:
 
     Attributes
     ----------
-    gradient : (B, K, d), 1/ℓ. Entry 0 along K is the centre, as below.
-    laplacian : (B, K), 1/ℓ²: Δ = Σ_c ∂_c²; zero below degree 2.
-    radius : (B,), ℓ: distance ρ of the farthest neighbour in local coordinates.
-    condition : (B,), of √ω V with its columns scaled to length one, as `left_inverse` gives it; above 1e10, or not
-        finite, without full rank.
-    residual : (B,): largest violation of the moment equations, in units of the largest right-hand side.
-    height_residual : (B,): what a polynomial leaves of the heights over the distances; 0 where no heights were given.
-    slope : (B,), degree of the fit of the gradient where that is another one, else 0.
+    gradient
+        (B, K, d), 1/ℓ. Entry 0 along K is the centre, as below.
+    laplacian
+        (B, K), 1/ℓ²: Δ = Σ_c ∂_c²; zero below degree 2.
+    radius
+        (B,), ℓ: distance ρ of the farthest neighbour in local coordinates.
+    condition
+        (B,), of √ω V with its columns scaled to length one, as `left_inverse` gives it; above 1e10, or not finite,
+        without full rank.
+    residual
+        (B,): largest violation of the moment equations, in units of the largest right-hand side.
+    height_residual
+        (B,): what a polynomial leaves of the heights over the distances; 0 where no heights were given.
+    slope
+        (B,), degree of the fit of the gradient where that is another one, else 0.
     """
 
     gradient: Float[Tensor, "B K d"]
@@ -154,12 +161,18 @@ class CenteredFit:
 
     Attributes
     ----------
-    coefficients : (B, M − 1, K − 1). Their rows of |α| = 1, over the radius, are the weights of the gradient.
-    radius : (B,), ℓ: distance ρ of the farthest neighbour in local coordinates.
-    residual : (B,): largest violation of the moment equations of the first derivatives.
-    values : (B, K − 1, M − 1), the monomials V at the neighbours.
-    root : (B, K − 1), √ω.
-    degree : m.
+    coefficients
+        (B, M − 1, K − 1). Their rows of |α| = 1, over the radius, are the weights of the gradient.
+    radius
+        (B,), ℓ: distance ρ of the farthest neighbour in local coordinates.
+    residual
+        (B,): largest violation of the moment equations of the first derivatives.
+    values
+        (B, K − 1, M − 1), the monomials V at the neighbours.
+    root
+        (B, K − 1), √ω.
+    degree
+        m.
     """
 
     coefficients: Float[Tensor, "B M neighbors"]
@@ -232,29 +245,32 @@ def least_squares_weights(
               \sum_{j \ne i} w_j y_j^\alpha = (D y^\alpha)(0), \quad 1 \le |\alpha| \le m, \qquad
               w_i = -\sum_{j \ne i} w_j .
 
-    The polynomial passes through the centre's value; that is what makes the operator stable (`method.md`, section 2).
-    Solved by `left_inverse` in coordinates scaled by ρ: w = Cᵀb. A stencil without full rank comes out with a
-    large `condition` and unusable weights; nothing is raised.
+    The polynomial passes through the centre's value, so that the operator is stable (`method.md`, section 2). Solved by
+    `left_inverse` in coordinates scaled by ρ: w = Cᵀb. Without full rank `condition` is large; nothing is raised.
 
     Parameters
     ----------
-    coords : (B, K − 1, d), ℓ: the neighbours without the centre, K − 1 ≥ M − 1.
-    degree : m ≥ 1. Δ comes with m ≥ 2.
-    keep : (B, K − 1), neighbours that may have a weight; all by default.
-    flux : (B, K, d), the conormal at each point of the stencil that lies on a boundary with the datum ∂_ν f + a f = 0
-        (centre first), zero at the others. Each adds an unknown v_b: minimise Σ w²/ω + Σ v²/ω subject to
-        Σ w_j y_j^α + Σ v_b (∂_ν + a) y^α(y_b) = (D y^α)(0), and w_i = −Σ w_j − a Σ v_b (`method.md`, section 6). Only
-        w is returned.
-    share : a, 1/ℓ, a number or of each point of the stencil.
-    heights : (B, K − 1, n), ℓ, of the neighbours over the tangent plane; not together with `flux`.
+    coords
+        (B, K − 1, d), ℓ: the neighbours without the centre, K − 1 ≥ M − 1.
+    degree
+        m ≥ 1. Δ comes with m ≥ 2.
+    keep
+        (B, K − 1), neighbours that may have a weight; all by default.
+    flux
+        (B, K, d), the conormal at each point of the stencil that lies on a boundary with the datum ∂_ν f + a f = 0
+        (centre first), zero at the others. Each adds an unknown v_b: minimise Σ w²/ω + Σ v²/ω subject to Σ w_j y_j^α +
+        Σ v_b (∂_ν + a) y^α(y_b) = (D y^α)(0), and w_i = −Σ w_j − a Σ v_b (`method.md`, section 6). Only w is returned.
+    share
+        a, 1/ℓ, a number or of each point of the stencil.
+    heights
+        (B, K − 1, n), ℓ, of the neighbours over the tangent plane; not together with `flux`.
 
     >>> line = torch.tensor([[[-1.0], [1.0]]], dtype=torch.float64)
     >>> least_squares_weights(line, 2).laplacian.round(decimals=12).tolist()
     [[-2.0, 1.0, 1.0]]
     """
     radius, scaled, values, root = scaled_system(coords, degree)
-    if keep is not None:
-        root = root * keep
+    root = root if keep is None else root * keep
     constant = torch.ones_like(root)
     if flux is not None:
         share = torch.as_tensor(share).to(coords).expand(flux.shape[:2]) * radius[:, None]
@@ -263,13 +279,12 @@ def least_squares_weights(
     coefficients, condition = left_inverse(values, root)
     rows = functionals.mT @ coefficients
     residual = (rows @ values - functionals.mT).abs().amax((1, 2)) / functionals.abs().max()
-    solution = rows.mT
     if flux is not None:
         # What the data add would hide that points on a line, or in one place, say nothing of what is across.
         spread = torch.linalg.svdvals(scaled.nan_to_num())
         residual = torch.where(spread[:, -1] <= ON_LINE * spread[:, 0], torch.inf, residual)
-    center = -(constant[..., None] * solution).sum(1, keepdim=True)
-    weights = torch.cat([center, solution[:, : coords.shape[1]]], dim=1)
+    center = -(constant[..., None] * rows.mT).sum(1, keepdim=True)
+    weights = torch.cat([center, rows.mT[:, : coords.shape[1]]], dim=1)
     left = torch.zeros_like(radius)
     if heights is not None:
         left = height_residual(values, coefficients, root, coords, heights)

@@ -34,11 +34,15 @@ class Boundary:
 
     Attributes
     ----------
-    mask : (N,), which points lie on the boundary.
-    conormals : (N, n), unit and outward there, zero elsewhere.
-    sizes : (N,), ℓ^{d−1}, a first-order share of the boundary's length or area; 1 at the end of a curve.
-    folds : (N,), 1 over the length of the mean of the outer normals around, where ν is that mean; 1 elsewhere. If
-        ∂_n f = g along all of them, ∂_ν f is that times g.
+    mask
+        (N,), which points lie on the boundary.
+    conormals
+        (N, n), unit and outward there, zero elsewhere.
+    sizes
+        (N,), ℓ^{d−1}, a first-order share of the boundary's length or area; 1 at the end of a curve.
+    folds
+        (N,), 1 over the length of the mean of the outer normals around, where ν is that mean; 1 elsewhere. If ∂_n f = g
+        along all of them, ∂_ν f is that times g.
     """
 
     mask: Bool[Tensor, " N"]

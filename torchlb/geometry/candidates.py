@@ -23,10 +23,14 @@ class Candidate(NamedTuple):
 
     Attributes
     ----------
-    degree : of the polynomials.
-    size : number of points K, the centre included.
-    rule : for the weights, a key of `WEIGHT_RULES`.
-    factor : points per polynomial that the search has come to; 0 where the user has fixed the size.
+    degree
+        Of the polynomials.
+    size
+        Number of points K, the centre included.
+    rule
+        For the weights, a key of `WEIGHT_RULES`.
+    factor
+        Points per polynomial that the search has come to; 0 where the user has fixed the size.
     """
 
     degree: int
@@ -97,7 +101,8 @@ class Search:
 
     Parameters
     ----------
-    start : first candidate of each row; the very first by default.
+    start
+        First candidate of each row; the very first by default.
     """
 
     def __init__(

@@ -31,10 +31,14 @@ class Edges:
 
     Attributes
     ----------
-    keys : (E,), low · count + high of the two ends, ascending.
-    of : (3F,), number of the edge that each half-edge lies on.
-    uses : (E,), how many faces meet there.
-    order : (3F,), the half-edges by the number of their edge.
+    keys
+        (E,), low · count + high of the two ends, ascending.
+    of
+        (3F,), number of the edge that each half-edge lies on.
+    uses
+        (E,), how many faces meet there.
+    order
+        (3F,), the half-edges by the number of their edge.
     """
 
     faces: Faces

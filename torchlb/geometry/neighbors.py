@@ -120,10 +120,14 @@ class GraphBalls:
 
     Parameters
     ----------
-    points : (N, n), length ℓ.
-    graph : (N, N) symmetric adjacency, from `mesh_graph` or `nearest_graph`.
-    frames : (N, n, d) tangent frames that decide admission.
-    sides : (N, n) from `thin_sides`: also refused is a point on the other side of a thin shape. None if not known.
+    points
+        (N, n), length ℓ.
+    graph
+        (N, N) symmetric adjacency, from `mesh_graph` or `nearest_graph`.
+    frames
+        (N, n, d) tangent frames that decide admission.
+    sides
+        (N, n) from `thin_sides`: also refused is a point on the other side of a thin shape. None if not known.
     """
 
     def __init__(
@@ -178,8 +182,10 @@ class GraphBalls:
 
         Returns
         -------
-        index : (B, size), padded by the centre itself where the ball holds fewer.
-        count : (B,), how many are real.
+        index
+            (B, size), padded by the centre itself where the ball holds fewer.
+        count
+            (B,), how many are real.
         """
         level = next((kept for kept in self._kept if kept.size >= size), None)
         if level is None:

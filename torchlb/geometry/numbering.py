@@ -19,8 +19,10 @@ class Numbering:
 
     Attributes
     ----------
-    given : (N,), of each point, in the order of the tree, the number that the user gave it.
-    here : (N,), of each of the user's points the place in that order.
+    given
+        (N,), of each point, in the order of the tree, the number that the user gave it.
+    here
+        (N,), of each of the user's points the place in that order.
 
     >>> numbering = Numbering.along_tree(torch.rand(50, 3))
     >>> numbering.given[numbering.here].equal(torch.arange(50))

@@ -32,12 +32,15 @@ def weak_matrices(
 
     Parameters
     ----------
-    lb : operator.
-    convention : "igl" (C ≤ 0), or "potpourri3d", "robust_laplacian", "lapy", "diffusion_net" (C ≥ 0).
+    lb
+        Operator.
+    convention
+        "igl" (C ≤ 0), or "potpourri3d", "robust_laplacian", "lapy", "diffusion_net" (C ≥ 0).
 
     Raises
     ------
-    ValueError : for another library.
+    ValueError
+        For another library.
 
     Examples
     --------
@@ -63,13 +66,16 @@ def edge_weights(
 
     Parameters
     ----------
-    lb : operator.
-    normalization : None for the weak matrix, "rw" for the strong one, Δ itself. PyG's "sym" makes a symmetric matrix
-        symmetric again; the stencil is none.
+    lb
+        Operator.
+    normalization
+        None for the weak matrix, "rw" for the strong one, Δ itself. PyG's "sym" makes a symmetric matrix symmetric
+        again; the stencil is none.
 
     Raises
     ------
-    ValueError : for another normalization.
+    ValueError
+        For another normalization.
     """
     if normalization not in (None, "rw"):
         raise InputError(f"normalization: expected None or 'rw', got {normalization!r}")

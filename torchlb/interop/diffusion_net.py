@@ -75,20 +75,28 @@ def get_operators(
 
     Parameters
     ----------
-    verts : (V, 3) tensor, ℓ; the results are constants, as a warning says if it requires a gradient.
-    faces : (F, 3) tensor; None or empty for a point cloud.
-    k_eig : number of eigenpairs, 0 for none.
-    op_cache_dir : folder of a cache (`load_or_build`), or None.
-    normals : (V, 3). They orient the frames, made consistent, and on a cloud are the first guess of the tangent planes.
-    overwrite_cache : whether to compute anew.
-    truncate_cache : of the original; without effect, since a file with more pairs serves already.
-    operator : "stencil" or "cotangent".
-    symmetric : whether L is symmetric; see above.
-    **options : of `LaplaceBeltrami.from_mesh` or `from_points`, such as ``order=3``.
+    verts
+        (V, 3) tensor, ℓ; the results are constants, as a warning says if it requires a gradient.
+    faces
+        (F, 3) tensor; None or empty for a point cloud.
+    k_eig
+        Number of eigenpairs, 0 for none.
+    op_cache_dir
+        Folder of a cache (`load_or_build`), or None.
+    normals
+        (V, 3). They orient the frames, made consistent, and on a cloud are the first guess of the tangent planes.
+    overwrite_cache
+        Whether to compute anew.
+    truncate_cache
+        Of the original; without effect, since a file with more pairs serves already.
+    operator
+        "stencil" or "cotangent".
+    symmetric
+        Whether L is symmetric; see above.
+    **options
+        Of `LaplaceBeltrami.from_mesh` or `from_points`, such as ``order=3``.
 
-    Raises
-    ------
-    ValueError : for bad input.
+    Raises ValueError for bad input.
     """
     verts, faces = torch.as_tensor(verts), None if faces is None else torch.as_tensor(faces)
     cloud = faces is None or faces.numel() == 0

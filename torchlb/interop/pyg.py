@@ -76,18 +76,25 @@ class LaplaceBeltramiTransform(BaseTransform):
 
     Parameters
     ----------
-    operator : "stencil" or "cotangent".
-    k : number of eigenpairs for spectral layers; 0 for none, which `to_operator(batch).eigenbasis` would solve anew.
-    cache : folder, so that each shape is computed once (`load_or_build`); None to compute at every call.
-    normals : key, or keys of which the first present counts, of the normals of a cloud, which orient it (PyG's own
-        transforms write "norm" or "normal"); None to ignore them. A shape without has them estimated.
-    on_error : "raise", or "skip": a warning says why a shape has no operator, and its data come back without the
-        keys, so that ``[d for d in map(transform, shapes) if "lb_values" in d]`` goes on with the others.
-    **options : of `LaplaceBeltrami.from_mesh` (for data with `face`) or `from_points` (without).
+    operator
+        "stencil" or "cotangent".
+    k
+        Number of eigenpairs for spectral layers; 0 for none, which `to_operator(batch).eigenbasis` would solve anew.
+    cache
+        Folder, so that each shape is computed once (`load_or_build`); None to compute at every call.
+    normals
+        Key, or keys of which the first present counts, of the normals of a cloud, which orient it (PyG's own transforms
+        write "norm" or "normal"); None to ignore them. A shape without has them estimated.
+    on_error
+        "raise", or "skip": a warning says why a shape has no operator, and its data come back without the keys, so that
+        ``[d for d in map(transform, shapes) if "lb_values" in d]`` goes on with the others.
+    **options
+        Of `LaplaceBeltrami.from_mesh` (for data with `face`) or `from_points` (without).
 
     Raises
     ------
-    ValueError : when called, for data without `pos`, and for bad shapes.
+    ValueError
+        When called, for data without `pos`, and for bad shapes.
 
     `FaceToEdge` drops `face`, and the shape is a cloud then; a warning says so where there are no normals either.
     """
@@ -188,8 +195,9 @@ def to_operator(data: Any) -> LaplaceBeltrami:
 
     Raises
     ------
-    ValueError : for data without the keys, whose `pos` was changed since by more than a translation, or whose nodes
-        were put into another order, since transforms permute nodes, not matrices.
+    ValueError
+        For data without the keys, whose `pos` was changed since by more than a translation, or whose nodes were put
+        into another order, since transforms permute nodes, not matrices.
     """
     if "lb_edge_index" not in data:
         raise InputError(f"expected data that went through LaplaceBeltramiTransform, got {data}")

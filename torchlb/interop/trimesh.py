@@ -20,13 +20,17 @@ def from_trimesh(shape: Any, *, operator: Operator = "stencil", **options: Any) 
 
     Parameters
     ----------
-    shape : vertices in ℓ. The geometries of a scene are joined, each in its place; they stay components of their own.
-    operator : "stencil", or "cotangent" for libigl's.
-    **options : of `LaplaceBeltrami.from_mesh` or `from_points`.
+    shape
+        Vertices in ℓ. The geometries of a scene are joined, each in its place; they stay components of their own.
+    operator
+        "stencil", or "cotangent" for libigl's.
+    **options
+        Of `LaplaceBeltrami.from_mesh` or `from_points`.
 
     Raises
     ------
-    ValueError : for bad input, such as vertices that belong to no face: `shape.remove_unreferenced_vertices()`.
+    ValueError
+        For bad input, such as vertices that belong to no face: `shape.remove_unreferenced_vertices()`.
 
     Examples
     --------
@@ -43,14 +47,18 @@ def to_trimesh(lb: LaplaceBeltrami, faces: Any = None, **attributes: Any) -> Any
 
     Parameters
     ----------
-    lb : of N points in R³.
-    faces : (F, 3), instead of the operator's own.
-    **attributes : (N,) or (N, C) data, such as ``curvature=lb.mean_curvature_normal()``, for `vertex_attributes`;
-        files such as .ply keep them. A point cloud has no place for them but in `metadata`.
+    lb
+        Of N points in R³.
+    faces
+        (F, 3), instead of the operator's own.
+    **attributes
+        (N,) or (N, C) data, such as ``curvature=lb.mean_curvature_normal()``, for `vertex_attributes`; files such as
+        .ply keep them. A point cloud has no place for them but in `metadata`.
 
     Raises
     ------
-    ValueError : for points of another dimension, or an attribute of another length.
+    ValueError
+        For points of another dimension, or an attribute of another length.
     """
     import trimesh
 

@@ -51,21 +51,23 @@ def load_or_build(
 
     Parameters
     ----------
-    vertices : (N, n) tensor or array, ℓ.
-    faces : (F, 3) indices; None or empty for a point cloud.
-    cache : folder; made if missing, "~" is the home directory.
-    operator : "stencil" (`from_mesh` or `from_points`) or "cotangent" (`from_cotangent`).
-    k : number of eigenpairs to have in the file. A file with fewer is completed; one with more serves.
-    overwrite : whether to build it anew even so.
-    progress : as for `LaplaceBeltrami.from_points`.
-    **options : of the builder, such as ``order=5``.
+    vertices, faces
+        (N, n) tensor or array, ℓ, and (F, 3) indices; None or empty for a point cloud.
+    cache
+        Folder; made if missing, "~" is the home directory.
+    operator
+        "stencil" (`from_mesh` or `from_points`) or "cotangent" (`from_cotangent`).
+    k
+        Number of eigenpairs to have in the file. A file with fewer is completed; one with more serves.
+    overwrite
+        Whether to build it anew even so.
+    progress, **options
+        Of the builder, such as ``order=5``.
 
     Returns what the builder returns, in the floating type of `vertices`, on the CPU, and raises what it raises; an
     InputError if `cache` is a file, an OSError if the folder cannot be read. A `CacheWarning` tells of a file that is
     damaged or of another torchlb, which is replaced, and of a folder that cannot be written.
 
-    Examples
-    --------
     >>> import tempfile
     >>> from torchlb.surfaces import Sphere
     >>> vertices, faces = Sphere().mesh(100)
@@ -162,14 +164,18 @@ def save_operator(lb: LaplaceBeltrami, path: str | Path, *, key: str = "") -> No
 
     Parameters
     ----------
-    lb : any operator, also a batch.
-    path : of the file, best with the ending .npz. Its folder is made if missing; a file that is there is replaced at
-        once and as a whole, also if the program is killed or several write it.
-    key : what `operator_key` calls it, for a file of a cache.
+    lb
+        Any operator, also a batch.
+    path
+        Of the file, best with the ending .npz. Its folder is made if missing; a file that is there is replaced at once
+        and as a whole, also if the program is killed or several write it.
+    key
+        What `operator_key` calls it, for a file of a cache.
 
     Raises
     ------
-    OSError : where the file cannot be written; nothing is left of it then.
+    OSError
+        Where the file cannot be written; nothing is left of it then.
     """
     path = Path(path).expanduser()
     state = lb.state_dict()
@@ -217,8 +223,10 @@ def load_operator(path: str | Path) -> LaplaceBeltrami:
 
     Raises
     ------
-    FileNotFoundError : if there is none.
-    OperatorFileError : if it is something else, damaged, or of a torchlb with another format.
+    FileNotFoundError
+        If there is none.
+    OperatorFileError
+        If it is something else, damaged, or of a torchlb with another format.
     """
     return _read(Path(path))[0]
 

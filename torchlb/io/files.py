@@ -41,7 +41,8 @@ def read_shape(path: str | Path) -> Shape:
 
     Parameters
     ----------
-    path : a mesh (.ply, .obj, .off, .stl, .glb, .gltf), whose polygons are split into triangles, along the shorter
+    path
+        A mesh (.ply, .obj, .off, .stl, .glb, .gltf), whose polygons are split into triangles, along the shorter
         diagonal of a quad; without faces it is a cloud. A cloud in .pcd, or a table of numbers (.xyz, .txt, .csv, .pts,
         .asc) with the coordinates in the columns x, y, z, or in the first three. An array (N, n) of points in .npy; or
         a .npz with `vertices` (or `points`, or `pos`) and, for a mesh, `faces`. The corners of an .stl, which has no
@@ -49,8 +50,10 @@ def read_shape(path: str | Path) -> Shape:
 
     Raises
     ------
-    FileNotFoundError : if there is none.
-    ValueError : if it is no shape; the message names the file.
+    FileNotFoundError
+        If there is none.
+    ValueError
+        If it is no shape; the message names the file.
     """
     path = Path(path).expanduser()
     suffix = path.suffix.lower()

@@ -37,12 +37,18 @@ class ShapeResult:
 
     Attributes
     ----------
-    name : file, relative to the folder, or "shape 7" for arrays.
-    status : "built", "cached" (it was there) or "failed".
-    points : number of points; 0 if failed.
-    seconds : that it took.
-    file : its operator, for `load_operator`; empty if failed.
-    message : why it failed, or what it was warned of.
+    name
+        File, relative to the folder, or "shape 7" for arrays.
+    status
+        "built", "cached" (it was there) or "failed".
+    points
+        Number of points; 0 if failed.
+    seconds
+        That it took.
+    file
+        Its operator, for `load_operator`; empty if failed.
+    message
+        Why it failed, or what it was warned of.
     """
 
     name: str
@@ -59,8 +65,10 @@ class PrecomputeReport:
 
     Attributes
     ----------
-    results : one for each shape.
-    skipped : files of the folder that are no shapes, by their endings or, of .txt and .csv, by their first lines.
+    results
+        One for each shape.
+    skipped
+        Files of the folder that are no shapes, by their endings or, of .txt and .csv, by their first lines.
     """
 
     results: tuple[ShapeResult, ...]
@@ -123,24 +131,26 @@ def precompute_operators(
 
     Parameters
     ----------
-    shapes : a folder, searched in depth for files that `torchlb.read_shape` takes, of .txt and .csv those whose rows
-        have three numbers or more; or a list of files or of (vertices, faces) pairs, faces None for a cloud.
-    out : folder of the cache. ``load_or_build(vertices, faces, cache=out, …)`` with the same options finds the entries.
-    operator, k : as for `load_or_build`.
-    workers : processes, each with one thread; −1 for one per core. Within ``joblib.parallel_config(backend="dask")``
-        the workers are those of the Dask client.
-    clean : whether meshes go through `clean_mesh` first, and clouds through `clean_points`; the data set then has to do
-        the same.
-    progress : whether to show a bar, on a terminal.
-    **options : of `LaplaceBeltrami.from_mesh` or `from_points`.
+    shapes
+        A folder, searched in depth for files that `torchlb.read_shape` takes, of .txt and .csv those whose rows have
+        three numbers or more; or a list of files or of (vertices, faces) pairs, faces None for a cloud.
+    out
+        Folder of the cache. ``load_or_build(vertices, faces, cache=out, …)`` with the same options finds the entries.
+    operator, k
+        As for `load_or_build`.
+    workers
+        Processes, each with one thread; −1 for one per core. Within ``joblib.parallel_config(backend="dask")`` the
+        workers are those of the Dask client.
+    clean
+        Whether meshes go through `clean_mesh` first, and clouds through `clean_points`; the data set then has to do the
+        same.
+    progress
+        Whether to show a bar, on a terminal.
+    **options
+        Of `LaplaceBeltrami.from_mesh` or `from_points`.
 
-    Returns
-    -------
-    What became of each shape; also in `out`/precompute.csv. No exception of a shape gets out.
-
-    Raises
-    ------
-    ValueError, TypeError : for options that are none, a folder that is missing or has no shapes, before any work.
+    Returns what became of each shape; also in `out`/precompute.csv. No exception of a shape gets out. Raises ValueError
+    or TypeError for options that are none, a folder that is missing or has no shapes, before any work.
     """
     check_options_of(operator, options)
     cache = Path(out).expanduser()

@@ -28,7 +28,8 @@ def conjugate_gradients(
 
     Raises
     ------
-    DiffusionError : where that is not reached in `max_steps`, and for a b that is not finite.
+    DiffusionError
+        Where that is not reached in `max_steps`, and for a b that is not finite.
 
     >>> a = torch.tensor([[2.0, 1.0], [1.0, 3.0]])
     >>> x, steps = conjugate_gradients(lambda v: a @ v, torch.tensor([[3.0], [4.0]]), lambda r: r, tolerance=1e-5)

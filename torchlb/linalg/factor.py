@@ -74,7 +74,8 @@ class Factor:
 
     Attributes
     ----------
-    is_cholesky : whether it is a Cholesky factor, the matrix thus positive definite.
+    is_cholesky
+        Whether it is a Cholesky factor, the matrix thus positive definite.
     """
 
     def __init__(self, matrix: sparse.csr_array) -> None:

@@ -67,10 +67,10 @@ def left_inverse(columns: np.ndarray, root: np.ndarray) -> tuple[np.ndarray, np.
 
     Parameters
     ----------
-    columns : (B, M, K)
-        The columns of every V, one after the other.
-    root : (B, K)
-        √ω.
+    columns
+        (B, M, K) The columns of every V, one after the other.
+    root
+        (B, K) √ω.
     """
     batch, terms, size = columns.shape
     lanes = max(min(LANES, batch), 1)
@@ -218,11 +218,12 @@ def graph_balls(
 
     Parameters
     ----------
-    points : (N, n)
-    normals : (N, n, n − d)
-        Orthonormal frames of the normal spaces.
-    sides : (N, n)
-        A point is refused whose vector is opposed to the centre's; zero where no sides are known.
+    points
+        (N, n).
+    normals
+        (N, n, n − d) Orthonormal frames of the normal spaces.
+    sides
+        (N, n) A point is refused whose vector is opposed to the centre's; zero where no sides are known.
     indptr, indices
         The graph's rows, without loops.
     centers : (B,)

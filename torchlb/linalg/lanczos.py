@@ -75,21 +75,21 @@ def lanczos(
     null: Float[np.ndarray, " N"] | None = None,
     least: float = np.inf,
 ) -> Pairs:
-    """The k smallest eigenpairs but a null vector, ascending and M-orthonormal, and `more` that are less accurate.
+    """The k smallest eigenpairs but `null`, ascending and M-orthonormal, and `more` that are less accurate.
 
     Krylov space of (K + shift M)⁻¹M from random vectors, fixed ones, orthogonalised in full; no restarts.
 
     Parameters
     ----------
-    solve, mass_matrix : product with (K + shift M)⁻¹, K positive semidefinite, (N, N); and M, positive definite.
-    shift, least : small and positive, in the unit of λ, and the smallest that is worth trying instead.
-    tolerance : of the residuals in the M-norm, relative to 1/(λ + shift); eigenvalues are off by about its square.
-    null : null vector of K, M-normalised, which is left out.
+    solve, mass_matrix
+        Product with (K + shift M)⁻¹, K positive semidefinite, (N, N); and M, positive definite.
+    shift, least
+        Small and positive, in the unit of λ, and the smallest that is worth trying instead.
+    tolerance
+        Of the residuals in the M-norm, relative to 1/(λ + shift); eigenvalues are off by about its square.
 
-    Raises
-    ------
-    ShiftTooLarge : if one of `NARROW` times it serves better, and `least` allows that.
-    EigenbasisError : if N vectors do not suffice, or `LONGEST` times those asked for.
+    Raises ShiftTooLarge if `NARROW` times the shift serves better, and `least` allows that; EigenbasisError if N
+    vectors do not suffice, or `LONGEST` times those asked for.
     """
     size, count = len(mass_matrix.diagonal()), k + more
     generator, first = np.random.default_rng(0), int(null is not None)

@@ -47,9 +47,12 @@ def csr_product(
 
     Parameters
     ----------
-    pattern : [crow, col, crow_t, col_t, order_t] of A and, from `transpose_pattern`, of its transpose; int32 or int64.
-    values : of A.
-    x : dense. The product is computed in the wider of the types of `values` and `x`, and at least in float32, also
+    pattern
+        [crow, col, crow_t, col_t, order_t] of A and, from `transpose_pattern`, of its transpose; int32 or int64.
+    values
+        Of A.
+    x
+        Dense. The product is computed in the wider of the types of `values` and `x`, and at least in float32, also
         under autocast; the result has that type, but for a half-precision x, which gives its own.
 
     >>> crow, col, values = torch.tensor([0, 2, 3]), torch.tensor([0, 1, 1]), torch.tensor([1.0, 2.0, 3.0])

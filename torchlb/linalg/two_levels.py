@@ -25,9 +25,12 @@ def two_levels(product: Linear, sums: Float[Tensor, "N _"], coarse: Linear) -> L
 
     Parameters
     ----------
-    product : with A, or with what is near A on rough functions.
-    sums : D, (N, 1), or (N, C) for columns with matrices of their own; rows of zeros are left alone.
-    coarse : a solve with what is near A on smooth functions.
+    product
+        With A, or with what is near A on rough functions.
+    sums
+        D, (N, 1), or (N, C) for columns with matrices of their own; rows of zeros are left alone.
+    coarse
+        A solve with what is near A on smooth functions.
 
     >>> diagonal = torch.tensor([[2.0], [4.0]])
     >>> cycle = two_levels(lambda x: diagonal * x, diagonal, torch.zeros_like)

@@ -22,7 +22,8 @@ def check_features(
 
     Raises
     ------
-    InputError : for a wrong shape, and for features of another type than the parameters, unless autocast made them so.
+    InputError
+        For a wrong shape, and for features of another type than the parameters, unless autocast made them so.
     """
     check_shape(x, lb)
     if x.shape[-1] != channels:

@@ -39,16 +39,22 @@ class Diffusion(LearnedTimes):
 
     Parameters
     ----------
-    channels : C.
-    method : "deflated" (exact at every scale), "spectral" (of the original DiffusionNet: Φe^{−λt}Φᵀπ, which drops
-        everything beyond the basis), "rational" (no basis; solves on the CPU).
-    k : number of eigenpairs for the first two.
-    init_time : ℓ², at the start. Shapes of radius about one are expected.
-    tolerance : of all but "spectral", see `heat_flow`.
+    channels
+        C.
+    method
+        "deflated" (exact at every scale), "spectral" (of the original DiffusionNet: Φe^{−λt}Φᵀπ, which drops everything
+        beyond the basis), "rational" (no basis; solves on the CPU).
+    k
+        Number of eigenpairs for the first two.
+    init_time
+        ℓ², at the start. Shapes of radius about one are expected.
+    tolerance
+        Of all but "spectral", see `heat_flow`.
 
     Attributes
     ----------
-    raw_time : (C,), the parameter; the times are t = softplus(100 raw)/100, positive by construction.
+    raw_time
+        (C,), the parameter; the times are t = softplus(100 raw)/100, positive by construction.
 
     Examples
     --------

@@ -36,11 +36,16 @@ class DiffusionNetBlock(nn.Module):
 
     Parameters
     ----------
-    width : channels in and out.
-    hidden : widths of the hidden layers of the pointwise network; [width, width] by default.
-    dropout : whether that network drops half of its hidden values while it trains.
-    gradient_features, rotations : whether there are any, and whether they turn: see `GradientFeatures`.
-    method, k : of `Diffusion`; method="implicit" takes `ImplicitDiffusion` in its place.
+    width
+        Channels in and out.
+    hidden
+        Widths of the hidden layers of the pointwise network; [width, width] by default.
+    dropout
+        Whether that network drops half of its hidden values while it trains.
+    gradient_features, rotations
+        Whether there are any, and whether they turn: see `GradientFeatures`.
+    method, k
+        Of `Diffusion`; method="implicit" takes `ImplicitDiffusion` in its place.
     """
 
     def __init__(
@@ -85,18 +90,27 @@ class DiffusionNet(nn.Module):
 
     Parameters
     ----------
-    in_channels, out_channels : of the features and of the output.
-    width : channels of the blocks.
-    num_blocks : number of blocks.
-    block : "diffusion", "implicit" or "poisson".
-    outputs_at : "vertices", "edges", "faces" (means over the corners) or "global_mean" (over the surface, by mass).
-    last_activation : applied to the output, such as ``lambda y: y.log_softmax(-1)``.
-    hidden, dropout, gradient_features, rotations : of the blocks.
-    method, k : of "diffusion" blocks.
+    in_channels, out_channels
+        Of the features and of the output.
+    width
+        Channels of the blocks.
+    num_blocks
+        Number of blocks.
+    block
+        "diffusion", "implicit" or "poisson".
+    outputs_at
+        "vertices", "edges", "faces" (means over the corners) or "global_mean" (over the surface, by mass).
+    last_activation
+        Applied to the output, such as ``lambda y: y.log_softmax(-1)``.
+    hidden, dropout, gradient_features, rotations
+        Of the blocks.
+    method, k
+        Of "diffusion" blocks.
 
     Raises
     ------
-    InputError : for a block, a method or a place that is none.
+    InputError
+        For a block, a method or a place that is none.
 
     Examples
     --------
@@ -152,9 +166,12 @@ class DiffusionNet(nn.Module):
 
         Parameters
         ----------
-        x : features (N, in_channels), or (B, N, in_channels) of B inputs on one surface.
-        lb : operator of one shape or of a batch, whose global mean is (S, out_channels), one for each shape.
-        faces, edges : for outputs there; in a batch, those of shape s moved by ``lb.offsets[s]``.
+        x
+            Features (N, in_channels), or (B, N, in_channels) of B inputs on one surface.
+        lb
+            Operator of one shape or of a batch, whose global mean is (S, out_channels), one for each shape.
+        faces, edges
+            For outputs there; in a batch, those of shape s moved by ``lb.offsets[s]``.
         """
         check_features(x, lb, self.in_channels, self.first_lin.weight)
         y = self.first_lin(x)
@@ -185,7 +202,8 @@ class DiffusionNet(nn.Module):
 
         Raises
         ------
-        InputError : that lists the missing and the unexpected keys, or a shape that differs.
+        InputError
+            That lists the missing and the unexpected keys, or a shape that differs.
         """
         own = self.state_dict()
         names = {_original_name(key): key for key in own}

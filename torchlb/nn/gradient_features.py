@@ -17,9 +17,11 @@ class TangentMap(nn.Module):
 
     Parameters
     ----------
-    channels : C.
-    rotations : whether A is complex, so that it also turns gradients in the tangent plane; that needs a surface whose
-        normals are oriented consistently (a mesh, or a cloud with oriented normals). Without it, any dimension.
+    channels
+        C.
+    rotations
+        Whether A is complex, so that it also turns gradients in the tangent plane; that needs a surface whose normals
+        are oriented consistently (a mesh, or a cloud with oriented normals). Without it, any dimension.
     """
 
     def __init__(self, channels: int, *, rotations: bool = True) -> None:
@@ -52,7 +54,8 @@ class GradientFeatures(TangentMap):
 
     Parameters
     ----------
-    channels, rotations : C, and whether A is complex, see `TangentMap`.
+    channels, rotations
+        C, and whether A is complex, see `TangentMap`.
 
     Examples
     --------

@@ -21,13 +21,17 @@ class ImplicitDiffusion(LearnedTimes):
 
     Parameters
     ----------
-    channels : C.
-    init_time : ℓ², at the start. Shapes of radius about one are expected.
-    tolerance : of the solves, relative; None for 1e-5 in float32, 1e-10 in float64. 1e-3 is enough to train by.
+    channels
+        C.
+    init_time
+        ℓ², at the start. Shapes of radius about one are expected.
+    tolerance
+        Of the solves, relative; None for 1e-5 in float32, 1e-10 in float64. 1e-3 is enough to train by.
 
     Attributes
     ----------
-    raw_time : (C,), the parameter; the times are t = softplus(100 raw)/100, positive by construction.
+    raw_time
+        (C,), the parameter; the times are t = softplus(100 raw)/100, positive by construction.
 
     Examples
     --------

@@ -31,11 +31,15 @@ class PoissonFeatures(nn.Module):
 
     Parameters
     ----------
-    channels : C.
-    fields : whether there are fields; a step of a network takes a third as long again.
-    rotations : whether A is complex, see `TangentMap`.
-    tolerance : of the solves with the weak pair, relative; by default linear elements are taken, one exact solve, since
-        what is learned has no need of more. Without a weak pair the stencil's.
+    channels
+        C.
+    fields
+        Whether there are fields; a step of a network takes a third as long again.
+    rotations
+        Whether A is complex, see `TangentMap`.
+    tolerance
+        Of the solves with the weak pair, relative; by default linear elements are taken, one exact solve, since what is
+        learned has no need of more. Without a weak pair the stencil's.
     """
 
     def __init__(
@@ -70,11 +74,16 @@ class PoissonBlock(nn.Module):
 
     Parameters
     ----------
-    width : channels in and out.
-    hidden : widths of the hidden layers of the pointwise network; [width, width] by default.
-    dropout : whether that network drops half of its hidden values while it trains.
-    gradient_features, rotations : whether there are any, and whether they turn: see `GradientFeatures`.
-    fields, tolerance : of `PoissonFeatures`.
+    width
+        Channels in and out.
+    hidden
+        Widths of the hidden layers of the pointwise network; [width, width] by default.
+    dropout
+        Whether that network drops half of its hidden values while it trains.
+    gradient_features, rotations
+        Whether there are any, and whether they turn: see `GradientFeatures`.
+    fields, tolerance
+        Of `PoissonFeatures`.
 
     Examples
     --------

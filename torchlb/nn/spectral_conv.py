@@ -20,11 +20,16 @@ class SpectralConv(nn.Module):
 
     Parameters
     ----------
-    in_channels, out_channels : of features (…, N, C).
-    num_filters : number of polynomials, T_0, …
-    k : number of eigenpairs.
-    scale : 1/ℓ², the eigenvalue in the middle of the filters' range; about 10 suits shapes of radius one.
-    bias : whether b is there.
+    in_channels, out_channels
+        Of features (…, N, C).
+    num_filters
+        Number of polynomials, T_0, ….
+    k
+        Number of eigenpairs.
+    scale
+        1/ℓ², the eigenvalue in the middle of the filters' range; about 10 suits shapes of radius one.
+    bias
+        Whether b is there.
 
     Examples
     --------

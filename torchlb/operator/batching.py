@@ -27,7 +27,8 @@ def join_buffers(shapes: Sequence[Buffers]) -> Buffers:
 
     Raises
     ------
-    InputError : if the shapes differ in dimension, in floating type or in device.
+    InputError
+        If the shapes differ in dimension, in floating type or in device.
     """
     first = shapes[0]
     for name in ("frames", "values"):

@@ -38,13 +38,17 @@ def clean_points(points: ArrayLike, tolerance: float = 0.0) -> tuple[Tensor, Ten
 
     Parameters
     ----------
-    points : (N, n), ℓ, finite.
-    tolerance : ℓ; of points that are at most so far from one to the next the first stays. Far below the spacing.
+    points
+        (N, n), ℓ, finite.
+    tolerance
+        ℓ; of points that are at most so far from one to the next the first stays. Far below the spacing.
 
     Returns
     -------
-    points : (N', n), in their order.
-    kept : (N',), their indices in the input: `values[kept]` carries data over.
+    points
+        (N', n), in their order.
+    kept
+        (N',), their indices in the input: `values[kept]` carries data over.
 
     Examples
     --------
@@ -78,16 +82,22 @@ def clean_mesh(
 
     Parameters
     ----------
-    vertices : (N, n).
-    faces : (F, 3) indices; (F, 4) for quads (or tetrahedra, which stay).
-    merge : whether of vertices in the same place, to rounding, the first stays and has the faces of the others: what
-        was cut open along them is closed.
+    vertices
+        (N, n).
+    faces
+        (F, 3) indices; (F, 4) for quads (or tetrahedra, which stay).
+    merge
+        Whether of vertices in the same place, to rounding, the first stays and has the faces of the others: what was
+        cut open along them is closed.
 
     Returns
     -------
-    vertices : (N', n), those in use, in their order.
-    faces : (F', 3), renumbered.
-    kept : (N',), their indices in the input: `values[kept]` carries data over.
+    vertices
+        (N', n), those in use, in their order.
+    faces
+        (F', 3), renumbered.
+    kept
+        (N',), their indices in the input: `values[kept]` carries data over.
 
     Examples
     --------

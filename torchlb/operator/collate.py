@@ -27,7 +27,8 @@ def collate(samples: Sequence[Any]) -> Any:
 
     Raises
     ------
-    InputError : for samples without an operator, and where `default_collate` fails; the key is named.
+    InputError
+        For samples without an operator, and where `default_collate` fails; the key is named.
 
     >>> from torchlb.surfaces import Sphere
     >>> samples = [(LaplaceBeltrami.from_points(Sphere().points(n), order=1), torch.zeros(n, 3), n) for n in (40, 50)]

@@ -43,16 +43,26 @@ class LaplaceBeltrami(StencilFace, WeakFace):
 
     Attributes
     ----------
-    crow, col, values : the matrix of Δ in CSR; values in 1/ℓ², where ℓ is the unit of the points.
-    gradient_values : (d, nnz), 1/ℓ: tangential derivatives in the frame of each row's point, on the same pattern.
-    mass : (N,), ℓ^d: positive quadrature weights that sum to the area; π of the certificate where there is one.
-    certificate : what is proved of the stability of Δ; None where it was not asked for, and for the cotangent.
-    points : (N, n), ℓ.  frames : (N, n, d), orthonormal tangent vectors.
-    normals : (N, n), unit normals of a hypersurface, empty (0, n) otherwise.
-    faces : (F, d + 1), of the mesh, or of the surface through a cloud of points in R³ or R²; empty for other clouds.
-    surface : how the surface through a cloud was found, a `SurfaceSummary`; None where there is none.
-    sizes : numbers of points of the shapes of a `batch`; None for a single shape.
-    source : "points", "mesh", "cotangent" or "batch".  options : of the constructor, as given.
+    crow, col, values
+        The matrix of Δ in CSR; values in 1/ℓ², where ℓ is the unit of the points.
+    gradient_values
+        (d, nnz), 1/ℓ: tangential derivatives in the frame of each row's point, on the same pattern.
+    mass
+        (N,), ℓ^d: positive quadrature weights that sum to the area; π of the certificate where there is one.
+    certificate
+        What is proved of the stability of Δ; None where it was not asked for, and for the cotangent.
+    points, frames
+        (N, n), ℓ, and (N, n, d), orthonormal tangent vectors.
+    normals
+        (N, n), unit normals of a hypersurface, empty (0, n) otherwise.
+    faces
+        (F, d + 1), of the mesh, or of the complex through a cloud.
+    surface
+        How the surface through a cloud was found, a `SurfaceSummary`; None where there is none.
+    sizes
+        Numbers of points of the shapes of a `batch`; None for a single shape.
+    source, options
+        "points", "mesh", "cotangent" or "batch", and those of the constructor, as given.
 
     Examples
     --------
@@ -94,34 +104,35 @@ class LaplaceBeltrami(StencilFace, WeakFace):
 
         Parameters
         ----------
-        points : (N, n) tensor or array, length ℓ, without duplicates. Computed in float64 on the CPU, without
-            gradients, as a warning says where they are required; the result has the floating type of the points.
-        dim : d of the manifold; n − 1 by default.
-        order : p ≥ 1 of the Laplacian: the error falls like h^p.
-        normal_order : q of the tangent frames, p + 1 by default; 0 keeps the initial ones (or those of `normals`).
-        projection : "tangent" (more accurate) or "normal" (the note's), see `method.md`, section 3.
-        weights : "least_squares" (robust) or "polyharmonic" (far more accurate on evenly spread points).
-        num_neighbors : size K of every stencil, itself included, instead of the sizes of the candidates.
-        normals : (N, n), if known (d = n − 1): which way is out, where neighbours agree; a warning says where not.
-        boundary : (N,) mask of the points on the boundary. By default, or for "detect", that of the complex through the
-            cloud; where there is none, None is a closed shape, and surfaces alone can "detect" one.
-        condition : there: "neumann", ∂_ν f = 0; "dirichlet", f = 0; or `torchlb.Robin(a)`, ∂_ν f + a f = 0. With
-            Dirichlet's the values of f at boundary points are not used elsewhere, and have rows of their own, −4d f/h²
-            with h the distance to the nearest, at least a tenth of that to the farthest of the row. None uses no datum.
-            That, and a boundary that is not declared, leaves stencils there one-sided; hardly one passes, and the
-            low-order rows in their place have ∂_ν f = 0 at first order: Δx at the boundary of a disk is of size 1/h
-            then, not 0.
-        reconstruct : from points (N, n) to cells through them, (F, d + 1), or a `torchlb.cloud.Complex`. By default
-            `torchlb.cloud.reconstruct`: of curves, of surfaces in R² and R³ and of solids in R³ (`lb.faces`).
-        weak_form : whether to build the weak pair (K, M), which eigenpairs, flows and solves are of.
-        certify : whether rows of the stencil are lowered until the certificate of stability holds, whose π is then the
-            mass. Eigenpairs, flows and solves are of the weak pair, and need none.
-        progress : whether to show a bar, on a terminal, for what takes longer than two seconds.
+        points
+            (N, n) tensor or array, length ℓ, without duplicates. Computed in float64 on the CPU, without gradients, as
+            a warning says where they are required; the result has the floating type of the points.
+        dim, order, normal_order
+            d of the manifold, n − 1 by default; p ≥ 1 of the Laplacian, whose error falls like h^p; q of the tangent
+            frames, p + 1 by default.
+        projection
+            "tangent" (more accurate) or "normal" (the note's), see `method.md`, section 3.
+        weights, num_neighbors
+            "least_squares" (robust) or "polyharmonic" (for evenly spread points); the size of every stencil.
+        normals
+            (N, n), if known (d = n − 1): which way is out, where neighbours agree; a warning says where not.
+        boundary
+            (N,) mask of the points on the boundary; by default, or for "detect", that of the complex through the cloud.
+        condition
+            There: "neumann", ∂_ν f = 0; "dirichlet", f = 0; or `torchlb.Robin(a)`, ∂_ν f + a f = 0. With Dirichlet's
+            the values of f at boundary points are not used elsewhere, and have rows of their own. None uses no datum:
+            stencils there are one-sided, hardly one passes, and low-order rows in their place have ∂_ν f = 0.
+        reconstruct
+            From points (N, n) to cells through them, (F, d + 1), or a `torchlb.cloud.Complex`. By default
+            `torchlb.cloud.reconstruct`, of d ≤ 3; `lb.faces` are what it found.
+        weak_form, certify
+            Whether to build the weak pair (K, M), which eigenpairs, flows and solves are of; whether to lower rows of
+            the stencil until the certificate of stability holds, whose π is then the mass.
+        progress
+            Whether to show a bar, on a terminal.
 
-        Raises
-        ------
-        InputError : for bad input, naming the points and the remedy.
-        StencilError : where not even the low-order row of a point can be built.
+        Raises InputError for bad input, naming the points and the remedy; StencilError where not even the low-order row
+        of a point can be built.
         """
         options = Options(
             order, normal_order, projection, weights, num_neighbors, condition, weak_form, certify
@@ -153,18 +164,22 @@ class LaplaceBeltrami(StencilFace, WeakFace):
 
         Parameters
         ----------
-        vertices : (N, n) tensor or array, length ℓ.
-        faces : (F, 3) indices. Any triangle mesh: several components, non-manifold edges, zero-area triangles.
-            Also (F, 2) polylines and (F, 4) tetrahedra, for manifolds of dimension 1 and 3 in Rⁿ.
-        boundary : (N,) mask of the part of the boundary where the condition holds; the rest has none. By default, or
-            for "detect", all the boundary that the faces have, if any.
-        order, normal_order, projection, weights, num_neighbors, condition, weak_form, certify, progress : as for
-            `from_points`. The order chooses the weak pair, too (degree of elements, of fits of functions): 1 and 2
-            (2, 2), 3 (2, 3), 4 (3, 4), 5 and above (4, 6); its surface is that of the frames, of degree q.
+        vertices
+            (N, n) tensor or array, length ℓ.
+        faces
+            (F, 3) indices. Any triangle mesh: several components, non-manifold edges, zero-area triangles. Also (F, 2)
+            polylines and (F, 4) tetrahedra, for manifolds of dimension 1 and 3 in Rⁿ.
+        boundary
+            (N,) mask of the part of the boundary where the condition holds; the rest has none. By default, or for
+            "detect", all the boundary that the faces have, if any.
+        order, normal_order, projection, weights, num_neighbors, condition, weak_form, certify, progress
+            As for `from_points`. The order chooses the weak pair, too (degree of elements, of fits of functions): 1 and
+            2 (2, 2), 3 (2, 3), 4 (3, 4), 5 and above (4, 6); its surface is that of the frames, of degree q.
 
         Raises
         ------
-        InputError : for bad input, such as vertices that belong to no face.
+        InputError
+            For bad input, such as vertices that belong to no face.
         """
         options = Options(
             order, normal_order, projection, weights, num_neighbors, condition, weak_form, certify
@@ -180,7 +195,10 @@ class LaplaceBeltrami(StencilFace, WeakFace):
 
         Parameters
         ----------
-        vertices : (N, 3), ℓ.  faces : (F, 3) indices.
+        vertices
+            (N, 3), ℓ.
+        faces
+            (F, 3) indices.
 
         Its gradient is the first-order fit to the vertices around each point, and ∂_ν f = 0 at a boundary.
         Long triangles along a boundary tie its vertices to lines: a warning says so, and `from_mesh` is right there.
@@ -247,7 +265,8 @@ class LaplaceBeltrami(StencilFace, WeakFace):
 
         Parameters
         ----------
-        points : (N, n), ℓ, in the order of those that the operator was built from.
+        points
+            (N, n), ℓ, in the order of those that the operator was built from.
 
         Raises InputError for another shape, where there is no `plan`, and with a certificate.
 
@@ -275,8 +294,10 @@ class LaplaceBeltrami(StencilFace, WeakFace):
 
         Parameters
         ----------
-        name : "stiffness", "mass", "boundary_mass", as `to_scipy` has them; "laplacian" is ``lb(f)``.
-        f : (N,), (N, C) or (B, N, C), of any type.
+        name
+            "stiffness", "mass", "boundary_mass", as `to_scipy` has them; "laplacian" is ``lb(f)``.
+        f
+            (N,), (N, C) or (B, N, C), of any type.
 
         Raises InputError for another name or shape, and where there is no such matrix.
         """

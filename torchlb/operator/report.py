@@ -20,20 +20,34 @@ class StencilReport:
 
     Attributes
     ----------
-    requested_order : p asked for.
-    dim : d of the manifold.
-    order : (N,), order of accuracy reached; 0 for a low-order row.
-    normal_order : (N,), degree q behind the tangent frame; 0 where it stayed the initial one.
-    num_neighbors : (N,), points of the stencil, itself included.
-    growth : (N,), ρ² Σ|w|: the factor of the a-priori error bound.
-    condition : (N,), of the scaled weighted Vandermonde matrix; NaN in a low-order row.
-    off_diagonal_ratio : (N,), Σ_{j≠i}|w_ij| / |w_ii|; 1 for an M-matrix row.
-    rule : (N,), place of the rule for the weights in `WEIGHT_RULES`; their number for a low-order row.
-    reason : (N,), why the row is below the requested order, a `Reason`.
-    fit_degree : (N,), degree of the surface of the weak pair; 0 where it is left flat.
-    fit_reason : (N,), why that is not higher, a place in `REASONS`.
-    edges, curved_edges : (N,), number of edges at each vertex, and of those that are curved; zero without a weak pair.
-    surface : what was found of the surface through a cloud; None on a mesh.
+    requested_order
+        p asked for.
+    dim
+        d of the manifold.
+    order
+        (N,), order of accuracy reached; 0 for a low-order row.
+    normal_order
+        (N,), degree q behind the tangent frame; 0 where it stayed the initial one.
+    num_neighbors
+        (N,), points of the stencil, itself included.
+    growth
+        (N,), ρ² Σ|w|: the factor of the a-priori error bound.
+    condition
+        (N,), of the scaled weighted Vandermonde matrix; NaN in a low-order row.
+    off_diagonal_ratio
+        (N,), Σ_{j≠i}|w_ij| / |w_ii|; 1 for an M-matrix row.
+    rule
+        (N,), place of the rule for the weights in `WEIGHT_RULES`; their number for a low-order row.
+    reason
+        (N,), why the row is below the requested order, a `Reason`.
+    fit_degree
+        (N,), degree of the surface of the weak pair; 0 where it is left flat.
+    fit_reason
+        (N,), why that is not higher, a place in `REASONS`.
+    edges, curved_edges
+        (N,), number of edges at each vertex, and of those that are curved; zero without a weak pair.
+    surface
+        What was found of the surface through a cloud; None on a mesh.
     """
 
     requested_order: int

@@ -83,7 +83,8 @@ class WeakFace(OperatorStorage):
 
         Parameters
         ----------
-        name : "laplacian" is Δ, 1/ℓ², negative semidefinite like `igl.cotmatrix`, but strong: no mass in it. The others
+        name
+            "laplacian" is Δ, 1/ℓ², negative semidefinite like `igl.cotmatrix`, but strong: no mass in it. The others
             are `stiffness`, `mass_matrix` and `boundary_mass`, which raise InputError where there are none.
 
         Weak matrices with the signs and masses of other libraries: `torchlb.interop.conventions`.
@@ -101,16 +102,20 @@ class WeakFace(OperatorStorage):
 
         Parameters
         ----------
-        k : number of pairs, the constants among them.
-        tolerance : bound on the estimated relative errors of the eigenvalues of a weak pair as against those of its
-            matrices, which the basis has as `relative_errors`. By default 1.5e-8 k², at order
-            4 1e-9, above 1e-11.
-        store : whether `state_dict` holds the basis from now on; it then loads into any operator.
+        k
+            Number of pairs, the constants among them.
+        tolerance
+            Bound on the estimated relative errors of the eigenvalues of a weak pair as against those of its matrices,
+            which the basis has as `relative_errors`. By default 1.5e-8 k², at order 4 1e-9, above 1e-11.
+        store
+            Whether `state_dict` holds the basis from now on; it then loads into any operator.
 
         Raises
         ------
-        EigenbasisError : where the solver does not converge.
-        InputError : without a weak pair.
+        EigenbasisError
+            Where the solver does not converge.
+        InputError
+            Without a weak pair.
         """
         return self.invariant_basis(k, tolerance=tolerance, store=store).truncate(k)
 

@@ -53,7 +53,8 @@ def conducting(lb: LaplaceBeltrami, conductivity: Tensor) -> Conducting:
 
     Raises
     ------
-    InputError : for another shape, values that are not positive, and operators that are without elements.
+    InputError
+        For another shape, values that are not positive, and operators that are without elements.
     """
     check_tensor(conductivity, "conductivity")
     forms = forms_of(lb)

@@ -41,13 +41,16 @@ def geodesic_distance(
 
     Parameters
     ----------
-    lb : operator of one shape or of a batch. Edges and triangles are those of its mesh, or of the surface through a
+    lb
+        Operator of one shape or of a batch. Edges and triangles are those of its mesh, or of the surface through a
         cloud; where there is none, edges are those of its stencils.
-    sources : number of a point, numbers of several, or a mask (N,).
+    sources
+        Number of a point, numbers of several, or a mask (N,).
 
     Raises
     ------
-    InputError : for no sources, or numbers out of range.
+    InputError
+        For no sources, or numbers out of range.
 
     Examples
     --------

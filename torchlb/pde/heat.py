@@ -44,18 +44,25 @@ def heat_flow(
 
     Parameters
     ----------
-    lb : operator of one shape, or of a batch.
-    f : (N,), (N, C) or (B, N, C).
-    t : time ≥ 0 in ℓ², one for all channels or (C,). (In a time t a peak spreads to a width of √(2t).)
-    method : "rational", which is exact to the tolerance, "deflated" or "spectral".
-    k : number of eigenpairs, for the last two.
-    tolerance : of the error in the norm of M, relative to |f|. Values that are smaller than that everywhere around,
-        as far away from a heated point, are noise: logarithms and directions of them (geodesics) need an implicit step.
+    lb
+        Operator of one shape, or of a batch.
+    f
+        (N,), (N, C) or (B, N, C).
+    t
+        Time ≥ 0 in ℓ², one for all channels or (C,). (In a time t a peak spreads to a width of √(2t).).
+    method
+        "rational", which is exact to the tolerance, "deflated" or "spectral".
+    k
+        Number of eigenpairs, for the last two.
+    tolerance
+        Of the error in the norm of M, relative to |f|. Values that are smaller than that everywhere around, as far away
+        from a heated point, are noise: logarithms and directions of them (geodesics) need an implicit step.
 
     Raises
     ------
-    InputError : for times that are negative or not finite, for an unknown method and a wrong shape, a tolerance that
-        is not between 0 and 1, an operator without a weak pair.
+    InputError
+        For times that are negative or not finite, for an unknown method and a wrong shape, a tolerance that is not
+        between 0 and 1, an operator without a weak pair.
 
     Examples
     --------

@@ -40,26 +40,26 @@ def implicit_step(
 
     Parameters
     ----------
-    lb : operator of one shape, or of a batch.
-    f : (N,), (N, C) or (B, N, C).
-    t : time ≥ 0 in ℓ², one for all channels or (C,).
-    boundary_values : u at the points of a Dirichlet condition, a number or of the shape of f, of which only those
-        points count; 0 by default.
-    flux : κ∂_ν u along the rest of the boundary, κ∂_ν u + a u with `Robin`, units of f by 1/ℓ, in the same way; 0 by
+    lb, f
+        Operator of one shape, or of a batch, and (N,), (N, C) or (B, N, C).
+    t
+        Time ≥ 0 in ℓ², one for all channels or (C,).
+    boundary_values
+        u at the points of a Dirichlet condition, a number or of the shape of f, of which only those points count; 0 by
+        default.
+    flux
+        κ∂_ν u along the rest of the boundary, κ∂_ν u + a u with `Robin`, units of f by 1/ℓ, in the same way; 0 by
         default. Beside that rest it counts at the next few held points, too, as the curve between points does: continue
         it smoothly to them.
-    conductivity : κ > 0 of u − t div(κ∇u) = f, of the vertices (N,), its logarithm prolonged as the surface is, or of
-        the faces (F,), if they are not as many; 1 by default. Of one shape; differentiable in it, too.
-    tolerance : of the solver, relative.
+    conductivity
+        κ > 0 of u − t div(κ∇u) = f, of the vertices (N,), its logarithm prolonged as the surface is, or of the faces
+        (F,), if they are not as many; 1 by default. Of one shape; differentiable in it, too.
+    tolerance
+        Of the solver, relative.
 
-    Raises
-    ------
-    InputError : for wrong shapes, times that are negative or not finite, data for a boundary that is not there, a
-        tolerance that is not between 0 and 1.
-    DiffusionError : where the solver does not converge.
+    Raises InputError for wrong shapes, times that are negative or not finite, data for a boundary that is not there, a
+    tolerance that is not between 0 and 1; DiffusionError where the solver does not converge.
 
-    Examples
-    --------
     >>> from torchlb.surfaces import Sphere
     >>> vertices, faces = Sphere().mesh(300)
     >>> lb = LaplaceBeltrami.from_mesh(vertices, faces)
@@ -136,9 +136,12 @@ def potential(
 
     Parameters
     ----------
-    field : (N, d, C) or (B, N, d, C), as `lb.local_gradient` gives it, units of u by 1/ℓ; None for none.
-    source : (N, C) or (B, N, C), units of u by 1/ℓ²; its mean is taken off.
-    tolerance : of the solve with the weak pair, relative; None for that of linear elements, which is second order.
+    field
+        (N, d, C) or (B, N, d, C), as `lb.local_gradient` gives it, units of u by 1/ℓ; None for none.
+    source
+        (N, C) or (B, N, C), units of u by 1/ℓ²; its mean is taken off.
+    tolerance
+        Of the solve with the weak pair, relative; None for that of linear elements, which is second order.
     """
     check_tolerance(tolerance)
     products = []

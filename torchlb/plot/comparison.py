@@ -78,11 +78,16 @@ def draw_comparison(
 
     Parameters
     ----------
-    lb : operator; of points in more than three dimensions the spectra alone are drawn.
-    faces : (F, 3), or None for a cloud.
-    values : of `spectra`.
-    path, title : of the picture.
-    view : elevations and azimuths, degrees.
+    lb
+        Operator; of points in more than three dimensions the spectra alone are drawn.
+    faces
+        (F, 3), or None for a cloud.
+    values
+        Of `spectra`.
+    path, title
+        Of the picture.
+    view
+        Elevations and azimuths, degrees.
 
     Raises ImportError without matplotlib, OSError where the file cannot be written.
     """

@@ -63,19 +63,30 @@ def plot_surface(
 
     Parameters
     ----------
-    vertices : (N, 3) tensor or array.
-    faces : (F, 3) indices.
-    values : (N,); a triangle has the mean of its corners. Grey where not finite.
-    ax : matplotlib axes; new ones by default.
-    title : above the axes.
-    cmap : matplotlib's name; by default "RdBu_r" around zero, "viridis" otherwise, which the colour-blind can read.
-    symmetric : whether zero is in the middle of the colours; by default if the values have both signs. The colours
-        span the values but for the outer 1 % at either end, which a pointed end of the bar stands for.
-    limits : least and greatest value that the colours tell apart, instead of those.
-    levels : values at which isolines are drawn.
-    view : elevation and azimuth of the eye, degrees; several are drawn below one another. A shape in the plane z = 0
-        is seen from above.
-    label : of the colour bar, such as the unit.
+    vertices
+        (N, 3) tensor or array.
+    faces
+        (F, 3) indices.
+    values
+        (N,); a triangle has the mean of its corners. Grey where not finite.
+    ax
+        Matplotlib axes; new ones by default.
+    title
+        Above the axes.
+    cmap
+        matplotlib's name; by default "RdBu_r" around zero, "viridis" otherwise, which the colour-blind can read.
+    symmetric
+        Whether zero is in the middle of the colours; by default if the values have both signs. The colours span the
+        values but for the outer 1 % at either end, which a pointed end of the bar stands for.
+    limits
+        Least and greatest value that the colours tell apart, instead of those.
+    levels
+        Values at which isolines are drawn.
+    view
+        Elevation and azimuth of the eye, degrees; several are drawn below one another. A shape in the plane z = 0 is
+        seen from above.
+    label
+        Of the colour bar, such as the unit.
 
     Returns the axes. Raises ValueError for values or faces that do not fit the vertices.
     """
@@ -105,10 +116,14 @@ def plot_points(
 
     Parameters
     ----------
-    points : (N, 2) or (N, 3) tensor or array.
-    values : (N,).
-    size : area of a disk, in square points (1/72 inch); by default smaller the more there are.
-    ax, title, cmap, symmetric, limits, view, label : as for `plot_surface`.
+    points
+        (N, 2) or (N, 3) tensor or array.
+    values
+        (N,).
+    size
+        Area of a disk, in square points (1/72 inch); by default smaller the more there are.
+    ax, title, cmap, symmetric, limits, view, label
+        As for `plot_surface`.
 
     Returns the axes. Raises ValueError for points of another dimension, or values that do not fit them.
     """
@@ -142,12 +157,18 @@ def plot_vectors(
 
     Parameters
     ----------
-    vertices : (N, 3); also (N, 2) for a cloud.
-    faces : (F, 3), or None for a cloud.
-    vectors : (N, 3), or (N, 2) in the plane. None is drawn where one is zero or not finite.
-    values : (N,), a scalar beneath black arrows. Without it the arrows are coloured, by their lengths.
-    count : number of arrows, on all sides of the shape.
-    ax, title, cmap, symmetric, limits, view, label : as for `plot_surface`.
+    vertices
+        (N, 3); also (N, 2) for a cloud.
+    faces
+        (F, 3), or None for a cloud.
+    vectors
+        (N, 3), or (N, 2) in the plane. None is drawn where one is zero or not finite.
+    values
+        (N,), a scalar beneath black arrows. Without it the arrows are coloured, by their lengths.
+    count
+        Number of arrows, on all sides of the shape.
+    ax, title, cmap, symmetric, limits, view, label
+        As for `plot_surface`.
 
     Returns the axes. Raises ValueError for vectors, values or faces that do not fit the vertices.
     """
@@ -180,10 +201,14 @@ def plot_orders(
 
     Parameters
     ----------
-    vertices : (N, 3); also (N, 2) for a cloud.
-    faces : (F, 3), or None for a cloud. A triangle takes the lowest order of its corners.
-    order : (N,), 0 for a low-order row. Darker is higher.
-    ax, title, view : as for `plot_surface`.
+    vertices
+        (N, 3); also (N, 2) for a cloud.
+    faces
+        (F, 3), or None for a cloud. A triangle takes the lowest order of its corners.
+    order
+        (N,), 0 for a low-order row. Darker is higher.
+    ax, title, view
+        As for `plot_surface`.
 
     Returns the axes. Raises ValueError for orders or faces that do not fit the vertices.
     """
@@ -232,11 +257,16 @@ def plot_convergence(
 
     Parameters
     ----------
-    sizes : numbers of points N, ascending.
-    errors : for each method its errors at these sizes; zeros and NaN are left out.
-    dim : d of the manifold. The measured order is the slope against h over the three finest sizes.
-    ax, title : as for `plot_surface`.
-    ylabel : of the vertical axis.
+    sizes
+        Numbers of points N, ascending.
+    errors
+        For each method its errors at these sizes; zeros and NaN are left out.
+    dim
+        d of the manifold. The measured order is the slope against h over the three finest sizes.
+    ax, title
+        As for `plot_surface`.
+    ylabel
+        Of the vertical axis.
 
     Returns the axes. Raises ValueError for no errors that are positive, or another number of them than of sizes.
     """

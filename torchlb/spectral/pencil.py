@@ -82,22 +82,22 @@ def pencil_eigenbasis(
 
     Parameters
     ----------
-    stiffness, mass_matrix : K, positive semidefinite, and M, positive definite, (N, N).
-    mass : diagonal mass, stored with the basis.
-    dim : d, from which the unit of a length follows: K is in ℓ^{d−2}, M in ℓ^d.
-    linear : K₁ and M₁ of the same points, spectrally close, with fewer entries. None if (K, M) are that themselves:
-        the eigenvalues are then exact to 1e-12 or so.
-    fixed : points where functions vanish (Dirichlet).
-    losing : these, and points where K1 > 0 (Robin); on components without K1 = 0. By default the same.
-    tolerance : bound on the estimated relative error of every eigenvalue, 1.5e-8 k² by default; those closer than that
-        are not separated.
+    stiffness, mass_matrix, mass
+        K, positive semidefinite, M, positive definite, (N, N), and the diagonal mass, stored with the basis.
+    dim
+        d, from which the unit of a length follows: K is in ℓ^{d−2}, M in ℓ^d.
+    linear
+        K₁ and M₁ of the same points, spectrally close, with fewer entries. None if (K, M) are that themselves.
+    fixed
+        Points where functions vanish (Dirichlet).
+    losing
+        These, and points where K1 > 0 (Robin); on components without K1 = 0. By default the same.
+    tolerance
+        Bound on the estimated relative error of every eigenvalue, 1.5e-8 k² by default; those closer than that are not
+        separated.
 
-    Raises
-    ------
-    EigenbasisError : where that is not reached, K has a negative eigenvalue, or M a diagonal that is not positive.
+    Raises EigenbasisError where that is not reached, K has a negative eigenvalue, or M a diagonal that is not positive.
 
-    Examples
-    --------
     >>> path = sparse.csr_array([[1.0, -1.0], [-1.0, 1.0]])
     >>> pencil_eigenbasis(path, sparse.eye_array(2).tocsr(), torch.ones(2), 2).eigenvalues
     tensor([0., 2.], dtype=torch.float64)

@@ -65,9 +65,12 @@ def heat_kernel_signature(
 
     Parameters
     ----------
-    lb : operator of one shape or of a batch.
-    times : ℓ². By default `count` of them, from 4 ln 10/λ_k to 4 ln 10/λ_1 of each shape, equally spaced in log t.
-    k : number of eigenpairs.
+    lb
+        Operator of one shape or of a batch.
+    times
+        ℓ². By default `count` of them, from 4 ln 10/λ_k to 4 ln 10/λ_1 of each shape, equally spaced in log t.
+    k
+        Number of eigenpairs.
 
     Examples
     --------
@@ -102,9 +105,11 @@ def wave_kernel_signature(
 
     Parameters
     ----------
-    energies : e, logarithms of eigenvalues in 1/ℓ². By default `count`, equally spaced from ln λ_1 + 2σ to
-        ln λ_k − 2σ of each shape, where σ is `width` times their spacing in the original: (ln λ_k − ln λ_1)/100.
-    width : of the Gaussians, in such hundredths.
+    energies
+        e, logarithms of eigenvalues in 1/ℓ². By default `count`, equally spaced from ln λ_1 + 2σ to ln λ_k − 2σ of each
+        shape, where σ is `width` times their spacing in the original: (ln λ_k − ln λ_1)/100.
+    width
+        Of the Gaussians, in such hundredths.
     """
     basis = lb.eigenbasis(k)
     values = basis.eigenvalues
@@ -136,7 +141,8 @@ def spectral_wavelets(
 
     Parameters
     ----------
-    scales : s, ℓ²; a band sits at the eigenvalue 1/s.
+    scales
+        s, ℓ²; a band sits at the eigenvalue 1/s.
     """
     if isinstance(f, Tensor) and f.ndim == 1:
         return spectral_wavelets(lb, f[:, None], scales, k=k)[..., 0]

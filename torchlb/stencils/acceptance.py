@@ -36,9 +36,12 @@ class Acceptance:
 
     Attributes
     ----------
-    dim : d.
-    on_mesh : whether low-order rows know the surface better than a fit that misses heights.
-    projection : of the coordinates.
+    dim
+        d.
+    on_mesh
+        Whether low-order rows know the surface better than a fit that misses heights.
+    projection
+        Of the coordinates.
     """
 
     dim: int

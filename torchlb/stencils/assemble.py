@@ -52,10 +52,14 @@ class Stencils:
 
     Parameters
     ----------
-    shape : points, frames, neighbourhoods, boundary and low-order rows.
-    order : p ≥ 1 of the first candidates.
-    projection, weights : keys of `PROJECTIONS` and `WEIGHT_RULES`.
-    num_neighbors : K of every candidate, instead of `SIZE_FACTORS`.
+    shape
+        Points, frames, neighbourhoods, boundary and low-order rows.
+    order
+        p ≥ 1 of the first candidates.
+    projection, weights
+        Keys of `PROJECTIONS` and `WEIGHT_RULES`.
+    num_neighbors
+        K of every candidate, instead of `SIZE_FACTORS`.
     """
 
     def __init__(

@@ -47,18 +47,30 @@ class Rows:
 
     Attributes
     ----------
-    length : (B,), entries of each row.
-    col : (nnz,), points, ascending within a row.
-    laplacian : (nnz,), 1/ℓ².
-    gradient : (nnz, d), 1/ℓ, in the frame of the row's point.
-    candidate : (B,), place in the list of candidates; their number for a low-order row.
-    rule : (B,), place in `WEIGHT_RULES` of the rule for its weights; their number for a low-order row.
-    order : (B,), order of accuracy p; 0 for a low-order row.
-    growth : (B,), ρ² Σ|w|, the factor of the a-priori error bound.
-    condition : (B,), of the scaled weighted Vandermonde matrix.
-    off_diagonal_ratio : (B,), Σ_{j≠i}|w_ij| / |w_ii|; 1 for an M-matrix row.
-    slope : (B,), degree of the fit of the gradient where that is another one, else 0.
-    reason : (B,), a `Reason`.
+    length
+        (B,), entries of each row.
+    col
+        (nnz,), points, ascending within a row.
+    laplacian
+        (nnz,), 1/ℓ².
+    gradient
+        (nnz, d), 1/ℓ, in the frame of the row's point.
+    candidate
+        (B,), place in the list of candidates; their number for a low-order row.
+    rule
+        (B,), place in `WEIGHT_RULES` of the rule for its weights; their number for a low-order row.
+    order
+        (B,), order of accuracy p; 0 for a low-order row.
+    growth
+        (B,), ρ² Σ|w|, the factor of the a-priori error bound.
+    condition
+        (B,), of the scaled weighted Vandermonde matrix.
+    off_diagonal_ratio
+        (B,), Σ_{j≠i}|w_ij| / |w_ii|; 1 for an M-matrix row.
+    slope
+        (B,), degree of the fit of the gradient where that is another one, else 0.
+    reason
+        (B,), a `Reason`.
     """
 
     length: Int[Tensor, " B"]

@@ -21,17 +21,22 @@ def limit_surface(
 
     Parameters
     ----------
-    vertices, faces : the control mesh; closed, two triangles at every edge.
-    levels : how often it is subdivided.
+    vertices, faces
+        The control mesh; closed, two triangles at every edge.
+    levels
+        How often it is subdivided.
 
     Returns
     -------
-    points : (P, 3), those of the finest level; those of every coarser level come first.
-    faces : of the levels 0 to `levels`; `points[: faces[i].max() + 1]` are the vertices of level i.
+    points
+        (P, 3), those of the finest level; those of every coarser level come first.
+    faces
+        Of the levels 0 to `levels`; `points[: faces[i].max() + 1]` are the vertices of level i.
 
     Raises
     ------
-    InputError : for meshes that are not closed.
+    InputError
+        For meshes that are not closed.
 
     References
     ----------
