@@ -171,7 +171,7 @@ def messages(calls):
                 and node.args
                 and re.search(calls, ast.unparse(node.func))
             ):
-                found[f"{path.name}:{node.lineno}"] = text_of(node.args[0], named)
+                found[f"{path.relative_to(source)}:{node.lineno}"] = text_of(node.args[0], named)
     return found
 
 
