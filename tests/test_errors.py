@@ -205,14 +205,14 @@ def test_near_duplicates_are_told_and_the_remedy_brings_the_cloud_back(cloud, ki
     doubled = _twice(points, kind)
     neighbors = nearest_neighbors(doubled, 24)
     with pytest.warns(UserWarning, match="far closer to another than to those around") as told:
-        warn_of_near_duplicates(doubled, neighbors)
+        warn_of_near_duplicates(doubled, neighbors, 2)
     tolerance = float(re.findall(r"clean_points\(points, (.*)\)", str(told[0].message))[0])
     merged, kept = clean_points(doubled, tolerance)
     assert abs(len(merged) - 1000) <= 10  # at random, some of the thousand are as close
     torch.testing.assert_close(merged, doubled[kept])
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        warn_of_near_duplicates(merged, nearest_neighbors(merged, 24))
+        warn_of_near_duplicates(merged, nearest_neighbors(merged, 24), 2)
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -225,7 +225,7 @@ def test_points_that_chance_brings_together_are_no_near_duplicates(seed):
     warnings.simplefilter("error")
     noisy = points[:3000] + 0.03 * torch.from_numpy(generator.standard_normal((3000, 3)))
     for cloud in (points[:3000], uneven, noisy, points[:40]):
-        warn_of_near_duplicates(cloud, nearest_neighbors(cloud, min(24, len(cloud))))
+        warn_of_near_duplicates(cloud, nearest_neighbors(cloud, min(24, len(cloud))), 2)
 
 
 def test_a_cloud_scanned_twice_in_part_is_told():

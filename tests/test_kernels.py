@@ -12,11 +12,10 @@ from scipy import sparse
 from torchlb.cloud.cocone import FOLD, best_manifold, wings
 from torchlb.fits.least_squares import left_inverse
 from torchlb.fits.weights import scaled_system
-from torchlb.galerkin import pair
-from torchlb.galerkin.pair import stored, upper_product
+from torchlb.galerkin import forms
+from torchlb.galerkin.pair import stored
 from torchlb.geometry.admission import MAX_SLOPE, MIN_ALIGNMENT, admissible, normal_frames
 from torchlb.geometry.complex import components, edges_of, spanning_pairs, tree_sides
-from torchlb.geometry.numbering import Numbering
 from torchlb.linalg import kernels
 
 
@@ -66,8 +65,8 @@ def test_left_inverses_are_as_accurate_as_their_condition_allows(degree):
         assert error < torch.finfo(torch.float64).eps * 2 * bound
 
 
-def test_upper_products_are_triangles_of_products(monkeypatch):
-    """With few entries at a time, zeros that cancel, and columns that do not ascend."""
+def test_products_some_rows_at_a_time_are_those_of_the_whole(monkeypatch):
+    """PᵀAP, with zeros that cancel and columns that do not ascend."""
     generator = np.random.default_rng(0)
     p = sparse.csr_array(sparse.random_array((400, 90), density=0.05, rng=generator))
     matrix = sparse.random_array((400, 400), density=0.02, rng=generator)
@@ -75,28 +74,25 @@ def test_upper_products_are_triangles_of_products(monkeypatch):
     matrix.data[::5] = 0.0
     shuffled = p[:, ::-1]
     shuffled.indices = 89 - shuffled.indices
-    monkeypatch.setattr(pair, "ROWS", 40)
-    found = upper_product(shuffled.copy(), matrix)
-    expected = sparse.triu(p.T @ matrix @ p)
+    monkeypatch.setattr(forms, "ROWS", 40)
+    found, expected = forms.congruence(shuffled.copy(), matrix), p.T @ matrix @ p
     assert abs(found - expected).max() < 1e-14 * abs(expected).max()
 
 
 @pytest.mark.parametrize("count", [1, 200])
-def test_mirrored_matrices_are_symmetric(count):
-    """Symmetric, rows of K sum to zero, in whatever order points are numbered."""
+def test_stored_matrices_are_symmetric(count):
+    """Exactly, and rows of K sum to zero; M is the mean of the matrix and its transpose, columns in any order."""
     generator = np.random.default_rng(count)
     parts = [sparse.random_array((count, count), density=0.1, rng=generator) for _ in range(2)]
-    upper = sparse.triu(parts[0] + 1j * parts[1]) + (1 + 1j) * sparse.eye_array(count)
-    numbering = Numbering.along_tree(torch.rand(count, 3, dtype=torch.float64))
-    for given in (None, numbering):
-        one = stored(upper, None, given)
-        shape = (count, count)
-        k, m = (sparse.csr_array((v, one.col, one.crow), shape).toarray() for v in one.values)
-        assert np.array_equal(k, k.T)
-        assert np.abs(k.sum(1)).max() < 1e-14 * max(np.abs(k).max(), 1)
-        whole = (upper + upper.T).imag.toarray() / (1 + np.eye(count))
-        place = np.arange(count) if given is None else given.here.numpy()
-        assert np.array_equal(m, whole[np.ix_(place, place)])
+    matrix = sparse.csr_array(parts[0] + 1j * parts[1])
+    matrix = sparse.csr_array(matrix + matrix.T + (1 + 1j) * sparse.eye_array(count))
+    matrix.data *= 1 + 1e-15 * generator.standard_normal(len(matrix.data))
+    one = stored(matrix[:, ::-1][:, ::-1])
+    k, m = (sparse.csr_array((v, one.col, one.crow), 2 * (count,)).toarray() for v in one.values)
+    assert np.array_equal(k, k.T)
+    assert np.array_equal(m, m.T)
+    assert np.abs(k.sum(1)).max() < 1e-14 * max(np.abs(k).max(), 1)
+    np.testing.assert_allclose(m, matrix.imag.toarray(), rtol=1e-14, atol=1e-15)
 
 
 def one_by_one(points, faces):

@@ -267,7 +267,7 @@ def test_factors_take_over_where_sweeps_stall(monkeypatch):
     torch.testing.assert_close(found.eigenvalues, expected, rtol=1e-9, atol=1e-9)
     gram = found.eigenvectors.T @ (fresh.mass_matrix @ found.eigenvectors)
     torch.testing.assert_close(gram, torch.eye(len(gram), dtype=gram.dtype), rtol=0, atol=1e-8)
-    monkeypatch.setattr(pencil, "prefers_krylov", lambda size: True)
+    monkeypatch.setattr(pencil, "LARGEST_FACTORED", 800)
     with pytest.raises(EigenbasisError, match="ask for a larger tolerance"):
         LaplaceBeltrami.from_mesh(*Ellipsoid().mesh(900)).eigenbasis(10, tolerance=1e-10)
 
