@@ -29,7 +29,7 @@ from torchlb.geometry.local_fits import FitPlan, LocalFits
 from torchlb.geometry.numbering import Numbering
 from torchlb.linalg.once import once_differentiable
 
-ROWS = 2**17
+ROWS = 2**15
 """Rows of a product at a time, so that not all of AP is held."""
 
 

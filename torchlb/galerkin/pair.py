@@ -159,8 +159,10 @@ def assembled_pair(
     p, weights = forms.prolongation, _row_sums(elements)
     mass, lowered = positive_mass(p, weights, plan, _row_sums(near) - flat)
     rim = boundary_mass(points, plan.curving, mesh, p)
+    linear = stored(near)
+    del near
     pair = stored(congruence(p, elements) + forms.flat(), rim)
-    return WeakPair(pair, stored(near), torch.from_numpy(mass + flat)), lowered
+    return WeakPair(pair, linear, torch.from_numpy(mass + flat)), lowered
 
 
 def positive_mass(
@@ -222,15 +224,19 @@ def stored(matrix: Any, rim: Any = None) -> SparsePair:
     matrix.sort_indices()
     other: Any = sparse.csr_array(matrix.T)
     count, crow, col = matrix.shape[0], matrix.indptr.astype(np.int64), matrix.indices
-    data = (matrix.data + other.data) / 2
-    row = np.arange(count, dtype=col.dtype).repeat(np.diff(crow))
+    data = other.data
+    data += matrix.data
+    data /= 2
+    del matrix, other  # the largest of a build
     values = np.stack([data.real, data.imag])
+    del data
+    row = np.arange(count, dtype=col.dtype).repeat(np.diff(crow))
     values[0, row == col] -= np.add.reduceat(values[0], crow[:-1])
-    parts = [torch.from_numpy(values)]
+    found = torch.from_numpy(values)
     if rim is not None:
         line: Any = sparse.coo_array((rim + rim.T) / 2)
         extra = np.zeros_like(values[:1])
         wanted = line.coords[0].astype(np.int64) * count + line.coords[1]
         extra[0, np.searchsorted(row.astype(np.int64) * count + col, wanted)] = line.data
-        parts.append(torch.from_numpy(extra))
-    return SparsePair(torch.from_numpy(crow), torch.from_numpy(col).long(), torch.cat(parts))
+        found = torch.cat([found, torch.from_numpy(extra)])
+    return SparsePair(torch.from_numpy(crow), torch.from_numpy(col).long(), found)
