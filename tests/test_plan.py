@@ -10,6 +10,7 @@ import torch
 from scipy.spatial import Delaunay
 
 from torchlb import LaplaceBeltrami, implicit_step
+from torchlb.cloud import reconstruct
 from torchlb.errors import InputError
 from torchlb.operator.plan import evaluate
 from torchlb.surfaces import (
@@ -197,3 +198,56 @@ def test_a_noisy_curve_has_no_plan_of_its_noise():
     lb = LaplaceBeltrami.from_points(circle + 4e-3 * noise)
     with pytest.raises(InputError, match="put elsewhere"):
         lb.at(lb.points)
+
+
+def own_cells(points):
+    """What a user's function may find."""
+    noise = torch.randn(points.shape, generator=torch.Generator().manual_seed(0)).double()
+    return reconstruct(points + 0.02 * noise)
+
+
+def noisy_circle():
+    angle = 2 * math.pi * torch.arange(200, dtype=torch.float64) / 200
+    noise = torch.randn(200, 2, generator=torch.Generator().manual_seed(0)).double()
+    return torch.stack([angle.cos(), angle.sin()], 1) + 0.005 * noise
+
+
+@pytest.mark.filterwarnings("ignore:points")
+@pytest.mark.parametrize(
+    ("points", "options"),
+    [
+        (Sphere().points(300), {"reconstruct": own_cells}),
+        (Torus().random_points(1500), {"normals": Torus().random_points(1500)}),
+        (noisy_circle(), {"dim": 1}),
+    ],
+    ids=["reconstruct", "normals", "noise"],
+)
+def test_a_copy_that_would_decide_otherwise_says_so(points, options):
+    """What it had beside the points is not known any more: an error, and no other shape in silence."""
+    lb = LaplaceBeltrami.from_points(points, **options)
+    with pytest.raises(InputError, match="decided anew"):
+        copy.deepcopy(lb).at(lb.points)
+
+
+@pytest.mark.parametrize(
+    "points", [Sphere().points(300), Torus().random_points(1500), CliffordTorus().points(400)]
+)
+def test_a_copy_of_a_cloud_has_the_same_cells(points):
+    lb = LaplaceBeltrami.from_points(points, dim=2)
+    f, kappa = lb.points[:, 0], torch.ones(len(points), dtype=torch.float64)
+    expected = implicit_step(lb, f, 0.1)
+    for other in (lb, copy.deepcopy(lb)):
+        found = implicit_step(other, f, 0.1, conductivity=kappa)
+        torch.testing.assert_close(found, expected, rtol=0, atol=1e-9)
+    assert copy.deepcopy(lb).plan.faces.equal(lb.faces)
+
+
+def test_a_copy_has_the_numbers_of_the_faces():
+    """Where rounded points find the same triangles in another order, one κ of each face is that face's still."""
+    lb = LaplaceBeltrami.from_points(Torus().random_points(2000)).float()
+    other, f = copy.deepcopy(lb), lb.points[:, 0]
+    kappa = torch.rand(len(lb.faces)).double() + 0.1
+    ours, theirs = (implicit_step(one, f, 0.1, conductivity=kappa) for one in (lb, other))
+    assert other.plan.faces.equal(lb.faces)
+    assert not torch.equal(other.plan.order, lb.plan.order)
+    torch.testing.assert_close(theirs, ours, rtol=0, atol=1e-5)

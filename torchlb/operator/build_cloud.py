@@ -7,6 +7,7 @@ from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
+import numpy as np
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
@@ -171,10 +172,28 @@ def _on_surface(
 
 
 def built_again(lb: OperatorStorage) -> AssembledOperator:
-    """The operator of a mesh or a cloud, from what is stored of it."""
+    """The operator of a mesh or a cloud, from what is stored of it.
+
+    Raises InputError where that is another one: where points of a curve were moved, or cells through a cloud came from
+    normals or a function of the user's.
+    """
     points, options = lb.points.detach().cpu().double(), Options(**lb.options)
     boundary, cells = None if lb.boundary is None else lb.boundary.cpu(), lb.faces.cpu()
     if lb.surface is None and (lb.source == "mesh" or lb.dim < 3 or lb.points.shape[1] == 3):
-        return on_cells(points, points, cells, options, boundary, lb.source, progress=False)
-    given: Any = {"normals": lb.normals.cpu() if len(lb.normals) else None, "boundary": boundary}
-    return build_cloud(points, lb.dim, options, **given, reconstruction=None, progress=False)
+        built = on_cells(points, points, cells, options, boundary, lb.source, progress=False)
+    else:
+        rest: Any = dict.fromkeys(("normals", "reconstruction"))
+        built = build_cloud(points, lb.dim, options, boundary=boundary, progress=False, **rest)
+    ours, theirs = (faces.sort(1).values.numpy() for faces in (built.faces, cells))
+    rows = [torch.from_numpy(np.lexsort(faces.T)) for faces in (ours, theirs)]
+    same = np.array_equal(ours[rows[0]], theirs[rows[1]])
+    if not same or not torch.allclose(built.mass, lb.mass.cpu().double(), atol=0):
+        raise InputError(
+            "plan: it was not kept, and what is decided anew by the points alone is not what the operator is of, where "
+            "`normals`, `reconstruct`, noise of a curve, rounding or another version had a part; build it again"
+        )
+    place = torch.empty_like(rows[0]).index_copy(
+        0, *rows
+    )  # of each face among those that the user has
+    plan = replace(built.plan, faces=cells, order=place[built.plan.order])
+    return replace(built, faces=cells, plan=plan)
