@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from torchlb.cloud.manifold import face_vectors
-from torchlb.geometry.complex import Faces, delaunay, edges_of
+from torchlb.geometry.complex import Faces, circumcenters, delaunay, edges_of
 from torchlb.geometry.vectors import TINY, inner, largest, lengths, smallest
 
 COCONE = np.sin(np.pi / 8)
@@ -144,7 +144,7 @@ class Tetrahedra:
         found = delaunay(moved)
         cells, beyond = (x.astype(np.int64) for x in (found.simplices, found.neighbors))
         del found
-        centers = _circumcenters(moved, cells)
+        centers = _bounded_centers(moved, cells)
         faces, here, there, apex = [], [], [], []
         for k in range(4):
             own = np.flatnonzero(beyond[:, k] < np.arange(len(cells)))
@@ -227,17 +227,15 @@ class Candidates:
         return best_manifold(points, self.triangles[np.argsort(~first, kind="stable")])
 
 
-def _circumcenters(points: np.ndarray, cells: Int[np.ndarray, "T 4"]) -> Float[np.ndarray, "T 3"]:
-    origin = points.take(cells[:, 0], 0)
-    u, v, w = (points.take(cells[:, k], 0) - origin for k in (1, 2, 3))
-    crosses = np.cross(v, w), np.cross(w, u), np.cross(u, v)
-    halves = (inner(x, x)[:, None] / 2 for x in (u, v, w))
-    determinant = inner(u, crosses[0])[:, None]
-    total = sum(h * c for h, c in zip(halves, crosses, strict=True))
+def _bounded_centers(points: np.ndarray, cells: Int[np.ndarray, "T 4"]) -> Float[np.ndarray, "T 3"]:
+    """Circumcentres, those of next to no volume not farther away than `FAR`."""
+    total, volume = circumcenters(points, cells)
     with np.errstate(all="ignore"):
-        center = total / determinant
+        center = total / volume[:, None]
     most = FAR * np.ptp(points, axis=0).max()
-    return origin + np.clip(np.nan_to_num(center, posinf=most, neginf=-most), -most, most)
+    return points.take(cells[:, 0], 0) + np.clip(
+        np.nan_to_num(center, posinf=most, neginf=-most), -most, most
+    )
 
 
 def _leaves_cone(

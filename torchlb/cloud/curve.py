@@ -216,18 +216,16 @@ def _cut(
     points: Float[np.ndarray, "N n"], chains: list[tuple[np.ndarray, bool]], noise: float
 ) -> tuple[list[Chain], Int[np.ndarray, " G"]]:
     """The chains without gaps; and the ends of those gaps that are hardly longer than what is none."""
-    uneven, found = [], []
-    for chain, closed in chains:
-        ends = points[np.append(chain, chain[:1])] if closed else points[chain]
-        length = lengths(np.diff(ends, axis=0))
+    turns = (np.append(chain, chain[:1]) if closed else chain for chain, closed in chains)
+    steps, uneven, found = [np.diff(points[turn], axis=0) for turn in turns], [], []
+    for step in steps:
+        length = lengths(step)
         uneven.append(np.abs(np.diff(length)) / np.maximum(length[1:] + length[:-1], TINY))
     spread = np.concatenate(uneven)
     random = min(1.0, 2 * float(np.median(spread))) if len(spread) else 0.0
     limit = GAP + random * (np.log(len(points)) + RANDOM)
     doubtful: list[int] = []
-    for chain, closed in chains:
-        ends = points[np.append(chain, chain[:1])] if closed else points[chain]
-        step = np.diff(ends, axis=0)
+    for (chain, closed), step in zip(chains, steps, strict=True):
         length = lengths(step)
         usual = _usual(length, closed) if len(length) > 1 else length
         cosine = inner(step, np.roll(step, 1, 0)) / np.maximum(length * np.roll(length, 1), TINY)

@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from torchlb.geometry.complex import Faces, components, edges_of, tree_sides
-from torchlb.geometry.vectors import inner, lengths
+from torchlb.geometry.vectors import TINY, inner, lengths
 
 CLOSED = 1000
 """A closed fan comes before an open one of up to so many triangles."""
@@ -76,7 +76,7 @@ def wound_alike(
     one, two = edges.twins
     against = edges.ends[0][one] == edges.ends[0][two]
     normals = face_vectors(points, faces)
-    normals /= np.maximum(lengths(normals), np.finfo(float).tiny)[:, None]
+    normals /= np.maximum(lengths(normals), TINY)[:, None]
     i, j, size = one // 3, two // 3, len(faces)
     bend = 1.001 - inner(normals.take(i, 0), normals.take(j, 0)) * np.where(against, -1, 1)
     order = np.argsort(bend, kind="stable")

@@ -16,9 +16,9 @@ from torch import Tensor
 
 from torchlb.cloud.complexes import Complex
 from torchlb.errors import InputError, first_few
-from torchlb.geometry.complex import components, delaunay
+from torchlb.geometry.complex import circumcenters, components, delaunay
 from torchlb.geometry.neighbors import nearest_neighbors
-from torchlb.geometry.vectors import TINY, inner, lengths
+from torchlb.geometry.vectors import TINY, lengths
 
 NEAREST = 16
 """Points by which the density around each is known."""
@@ -75,12 +75,8 @@ def _spheres(
     points: Float[np.ndarray, "N 3"], cells: Int[np.ndarray, "T 4"]
 ) -> tuple[Float[np.ndarray, " T"], Bool[np.ndarray, " T"]]:
     """Circumradii, ℓ, and which have no volume."""
-    origin = points[cells[:, 0]]
-    u, v, w = (points[cells[:, k]] - origin for k in (1, 2, 3))
-    crosses = np.cross(v, w), np.cross(w, u), np.cross(u, v)
-    six = inner(u, crosses[0])
-    total = np.sum([inner(x, x)[:, None] * c for x, c in zip((u, v, w), crosses, strict=True)], 0)
-    radius = lengths(total) / np.maximum(2 * np.abs(six), TINY)
+    center, six = circumcenters(points, cells)
+    radius = lengths(center) / np.maximum(np.abs(six), TINY)
     edges = [
         lengths(points[cells[:, i]] - points[cells[:, j]]) for i, j in combinations(range(4), 2)
     ]

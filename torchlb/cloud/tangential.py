@@ -165,10 +165,7 @@ class _Fans:
         self.points, self.frames = points, frames
         edges = edges_of(faces, len(points))
         self.uses = dict(zip(edges.keys.tolist(), edges.uses.tolist(), strict=True))
-        self.open = np.ones(len(points), dtype=bool)
-        self.open[faces.ravel()] = False
-        for end in edges.ends:
-            self.open[end[edges.rim]] = True
+        self.open = edges.outer
         self.wedges: dict[int, list[tuple[float, float]]] = {}
         for face in faces[self.open[faces].any(1)].tolist():
             self._put(face)

@@ -193,9 +193,9 @@ class OnSurface:
         still = WithoutBoundary(len(moved)).at(points)
         if not self.inside.any():
             return replace(still, displacement=moved)
-        p = prolongation(self.fits, fits, self.curving, surface)[len(places) :]
-        node, vertex = (torch.from_numpy(part.astype(np.int64)) for part in p.tocoo().coords)
+        p = prolongation(self.fits, fits, self.curving, surface)[len(places) :].tocoo()
+        node, vertex = (torch.from_numpy(part.astype(np.int64)) for part in p.coords)
         kept = self.inside[node]
-        weights = torch.from_numpy(p.tocoo().data)[kept]
+        weights = torch.from_numpy(p.data)[kept]
         entries = self.here[node[kept]], self.vertices[vertex[kept]], weights
         return BoundaryNodes(moved, self.here[self.inside], entries)

@@ -265,7 +265,8 @@ def _flattened(
     `stand` is where nodes are on flat cells and on the surface; `whole`, which triangles and cells may have theirs
     there.
     """
-    sides, lengths = nodes.lengths(points), sound_lengths(nodes.lengths(points), nodes.cells)
+    sides = nodes.lengths(points)
+    lengths = sound_lengths(sides, nodes.cells)
     plane, shape = flat_metric(lengths), simplex(nodes.dim, nodes.degree)
     area = area_element(plane)
     curved = curved.clone()

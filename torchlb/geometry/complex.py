@@ -16,6 +16,8 @@ from scipy.sparse import csgraph
 from scipy.spatial import Delaunay
 from torch import Tensor
 
+from torchlb.geometry.vectors import inner
+
 Faces = Int[np.ndarray, "_ 3"]
 
 
@@ -23,6 +25,24 @@ def delaunay(points: Float[np.ndarray, "N n"]) -> Delaunay:
     """Delaunay's simplices by Qhull, whose tolerances are lengths: around the origin, and of a size of about one."""
     centered = points - points.mean(0)
     return Delaunay(np.ldexp(centered, -np.frexp(np.abs(centered).max())[1]))
+
+
+def circumcenters(
+    points: Float[np.ndarray, "N 3"], cells: Int[np.ndarray, "T 4"]
+) -> tuple[Float[np.ndarray, "T 3"], Float[np.ndarray, " T"]]:
+    """(c, v) of tetrahedra: the circumcentre is the first corner + c/v; v is six times the volume, with a sign.
+
+    >>> corners = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]])
+    >>> [x.tolist() for x in circumcenters(corners, np.array([[0, 1, 2, 3]]))]
+    [[[0.5, 0.5, 0.5]], [1.0]]
+    """
+    origin = points.take(cells[:, 0], 0)
+    u, v, w = (points.take(cells[:, k], 0) - origin for k in (1, 2, 3))
+    crosses = np.cross(v, w), np.cross(w, u), np.cross(u, v)
+    a, b, c = (
+        inner(x, x)[:, None] / 2 * cross for x, cross in zip((u, v, w), crosses, strict=True)
+    )
+    return a + b + c, inner(u, crosses[0])
 
 
 @dataclass(frozen=True)
