@@ -148,8 +148,7 @@ class Stencils:
             entry = 8 * candidate.size * num_monomials(self.shape.frames.shape[2], candidate.degree)
             for centers in rows.split(max(64, PIECE_BYTES // entry)) if len(rows) else ():
                 places = plan.entries(centers)
-                own = plan.col[places] == centers[:, None]
-                places = places.gather(1, own.byte().argsort(dim=1, descending=True, stable=True))
+                places = places.gather(1, _own_first(plan.col[places], centers))
                 index, used = plan.col[places].long(), plan.used[places][:, 1:]
                 with_data = self._holds_boundary(index) & (self.share is not None)
                 keep, slope = None if used.all() else used, plan.slope[centers]
@@ -185,8 +184,7 @@ class Stencils:
         for degree, count in torch.stack([slope, size], 1)[slope > 0].unique(dim=0).tolist():
             local = ((slope == degree) & (size == count)).nonzero()[:, 0]
             index = plan.col[entry[torch.isin(row, local)]].long().view(-1, count)
-            own = index == centers[local, None]
-            index = index.gather(1, own.byte().argsort(dim=1, descending=True, stable=True))
+            index = index.gather(1, _own_first(index, centers[local]))
             weights = self._free_weights(centers[local], index, Candidate(degree, count, RULES[0]))
             gradient = self._tangent_vectors(centers[local], index, weights.gradient)
             found.append((local.repeat_interleave(count), index.flatten(), gradient.flatten(0, 1)))
@@ -361,3 +359,8 @@ def assemble(stencils: Stencils, *, progress: bool = True) -> Rows:
     parts = torch.arange(len(shape.points)).split(AT_ONCE)
     bar = tqdm(parts, "stencils", delay=2, disable=not progress, leave=False)
     return Rows.stack(stencils.rows(centers) for centers in bar)
+
+
+def _own_first(index: Int[Tensor, "B K"], centers: Int[Tensor, " B"]) -> Int[Tensor, "B K"]:
+    """The columns of each row in an order that begins with its own point."""
+    return (index == centers[:, None]).byte().argsort(dim=1, descending=True, stable=True)
