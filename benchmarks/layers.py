@@ -87,7 +87,7 @@ def product(lb: LaplaceBeltrami, channels: int, repeats: int, device: str) -> No
     target = torch.empty_like(source)
     steps["copy"] = lambda: target.copy_(source)
     title = f"Sparse product, forward and backward, N = {lb.num_points:,}, C = {channels}, "
-    title += f"{lb.col.numel() / lb.num_points:.0f} entries a row"
+    title += f"{lb.stencil.col.numel() / lb.num_points:.0f} entries a row"
     table(title, medians(steps, repeats, device), "torch CSR")
 
 

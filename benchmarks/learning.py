@@ -70,18 +70,17 @@ class Original:
         shifted = sparse.csc_matrix(weak + 1e-8 * sparse.identity(len(points)))
         values, vectors = eigsh(shifted, k, sparse.diags(mass), sigma=1e-8)
         self.points, self.num_points, self.mass = vertices.float(), len(points), tensor(mass)
-        self.values = self.mass  # of the type that the network computes in
         evecs = tensor(vectors)
         self.basis = Eigenbasis(
             tensor(values).clamp_min(0), evecs, self.mass, evecs * self.mass[:, None]
         )
         self.num_pairs = k
         gradients = tangent_gradients(points, None if faces is None else faces.numpy())
-        self.gradient_values = Gradients(gradients)
+        self.stencil = Gradients(gradients)
 
     def to(self, device: str) -> Original:
         """Itself, on another device."""
-        for name in ("points", "mass", "values", "gradient_values"):
+        for name in ("points", "mass", "stencil"):
             setattr(self, name, getattr(self, name).to(device))
         parts = (self.basis.eigenvalues, self.basis.eigenvectors, self.mass, self.basis.left)
         self.basis = Eigenbasis(*(part.to(device) for part in parts))
@@ -96,11 +95,8 @@ class Original:
     def has_pairs(self, k: int) -> bool:
         return k <= self.num_pairs
 
-    def _apply_rows(self, values: Tensor, x: Tensor) -> Tensor:
-        return torch.mm(values, x)
-
     def local_gradient(self, x: Tensor) -> Tensor:
-        return torch.stack([torch.mm(values, x) for values in self.gradient_values], dim=1)
+        return torch.stack([torch.mm(values, x) for values in self.stencil], dim=1)
 
 
 class Gradients(tuple[Tensor, ...]):
@@ -109,6 +105,10 @@ class Gradients(tuple[Tensor, ...]):
     def to(self, where: Any) -> Gradients:
         """The same of another type, or on another device."""
         return Gradients(matrix.to(where) for matrix in self)
+
+    def product(self, channel: int, x: Tensor, *, dtype: torch.dtype) -> Tensor:
+        """A component; the first channel of an operator's is Δ."""
+        return torch.mm(self[channel - 1].to(dtype), x)
 
 
 def tensor(array: Any) -> Tensor:

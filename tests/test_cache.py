@@ -89,7 +89,7 @@ def test_read_back_bit_for_bit(make, tmp_path):
     back = load_operator(tmp_path / "new" / "lb.npz")
     assert_same(back, lb)
     assert files_of(tmp_path / "new") == ["lb.npz"]
-    if len(lb.basis_left):
+    if len(lb.modes.left):
         assert torch.equal(back.eigenbasis(5).eigenvectors, lb.eigenbasis(5).eigenvectors)
 
 
@@ -171,7 +171,7 @@ def test_a_file_is_completed_by_eigenpairs_and_serves_fewer(tmp_path, no_buildin
     no_building()
     more = load_or_build(VERTICES, FACES, k=8, **cache)
     stored = load_operator(tmp_path / files_of(tmp_path)[0])
-    assert stored.basis_eigenvectors.shape[1] >= 8
+    assert stored.modes.eigenvectors.shape[1] >= 8
     fewer = load_or_build(VERTICES, FACES, k=5, **cache).eigenbasis(5)
     assert torch.equal(fewer.eigenvectors, more.eigenbasis(8).eigenvectors[:, :5])
     before = (tmp_path / files_of(tmp_path)[0]).stat().st_mtime_ns
@@ -294,9 +294,9 @@ import sys, torch
 from torchlb import LaplaceBeltrami, save_operator
 torch.set_num_threads(1)
 lb = LaplaceBeltrami()
-lb.crow = torch.tensor([0, 200_000])
-lb.values = torch.full((200_000,), float(sys.argv[2]))
-lb.col = torch.zeros(200_000, dtype=torch.int64)
+lb.stencil.crow = torch.tensor([0, 200_000])
+lb.stencil.values = torch.full((1, 200_000), float(sys.argv[2]))
+lb.stencil.col = torch.zeros(200_000, dtype=torch.int64)
 print("ready", flush=True)
 sys.stdin.readline()
 for _ in range(int(sys.argv[3])):
@@ -325,12 +325,12 @@ def test_two_processes_writing_one_file_leave_one_good_file(tmp_path):
     seen = set()
     while any(writer.poll() is None for writer in writers):
         if path.exists():
-            values = load_operator(path).values  # whole at every moment
+            values = load_operator(path).stencil.values  # whole at every moment
             assert len(values.unique()) == 1
-            seen.add(float(values[0]))
+            seen.add(float(values[0, 0]))
     assert [writer.wait() for writer in writers] == [0, 0]
     assert seen <= {1.0, 2.0}
-    assert len(load_operator(path).values.unique()) == 1
+    assert len(load_operator(path).stencil.values.unique()) == 1
     assert files_of(tmp_path) == ["lb.npz"]
 
 
@@ -345,7 +345,7 @@ def test_a_writer_killed_in_the_middle_leaves_the_file_as_it_was(tmp_path):
         time.sleep(0.05 * torch.rand(()).item())
         writer.send_signal(signal.SIGKILL)
         writer.wait()
-        assert len(load_operator(path).values.unique()) == 1
+        assert len(load_operator(path).stencil.values.unique()) == 1
         assert all(name == "lb.npz" or name.endswith(".tmp") for name in files_of(tmp_path))
 
 
@@ -419,7 +419,7 @@ def test_a_file_of_an_older_format_is_refused_by_name_and_built_again(tmp_path):
     lb = load_or_build(VERTICES, FACES, **arguments)
     path = tmp_path / files_of(tmp_path)[0]
     of_format_1(path)
-    message = r"written by torchlb 0\.0\.9 in format 1, and torchlb .* reads format 2; build"
+    message = r"written by torchlb 0\.0\.9 in format 1, and torchlb .* reads format 3; build"
     with pytest.raises(OperatorFileError, match=message):
         load_operator(path)
     with pytest.warns(CacheWarning, match=f"{message}.*computed again and replaced"):

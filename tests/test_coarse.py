@@ -16,8 +16,7 @@ from torchlb.galerkin.assembly import element_matrices, flat_metric, summed
 from torchlb.galerkin.delaunay import delaunay_cover
 from torchlb.galerkin.elements import simplex
 from torchlb.galerkin.nodes import lagrange_nodes
-from torchlb.operator.medium import forms_of
-from torchlb.pde.conduction import conducting
+from torchlb.pde.conduction import conducting, elements_of
 from torchlb.surfaces import UnitDisk
 
 SQUARE = np.sort([np.pi**2 * (i * i + j * j) for i in range(8) for j in range(8)])[:12]
@@ -64,7 +63,7 @@ def test_long_triangles_along_the_boundary_bind_nothing(mesh, median, worst):
     least = float(held.eigenbasis(1).eigenvalues[0])
     np.testing.assert_allclose(least, 2 * np.pi**2, rtol=2e-2)
     for operator in (lb, held):
-        forms = forms_of(operator)
+        forms = elements_of(operator)
         for count in (len(mesh[0]), len(mesh[1])):
             ones = torch.ones(count, dtype=torch.float64)
             assert conducting(operator, ones).shape == operator.shape
@@ -230,5 +229,5 @@ def test_boundary_edges_without_length():
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         lb = LaplaceBeltrami.from_mesh(points, faces)
-    assert lb.weak_values.isfinite().all()
+    assert lb.weak.values.isfinite().all()
     assert lb.boundary_mass.values().sum() > 0

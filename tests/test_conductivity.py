@@ -6,8 +6,7 @@ from torch.autograd import gradcheck
 
 from torchlb import InputError, LaplaceBeltrami, implicit_step, poisson_solve
 from torchlb.galerkin.forms import Forms
-from torchlb.operator.medium import forms_of
-from torchlb.pde.conduction import conducting
+from torchlb.pde.conduction import conducting, elements_of
 from torchlb.surfaces import Ellipsoid, Sphere, Torus, UnitDisk
 
 
@@ -115,7 +114,7 @@ def test_as_many_vertices_as_faces_are_vertices():
 
 def test_elements_are_made_once():
     lb = build("mesh")
-    assert forms_of(lb) is forms_of(lb)
+    assert elements_of(lb) is elements_of(lb)
 
 
 def test_a_conductivity_is_learned():

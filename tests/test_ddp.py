@@ -87,13 +87,13 @@ rank = dist.get_rank()
 for sizes in ((60, 90), (60, 60)):  # of the same size, one would be replaced by the other in silence
     vertices, faces = Ellipsoid((1.0, 0.8, 0.6 + 0.2 * rank)).mesh(sizes[rank])
     lb = LaplaceBeltrami.from_cotangent(vertices, faces)
-    values, model = lb.values.clone(), Holds(lb)
+    values, model = lb.stencil.values[0].clone(), Holds(lb)
     DistributedDataParallel._set_params_and_buffers_to_ignore_for_model(model, own_buffers(model))
     held, taken = DistributedDataParallel(model), DistributedDataParallel(Takes())
     for _ in range(2):
         one, other = held(vertices), taken(vertices, lb)
         (one.square().sum() + other.square().sum()).backward()
-    assert torch.equal(one, other) and torch.equal(lb.values, values) and torch.equal(lb.points, vertices)
+    assert torch.equal(one, other) and torch.equal(lb.stencil.values[0], values) and torch.equal(lb.points, vertices)
     gradients = [held.module.diffusion.raw_time.grad, taken.module.diffusion.raw_time.grad]
     assert torch.equal(*gradients) and bool((gradients[0] != 0).all())
 dist.destroy_process_group()

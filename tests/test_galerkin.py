@@ -24,10 +24,10 @@ from torchlb.surfaces import CliffordTorus, Hemisphere, Sphere, Torus, UnitDisk,
 def pair_of(lb):
     """(K, M) as scipy matrices."""
     shape = (lb.num_points, lb.num_points)
-    where = lb.weak_col.numpy(), lb.weak_crow.numpy()
+    where = lb.weak.col.numpy(), lb.weak.crow.numpy()
     return [
         sparse.csc_array(sparse.csr_array((v.numpy(), *where), shape=shape))
-        for v in lb.weak_values[:2]
+        for v in lb.weak.values[:2]
     ]
 
 
@@ -323,8 +323,8 @@ def test_blocks_of_any_size_make_the_same_pair(monkeypatch):
     for module in ("assembly", "curving"):
         monkeypatch.setattr(f"torchlb.galerkin.{module}.CHUNK", 70)
     parts = LaplaceBeltrami.from_mesh(vertices, faces)
-    assert whole.weak_col.equal(parts.weak_col)
-    for one, two in zip(whole.weak_values, parts.weak_values, strict=True):
+    assert whole.weak.col.equal(parts.weak.col)
+    for one, two in zip(whole.weak.values, parts.weak.values, strict=True):
         assert (one - two).abs().max() < 1e-12 * one.abs().max()
 
 
@@ -348,8 +348,8 @@ def test_the_pair_travels(dtype):
     expected = torch.block_diag(one.mass_matrix.to_dense(), two.mass_matrix.to_dense())
     assert torch.equal(batch.mass_matrix.to_dense(), expected)
     for before, after in zip((one, two), batch.unbatch(), strict=True):
-        assert torch.equal(before.weak_values, after.weak_values)
-        assert torch.equal(before.linear_col, after.linear_col)
+        assert torch.equal(before.weak.values, after.weak.values)
+        assert torch.equal(before.linear.col, after.linear.col)
     empty = LaplaceBeltrami()
     empty.load_state_dict(two.state_dict())
     assert torch.equal(empty.boundary_mass.to_dense(), two.boundary_mass.to_dense())

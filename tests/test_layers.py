@@ -89,7 +89,7 @@ def eight():
 
 def features(lb, channels=CHANNELS):
     generator = torch.Generator().manual_seed(lb.num_points)
-    return torch.randn(lb.num_points, channels, generator=generator).to(lb.values)
+    return torch.randn(lb.num_points, channels, generator=generator).to(lb.stencil.values[0])
 
 
 @every_layer
@@ -251,8 +251,8 @@ def test_a_batch_takes_bases_over_solves_what_is_missing_and_is_stored():
     for lb in fresh:
         lb.eigenbasis(K)
     ready, later = LaplaceBeltrami.batch(fresh), LaplaceBeltrami.batch(shapes(torch.float64)[:3])
-    assert ready.basis_left.shape[1] >= K
-    assert later.basis_left.numel() == 0
+    assert ready.modes.left.shape[1] >= K
+    assert later.modes.left.numel() == 0
     for field in ("eigenvalues", "eigenvectors", "left"):
         a, b = (getattr(lb.eigenbasis(K), field) for lb in (ready, later))
         torch.testing.assert_close(a, b, rtol=1e-6, atol=1e-6)
@@ -299,7 +299,7 @@ def test_shapes_that_do_not_go_together_are_refused():
     sphere = LaplaceBeltrami.from_points(Sphere().points(60))
     with pytest.raises(ValueError, match="got no shapes"):
         LaplaceBeltrami.batch([])
-    with pytest.raises(ValueError, match="shape 1 has frames"):
+    with pytest.raises(ValueError, match="shape 1 is of dimension 1"):
         LaplaceBeltrami.batch([sphere, LaplaceBeltrami.from_points(Circle().points(60))])
     with pytest.raises(ValueError, match="one dimension, floating type and device"):
         LaplaceBeltrami.batch([sphere, LaplaceBeltrami.from_points(Sphere().points(60).float())])
@@ -505,7 +505,7 @@ def test_data_loader_with_workers(eight, workers):
     loader = DataLoader(Shapes(eight[:6]), batch_size=3, num_workers=workers, collate_fn=collate)
     sizes = []
     for batch, x in loader:
-        assert batch.basis_left.shape[1] >= K
+        assert batch.modes.left.shape[1] >= K
         assert layer(x, batch).isfinite().all()
         sizes += batch.sizes
     assert sizes == [lb.num_points for lb in eight[:6]]

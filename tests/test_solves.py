@@ -4,6 +4,7 @@ import copy
 import functools
 import gc
 import pickle
+import weakref
 
 import numpy as np
 import pytest
@@ -291,11 +292,24 @@ def test_an_operator_that_has_solved_travels():
     for other in (copy.deepcopy(lb), pickle.loads(pickle.dumps(lb))):
         torch.testing.assert_close(implicit_step(other, f, 0.1), u)
     assert set(lb.state_dict()) == before
-    gc.collect()
-    kept = len(systems._SYSTEMS)
+    assert len(lb.cache.systems) == 1
+    lb.weak.values = lb.weak.values.clone()
+    assert len(lb.cache.systems) == 0
+    implicit_step(lb, f, 0.1)
+    held = weakref.ref(systems.pair_system(lb))
     del lb
     gc.collect()
-    assert len(systems._SYSTEMS) < kept
+    assert held() is None
+
+
+def test_factors_may_be_let_go():
+    lb = BUILDERS["cotangent"]()
+    f = rough(lb)
+    u, system = implicit_step(lb, f, 0.1), systems.pair_system(lb)
+    assert systems.pair_system(lb) is system
+    del lb.cache
+    assert systems.pair_system(lb) is not system
+    torch.testing.assert_close(implicit_step(lb, f, 0.1), u)
 
 
 def test_factors_are_kept_in_bounds():

@@ -63,14 +63,6 @@ class WeakPair:
     linear: SparsePair | None = None
     mass: Float[Tensor, " N"] | None = None
 
-    @property
-    def buffers(self) -> dict[str, Tensor]:
-        """The matrices by their names in an operator."""
-        found = {f"weak_{name}": t for name, t in vars(self.matrices).items()}
-        if self.linear is not None:
-            found |= {f"linear_{name}": t for name, t in vars(self.linear).items()}
-        return found
-
     def restored(self, numbering: Numbering) -> WeakPair:
         """With the user's numbers."""
         linear = None if self.linear is None else self.linear.restored(numbering)

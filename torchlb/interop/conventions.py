@@ -79,7 +79,6 @@ def edge_weights(
     """
     if normalization not in (None, "rw"):
         raise InputError(f"normalization: expected None or 'rw', got {normalization!r}")
-    count = torch.arange(lb.num_points, device=lb.crow.device)
-    row = count.repeat_interleave(lb.crow.diff())
-    values = lb.values if normalization == "rw" else lb.mass[row] * lb.values
-    return torch.stack([row, lb.col]), values
+    row, values = lb.stencil.row, lb.stencil.values[0]
+    values = values if normalization == "rw" else lb.mass[row] * values
+    return torch.stack([row, lb.stencil.col]), values

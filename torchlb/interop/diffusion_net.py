@@ -154,10 +154,10 @@ def _tuple(
     """The seven results of an operator in float64, in the type and on the device of `like`."""
     frames = _frames(lb, normals)
     turn = torch.einsum("vxn,vnd->vxd", frames[:, :2], lb.frames)  # of the frame's components
-    row = torch.arange(lb.num_points).repeat_interleave(lb.crow.diff())
-    index = torch.stack([row, lb.col])
-    gradient = torch.einsum("exd,de->xe", turn[row], lb.gradient_values)
-    weak = -lb.mass[row] * lb.values
+    row = lb.stencil.row
+    index = torch.stack([row, lb.stencil.col])
+    gradient = torch.einsum("exd,de->xe", turn[row], lb.stencil.values[1:])
+    weak = -lb.mass[row] * lb.stencil.values[0]
     if symmetric and lb.has_weak_form:
         crow, col, values = lb.pair
         rows = torch.arange(lb.num_points).repeat_interleave(crow.diff())

@@ -32,15 +32,14 @@ except ModuleNotFoundError as error:
 
 from torchlb.errors import InputError, TorchlbError, first_few, warn
 from torchlb.io.cache import load_or_build
-from torchlb.operator.batching import join_states, trimmed
+from torchlb.linalg.csr import Csr
+from torchlb.operator.batching import join_states, without_zeros
 from torchlb.operator.dispatch import Operator, build_operator
 from torchlb.operator.laplace_beltrami import LaplaceBeltrami
-from torchlb.operator.storage import BASIS, PAIRS
+from torchlb.operator.storage import BASIS
 from torchlb.spectral.eigenbasis import Eigenbasis, stack_eigenbases
 
 __all__ = ["LaplaceBeltramiTransform", "to_operator"]
-
-"""Shapes of what an eigenbasis has beside its pairs: nothing; the flow on its invariant span; errors of a pair's."""
 
 
 @functional_transform("laplace_beltrami")
@@ -50,9 +49,9 @@ class LaplaceBeltramiTransform(BaseTransform):
     =================  ===========  ============================================================================
     key                shape        what
     =================  ===========  ============================================================================
-    lb_edge_index      (2, nnz)     [j; i] of every entry Δ_ij: messages flow j → i, as in `edge_index`
-    lb_values          (nnz,)       Δ_ij, 1/ℓ²: ``propagate(data.lb_edge_index, x=f, edge_weight=data.lb_values)`` is Δf
-    lb_gradient        (nnz, d)     tangential derivatives in the frame of i, 1/ℓ
+    lb_stencil_index   (2, nnz)     [j; i] of every entry Δ_ij: messages flow j → i, as in `edge_index`
+    lb_stencil_values  (nnz, 1 + d) Δ_ij, 1/ℓ², and tangential derivatives in the frame of i, 1/ℓ: of the first column w
+                                    ``propagate(data.lb_stencil_index, x=f, edge_weight=w)`` is Δf
     lb_order_t         (nnz,)       the entries sorted by column, within the shape: the transpose, for the backward pass
     lb_mass            (N,)         quadrature weights, ℓ^d
     lb_frames          (N, n, d)    orthonormal tangent vectors
@@ -60,7 +59,7 @@ class LaplaceBeltramiTransform(BaseTransform):
     lb_normals         (N, n)       unit normals of a hypersurface
     lb_face_index      (d + 1, F)   faces of the mesh, or of the surface through the cloud; F = 0 for other clouds
     lb_boundary        (N,)         mask of the points where the boundary condition holds; of none on a closed shape
-    lb_weak_index      (2, nnz)     [i; j] of every entry of the weak pair, none where there is no pair; ascending
+    lb_weak_index      (2, nnz)     [j; i] of every entry of the weak pair, none where there is no pair
     lb_weak_values     (nnz, 3)     stiffness, mass matrix, mass matrix of the boundary; (nnz, 4) with Robin's term
     lb_linear_…                     the same of the linear pair
     lb_basis           (…,)         with k > 0: all parts of the eigenbasis in one vector, for `to_operator`
@@ -87,7 +86,7 @@ class LaplaceBeltramiTransform(BaseTransform):
         write "norm" or "normal"); None to ignore them. A shape without has them estimated.
     on_error
         "raise", or "skip": a warning says why a shape has no operator, and its data come back without the keys, so that
-        ``[d for d in map(transform, shapes) if "lb_values" in d]`` goes on with the others.
+        ``[d for d in map(transform, shapes) if "lb_info" in d]`` goes on with the others.
     **options
         Of `LaplaceBeltrami.from_mesh` (for data with `face`) or `from_points` (without).
 
@@ -153,14 +152,10 @@ class LaplaceBeltramiTransform(BaseTransform):
 
 def _keys(lb: LaplaceBeltrami, k: int) -> dict[str, Any]:
     """What is stored in the data of one shape."""
-    row = torch.arange(lb.num_points).repeat_interleave(lb.crow.diff())
     closed = torch.zeros(lb.num_points, dtype=torch.bool)
     first = zlib.crc32(lb.points.cpu().numpy().tobytes())
     keys: dict[str, Any] = {
-        "lb_edge_index": torch.stack([lb.col, row]),
-        "lb_values": lb.values,
-        "lb_gradient": lb.gradient_values.T.contiguous(),
-        "lb_order_t": lb.order_t,
+        "lb_order_t": lb.stencil.order_t,
         "lb_mass": lb.mass,
         "lb_frames": lb.frames,
         "lb_pos": lb.points,
@@ -174,11 +169,10 @@ def _keys(lb: LaplaceBeltrami, k: int) -> dict[str, Any]:
         keys["lb_normals"] = lb.normals
     kind = lb.conditions[0]
     width = 3 if kind.conserves or kind.fixes else 4  # of every shape with this condition
-    for name in PAIRS:
-        crow, col, values = lb.channels(name if len(lb.linear_crow) else "weak")
-        rows = torch.arange(len(crow.diff())).repeat_interleave(crow.diff())
-        keys[f"lb_{name}_index"] = torch.stack([rows, col])
-        keys[f"lb_{name}_values"] = pad(values, (0, 0, 0, width - len(values))).T.contiguous()
+    for name, pair in {"stencil": lb.stencil, "weak": lb.weak, "linear": lb.near}.items():
+        more = 0 if name == "stencil" else width - len(pair.values)
+        keys[f"lb_{name}_index"] = torch.stack([pair.col, pair.row])
+        keys[f"lb_{name}_values"] = pad(pair.values, (0, 0, 0, more)).T.contiguous()
     if k > 0:
         basis = lb.invariant_basis(k)
         parts = [getattr(basis, name) for name in BASIS]
@@ -199,7 +193,7 @@ def to_operator(data: Any) -> LaplaceBeltrami:
         For data without the keys, whose `pos` was changed since by more than a translation, or whose nodes were put
         into another order, since transforms permute nodes, not matrices.
     """
-    if "lb_edge_index" not in data:
+    if "lb_stencil_index" not in data:
         raise InputError(f"expected data that went through LaplaceBeltramiTransform, got {data}")
     batched = isinstance(data, Batch)
     infos = [json.loads(text) for text in (data["lb_info"] if batched else [data["lb_info"]])]
@@ -210,66 +204,58 @@ def to_operator(data: Any) -> LaplaceBeltrami:
         bases = _bases(data, sizes.tolist())
         basis = stack_eigenbases(bases) if batched else bases[0]
     state = join_states(infos, sizes.tolist()) if batched else infos[0]
-    return LaplaceBeltrami.from_buffers(_buffers(data, sizes), state, basis)
+    return LaplaceBeltrami.of_parts(_parts(data, sizes), state, basis)
 
 
-def _buffers(data: Any, sizes: Int[Tensor, " S"]) -> dict[str, Tensor]:
-    """The block-diagonal matrix and its transpose, and what else is known of the points."""
-    col, row = data.lb_edge_index
-    crow = _starts(row, len(data.pos))
-    ends = crow[sizes.cumsum(0)]
-    entries = torch.diff(ends, prepend=ends.new_zeros(1))
-    order_t = data.lb_order_t + (ends - entries).repeat_interleave(entries)
+def _parts(data: Any, sizes: Int[Tensor, " S"]) -> dict[str, Any]:
+    """The block-diagonal matrices, and what else is known of the points."""
     points = data.pos.to(data.lb_mass)
-    boundary = data.get("lb_boundary", points.new_zeros(0, dtype=torch.bool))
-    pairs = {}
-    for name in PAIRS if "lb_weak_index" in data else ():
-        rows, columns = data[f"lb_{name}_index"]
-        values = data[f"lb_{name}_values"].T.contiguous()
-        weak_crow = _starts(rows, len(data.pos))
-        if bool((weak_crow[pad(sizes.cumsum(0), (1, 0))].diff() == 0).any()):
-            break  # as in `LaplaceBeltrami.batch`, if one shape has no pair
-        pairs |= {
-            f"{name}_crow": weak_crow,
-            f"{name}_col": columns.contiguous(),
-            f"{name}_values": trimmed(values),
-        }
-    return pairs | {
-        "crow": crow,
-        "col": col.contiguous(),
-        "crow_t": _starts(col, len(data.pos)),
-        "col_t": row[order_t],
-        "order_t": order_t,
-        "values": data.lb_values,
-        "gradient_values": data.lb_gradient.T.contiguous(),
+    boundary = data.lb_boundary
+    parts = {
         "mass": data.lb_mass,
         "points": points,
         "frames": data.lb_frames,
         "normals": data.get("lb_normals", points[:0]),
         "on_boundary": boundary[: None if boundary.any() else 0],
-        "faces": data.get("lb_face_index", crow.new_zeros(data.lb_frames.shape[-1] + 1, 0)).T,
+        "faces": data.lb_face_index.T,
     }
+    for name in ("stencil", "weak", "linear"):
+        col, row = data[f"lb_{name}_index"]
+        count = torch.bincount(row, minlength=len(points))
+        crow = torch.cat([count.new_zeros(1), count.cumsum(0)])
+        ends = crow[pad(sizes.cumsum(0), (1, 0))]
+        entries = ends.diff()
+        if bool((entries == 0).any()):
+            break  # as in `LaplaceBeltrami.batch`, if one shape has no pair
+        values = data[f"lb_{name}_values"].T.contiguous()
+        if name == "stencil":
+            order_t = data.lb_order_t + ends[:-1].repeat_interleave(entries)
+            parts[name] = Csr(crow, col.contiguous(), values, order_t)
+        else:
+            parts[name] = without_zeros(Csr(crow, col.contiguous(), values))
+    return parts
 
 
 def _check_unchanged(data: Any, sizes: Int[Tensor, " S"]) -> None:
     """ValueError unless `pos` is what the operator was built from, in its order, but for a translation of a shape."""
     built, pos = data.lb_pos, data.pos
-    count = max(len(built), int(data.lb_edge_index.max()) + 1)  # some transforms sample every key
+    count = max(
+        len(built), int(data.lb_stencil_index.max()) + 1
+    )  # some transforms sample every key
     if not len(pos) == int(sizes.sum()) == count:
         raise InputError(
             f"{len(pos)} points, but an operator of {count}: nodes were added or taken away after "
             "LaplaceBeltramiTransform; apply it last"
         )
-    if "lb_nodes" in data:  # data of torchlb 0.2 have none
-        before = sizes.cumsum(0) - sizes
-        number = torch.arange(len(pos), device=before.device) - before.repeat_interleave(sizes)
-        expected = data.lb_first.repeat_interleave(sizes) + number
-        astray = (data.lb_nodes != expected).nonzero()[:, 0]
-        if len(astray):
-            raise InputError(
-                f"pos: {len(astray)} of {len(pos)} points ({first_few(astray)}) are in another order since "
-                "LaplaceBeltramiTransform, and its matrices are not; permute or sample first, and apply it last"
-            )
+    before = sizes.cumsum(0) - sizes
+    number = torch.arange(len(pos), device=before.device) - before.repeat_interleave(sizes)
+    expected = data.lb_first.repeat_interleave(sizes) + number
+    astray = (data.lb_nodes != expected).nonzero()[:, 0]
+    if len(astray):
+        raise InputError(
+            f"pos: {len(astray)} of {len(pos)} points ({first_few(astray)}) are in another order since "
+            "LaplaceBeltramiTransform, and its matrices are not; permute or sample first, and apply it last"
+        )
     moved = (pos - built).split(sizes.tolist())
     by = max((float((d - d[:1]).abs().max()) for d in moved if len(d)), default=0.0)
     scale = max(float(pos.abs().max()), float(built.abs().max())) if len(pos) else 0.0
@@ -278,11 +264,6 @@ def _check_unchanged(data: Any, sizes: Int[Tensor, " S"]) -> None:
             f"pos: its points moved by up to {by:.3g} against each other since LaplaceBeltramiTransform, whose "
             "operator is that of the old ones; scale, rotate, jitter or deform first, and apply it last"
         )
-
-
-def _starts(index: Int[Tensor, " nnz"], size: int) -> Int[Tensor, " size_plus_1"]:
-    count = torch.bincount(index, minlength=size)
-    return torch.cat([count.new_zeros(1), count.cumsum(0)])
 
 
 def _bases(data: Any, sizes: list[int]) -> list[Eigenbasis]:

@@ -28,7 +28,7 @@ from torchlb.operator.laplace_beltrami import LaplaceBeltrami
 from torchlb.stencils.conditions import Condition
 from torchlb.version import __version__
 
-FORMAT = 2
+FORMAT = 3
 """Of the file. It changes when another torchlb could not read it."""
 
 

@@ -22,15 +22,18 @@ from torch.nn.functional import embedding_bag
 
 
 def transpose_pattern(
-    crow: Int[Tensor, " rows_plus_1"], col: Int[Tensor, " nnz"], num_cols: int
+    crow: Int[Tensor, " rows_plus_1"],
+    col: Int[Tensor, " nnz"],
+    num_cols: int,
+    order: Int[Tensor, " nnz"] | None = None,
 ) -> tuple[Int[Tensor, " cols_plus_1"], Int[Tensor, " nnz"], Int[Tensor, " nnz"]]:
-    """Pattern of the transpose: (crow_t, col_t, order_t) with values_t = values[order_t].
+    """Pattern of the transpose: (crow_t, col_t, order_t) with values_t = values[order_t]; `order` is that, if known.
 
     >>> crow, col = torch.tensor([0, 2, 3]), torch.tensor([0, 1, 1])
     >>> [part.tolist() for part in transpose_pattern(crow, col, 2)]
     [[0, 1, 3], [0, 0, 1], [0, 1, 2]]
     """
-    order = torch.sort(col, stable=True).indices
+    order = torch.sort(col, stable=True).indices if order is None else order
     row = torch.repeat_interleave(torch.arange(len(crow) - 1, device=crow.device), crow.diff())
     count = torch.bincount(col, minlength=num_cols)
     crow_t = torch.cat([count.new_zeros(1), count.cumsum(0)])

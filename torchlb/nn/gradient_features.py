@@ -38,7 +38,7 @@ class TangentMap(nn.Module):
         dtype = check_features(x, lb, self.channels, next(self.parameters()))
         if self.rotations and lb.dim != 2:
             raise InputError(f"rotations need a surface, got dim={lb.dim}; use rotations=False")
-        rows = [lb._apply_rows(values, x) for values in lb.gradient_values.to(dtype)]
+        rows = [lb.stencil.product(1 + c, x, dtype=dtype) for c in range(lb.dim)]
         gradient = torch.stack(rows, dim=-2)
         if not self.rotations:
             return gradient, self.A(gradient)

@@ -1,146 +1,109 @@
-"""Several operators side by side as one block-diagonal operator, and back: what becomes of each stored tensor."""
+"""Several operators side by side as one block-diagonal operator, and back."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from itertools import accumulate
 from math import isnan
 from typing import Any
 
 import torch
-from torch import Tensor
-from torch.nn.functional import pad
-from torch.utils.weak import WeakIdKeyDictionary
 
 from torchlb.errors import InputError
-from torchlb.operator.storage import PAIRS, no_pairs
+from torchlb.linalg.csr import Csr, Record, starts
+from torchlb.operator.storage import OperatorStorage
 
-Buffers = dict[str, Tensor]
-BY_POINT = ("mass", "points", "frames", "normals", "on_boundary")
-BY_ENTRY = ("col", "values", "col_t", "order_t")
-PARTS = ("crow", "col", "values")
-_SHAPES: Any = WeakIdKeyDictionary()
+Parts = dict[str, Any]
 
 
-def join_buffers(shapes: Sequence[Buffers]) -> Buffers:
-    """Stored tensors of the block-diagonal operator, from those of the shapes.
-
-    Raises
-    ------
-    InputError
-        If the shapes differ in dimension, in floating type or in device.
-    """
-    first = shapes[0]
-    for name in ("frames", "values"):
-        for i, other in enumerate(shapes):
-            ours, theirs = (
-                (t.shape[1:] if name == "frames" else (), t.dtype, t.device)
-                for t in (first[name], other[name])
+def check_alike(shapes: Sequence[OperatorStorage]) -> None:
+    """InputError for shapes that differ in dimension, in floating type or in device."""
+    kinds = [
+        f"of dimension {s.dim} in R^{s.points.shape[1]}, {s.dtype}, on {s.device}" for s in shapes
+    ]
+    for i, kind in enumerate(kinds):
+        if kind != kinds[0]:
+            raise InputError(
+                f"batch: shape {i} is {kind}, and shape 0 {kinds[0]}; one dimension, floating type and device are "
+                "needed: use lb.to(…)"
             )
-            if ours != theirs:
-                raise InputError(
-                    f"batch: shape {i} has {name} of {theirs}, shape 0 of {ours}; one dimension, floating type and "
-                    "device are needed: use lb.to(…)"
-                )
-    by_point = [n for n in first if n in BY_POINT or n.startswith("report_")]
-    joined = {n: torch.cat([s[n] for s in shapes]) for n in (*by_point, "values")}
-    joined["gradient_values"] = torch.cat([s["gradient_values"] for s in shapes], dim=1)
-    if not all(len(s["normals"]) for s in shapes):
-        joined["normals"] = first["normals"][:0]
-    if len(joined["on_boundary"]):
-        masks = [s["on_boundary"] for s in shapes]
-        empty = [torch.zeros_like(s["mass"], dtype=torch.bool) for s in shapes]
-        pairs = zip(masks, empty, strict=True)
-        joined["on_boundary"] = torch.cat([mask if len(mask) else none for mask, none in pairs])
-    points = _starts([len(s["mass"]) for s in shapes])
-    entries = _starts([len(s["col"]) for s in shapes])
-    for suffix in ("", "_t"):
-        crows = [s["crow" + suffix][1:] + e for s, e in zip(shapes, entries, strict=True)]
-        joined["crow" + suffix] = torch.cat([first["crow" + suffix][:1], *crows])
-        cols = [s["col" + suffix] + p for s, p in zip(shapes, points, strict=True)]
-        joined["col" + suffix] = torch.cat(cols)
-    orders = [s["order_t"] + e for s, e in zip(shapes, entries, strict=True)]
-    joined["order_t"] = torch.cat(orders)
-    joined["faces"] = torch.cat([s["faces"] + p for s, p in zip(shapes, points, strict=True)])
-    return joined | _join_pairs(shapes)
 
 
-def _join_pairs(shapes: Sequence[Buffers]) -> Buffers:
-    """The weak pairs, if all shapes have one, and, if any shape has one of its own, the linear ones."""
-    if not all(len(s["weak_crow"]) for s in shapes):
-        shapes = [s | no_pairs(s["values"]) for s in shapes]
-    joined = {}
-    points = _starts([len(s["mass"]) for s in shapes])
-    for pair in PAIRS:
-        if not any(len(s[f"{pair}_crow"]) for s in shapes):
-            joined |= {f"{pair}_{part}": shapes[0][f"{pair}_{part}"] for part in PARTS}
-            continue
-        names = [pair if len(s[f"{pair}_crow"]) else "weak" for s in shapes]
-        blocks = [[s[f"{name}_{p}"] for p in PARTS] for s, name in zip(shapes, names, strict=True)]
-        entries = _starts([len(col) for _, col, _ in blocks])
-        crows = [crow[i > 0 :] + entries[i] for i, (crow, _, _) in enumerate(blocks)]
-        joined[f"{pair}_crow"] = torch.cat(crows)
-        joined[f"{pair}_col"] = torch.cat([b[1] + p for b, p in zip(blocks, points, strict=True)])
-        most = max(len(values) for _, _, values in blocks)  # the more, the more some shape has
-        padded = [pad(values, (0, 0, 0, most - len(values))) for _, _, values in blocks]
-        joined[f"{pair}_values"] = torch.cat(padded, dim=1)
-    return joined
+def joined_parts(shapes: Sequence[OperatorStorage]) -> Parts:
+    """What the block-diagonal operator stores, from what its shapes store.
+
+    The weak pairs, if all shapes have one, and, if any shape has one of its own, the linear ones.
+    """
+    parts: Parts = {
+        n: torch.cat([getattr(s, n) for s in shapes]) for n in ("mass", "points", "frames")
+    }
+    first = starts([s.num_points for s in shapes])
+    parts["faces"] = torch.cat([s.faces + start for s, start in zip(shapes, first, strict=True)])
+    if all(len(s.normals) for s in shapes):
+        parts["normals"] = torch.cat([s.normals for s in shapes])
+    if any(len(s.on_boundary) for s in shapes):
+        masks = [s.on_boundary if len(s.on_boundary) else s.mass < 0 for s in shapes]
+        parts["on_boundary"] = torch.cat(masks)
+    parts["record"] = Record.join([s.record for s in shapes])
+    parts["stencil"] = Csr.join([s.stencil for s in shapes])
+    if all(s.weak.num_rows for s in shapes):
+        parts["weak"] = Csr.join([s.weak for s in shapes])
+        if any(s.linear.num_rows for s in shapes):
+            parts["linear"] = Csr.join([s.near for s in shapes])
+    return parts
 
 
-def trimmed(values: Tensor) -> Tensor:
+def split_parts(batch: OperatorStorage, sizes: Sequence[int]) -> list[Parts]:
+    """The inverse of `joined_parts`."""
+    names = [
+        n for n in ("mass", "points", "frames", "normals", "on_boundary") if len(getattr(batch, n))
+    ]
+    columns: dict[str, Any] = {
+        name: [part.clone() for part in getattr(batch, name).split(list(sizes))] for name in names
+    }
+    first = batch.faces.new_tensor(starts(sizes))
+    of_shape = torch.bucketize(batch.faces[:, 0].contiguous(), first[1:], right=True)
+    faces = batch.faces.split(torch.bincount(of_shape, minlength=len(sizes)).tolist())
+    columns["faces"] = [own - start for own, start in zip(faces, first, strict=True)]
+    if len(batch.record.order):  # data of PyG do not carry it
+        columns["record"] = batch.record.split(sizes)
+    for name in ("stencil", "weak", "linear"):
+        matrices: Csr = getattr(batch, name)
+        if matrices.num_rows:
+            columns[name] = matrices.split(sizes)
+    shapes = [dict(zip(columns, row, strict=True)) for row in zip(*columns.values(), strict=True)]
+    return [_trimmed(shape) for shape in shapes]
+
+
+def _trimmed(shape: Parts) -> Parts:
+    """Without what a shape has in a batch because others have it."""
+    for name in ("weak", "linear"):
+        if name in shape:
+            shape[name] = without_zeros(shape[name])
+    pair, near = shape.get("weak"), shape.get("linear")
+    if pair and near and all(torch.equal(t, near.tensors[n]) for n, t in pair.tensors.items()):
+        del shape["linear"]
+    if "on_boundary" in shape and not shape["on_boundary"].any():
+        del shape["on_boundary"]
+    return shape
+
+
+def without_zeros(pair: Csr) -> Csr:
     """Without the last matrices where they are zero: those of the boundary, and of what a condition adds."""
-    return values[: 4 if values[3:].any() else 3 if values[2:].any() else 2]
+    values = pair.values
+    most = 4 if values[3:].any() else 3 if values[2:].any() else 2
+    return Csr(pair.crow, pair.col, values[:most])
 
 
-def remember_shapes(batch: Any, shapes: Sequence[Any]) -> None:
+def remember_shapes(batch: OperatorStorage, shapes: Sequence[OperatorStorage]) -> None:
     """So that what is kept of the shapes (factors, say) serves their batch, too."""
-    _SHAPES[batch.values] = tuple((shape, shape.values) for shape in shapes)
+    batch.cache.shapes = tuple((shape, shape.weak.values) for shape in shapes)
 
 
 def shapes_of(batch: Any) -> tuple[Any, ...]:
     """The operators that a batch was made of, as long as neither has been copied, cast, moved or loaded; else none."""
-    known = _SHAPES.get(batch.values, ())
-    same = all(shape.values is values for shape, values in known)
+    known = batch.cache.shapes
+    same = all(shape.weak.values is values for shape, values in known)
     return tuple(shape for shape, _ in known) if same else ()
-
-
-def _starts(counts: Sequence[int]) -> list[int]:
-    return [0, *accumulate(counts)][: len(counts)]
-
-
-def split_buffers(joined: Buffers, sizes: Sequence[int]) -> list[Buffers]:
-    """The inverse of `join_buffers`."""
-    shapes = []
-    corner, starts = joined["faces"][:, 0].contiguous(), joined["faces"].new_tensor(_starts(sizes))
-    of_shape = torch.bucketize(corner, starts[1:], right=True)
-    faces = joined["faces"].split(torch.bincount(of_shape, minlength=len(sizes)).tolist())
-    for start, size, corners in zip(_starts(sizes), sizes, faces, strict=True):
-        point = slice(start, start + size)
-        first, last = joined["crow"][[start, start + size]].tolist()
-        entry = slice(first, last)
-        by_point = [n for n in joined if n in BY_POINT or n.startswith("report_")]
-        shape = {n: joined[n][point] for n in by_point} | {n: joined[n][entry] for n in BY_ENTRY}
-        shape["gradient_values"] = joined["gradient_values"][:, entry]
-        shape["faces"] = corners - start
-        for name, shift in (("col", start), ("col_t", start), ("order_t", first)):
-            shape[name] = shape[name] - shift
-        for name in ("crow", "crow_t"):
-            shape[name] = joined[name][start : start + size + 1] - first
-        for pair in PAIRS:
-            crow, col, values = (joined[f"{pair}_{part}"] for part in PARTS)
-            if len(crow):
-                first, last = crow[[start, start + size]].tolist()
-                crow, col = crow[start : start + size + 1] - first, col[first:last] - start
-                values = trimmed(values[:, first:last])
-            shape |= dict(
-                zip((f"{pair}_{part}" for part in PARTS), (crow, col, values), strict=True)
-            )
-        if all(torch.equal(shape[f"weak_{part}"], shape[f"linear_{part}"]) for part in PARTS):
-            shape |= {n: t for n, t in no_pairs(shape["values"]).items() if n.startswith("linear")}
-        if not shape["on_boundary"].any():
-            shape["on_boundary"] = shape["on_boundary"][:0]
-        shapes.append({name: tensor.clone() for name, tensor in shape.items()})
-    return shapes
 
 
 def join_states(states: Sequence[dict[str, Any]], sizes: Sequence[int]) -> dict[str, Any]:

@@ -14,19 +14,21 @@ from torchlb.cloud.surface import SurfaceSummary
 from torchlb.errors import InputError, InputTypeError
 from torchlb.fits.rules import WeightsName
 from torchlb.geometry.frames import Projection
+from torchlb.linalg.csr import Csr, Record
 from torchlb.operator import build
 from torchlb.operator.batching import (
-    join_buffers,
+    check_alike,
     join_states,
+    joined_parts,
     remember_shapes,
-    split_buffers,
+    split_parts,
 )
 from torchlb.operator.build_cloud import Reconstruction, build_cloud, built_again
 from torchlb.operator.inputs import ArrayLike, check_points, float_type, warn_of_gradients
 from torchlb.operator.options import Options
 from torchlb.operator.plan import Plan, evaluate
 from torchlb.operator.stencil_face import StencilFace
-from torchlb.operator.storage import FIT_FIELDS, REPORT_FIELDS
+from torchlb.operator.storage import FIT_FIELDS, ROW_FIELDS
 from torchlb.operator.weak_face import MatrixName, WeakFace
 from torchlb.spectral.eigenbasis import (
     stack_eigenbases,
@@ -43,10 +45,9 @@ class LaplaceBeltrami(StencilFace, WeakFace):
 
     Attributes
     ----------
-    crow, col, values
-        The matrix of Δ in CSR; values in 1/ℓ², where ℓ is the unit of the points.
-    gradient_values
-        (d, nnz), 1/ℓ: tangential derivatives in the frame of each row's point, on the same pattern.
+    stencil
+        A `Csr`: crow, col and values (1 + d, nnz) of Δ, in 1/ℓ², where ℓ is the unit of the points, and of the
+        tangential derivatives in the frame of each row's point, 1/ℓ.
     mass
         (N,), ℓ^d: positive quadrature weights that sum to the area; π of the certificate where there is one.
     certificate
@@ -224,6 +225,7 @@ class LaplaceBeltrami(StencilFace, WeakFace):
             raise InputTypeError("batch: expected a sequence of operators, [lb, …]")
         if len(shapes) == 0:
             raise InputError("batch: got no shapes")
+        check_alike(shapes)
         sizes = [n for shape in shapes for n in shape.sizes or (shape.num_points,)]
         if all(shape.has_weak_form for shape in shapes):
             _ = [
@@ -233,7 +235,7 @@ class LaplaceBeltrami(StencilFace, WeakFace):
         bases = [shape.basis for shape in shapes if shape.basis and not shape.sizes]
         with torch.inference_mode(False):
             basis = stack_eigenbases(bases) if len(bases) == len(shapes) else None
-            joined = cls.from_buffers(join_buffers([s.tensors for s in shapes]), state, basis)
+            joined = cls.of_parts(joined_parts(shapes), state, basis)
         remember_shapes(joined, shapes)
         return joined
 
@@ -301,12 +303,8 @@ class LaplaceBeltrami(StencilFace, WeakFace):
 
         Raises InputError for another name or shape, and where there is no such matrix.
         """
-        if name == "laplacian":
-            return self(f)
-        crow, col, values = self.parts_of(name)  # symmetric: the transpose is itself
-        return self._multiplied(
-            [crow, col, crow, col, torch.arange(len(col), device=col.device)], values, f
-        )
+        matrices, channel = self._channel(name)
+        return matrices.product(channel, f)
 
     def unbatch(self) -> list[LaplaceBeltrami]:
         """The operators of the shapes of a `batch`, with all that they had: certificates, spectral radii, eigenbases.
@@ -317,51 +315,48 @@ class LaplaceBeltrami(StencilFace, WeakFace):
             raise InputError(f"unbatch: expected a batch of operators, got one from {self.source}")
         basis = self.basis
         bases = [None] * len(self.sizes) if basis is None else unstack_eigenbases(basis)
-        buffers = split_buffers(self.tensors, self.sizes)
-        shapes = zip(buffers, self.parts, bases, strict=True)
-        return [type(self).from_buffers(*shape) for shape in shapes]
+        shapes = zip(split_parts(self, self.sizes), self.parts, bases, strict=True)
+        return [type(self).of_parts(*shape) for shape in shapes]
 
     @classmethod
     def _from_assembled(cls, built: build.AssembledOperator, given: ArrayLike) -> LaplaceBeltrami:
         """Store what was built, in the floating type of the input."""
-        rows, points = built.rows, built.points
-        report = {**vars(rows), "num_neighbors": rows.length, "normal_order": built.normal_order}
-        buffers = {f"report_{n}": report[n] for n in REPORT_FIELDS if n not in FIT_FIELDS} | {
-            "crow": rows.crow,
-            "col": rows.col,
-            "values": rows.laplacian,
-            "gradient_values": rows.gradient.T.contiguous(),
-            "mass": built.mass,
-            "points": points,
-            "frames": built.frames,
+        rows, points, pair = built.rows, built.points, built.whole_pair
+        none = rows.length.new_zeros(4, len(points))
+        fits = none if built.fit_counts is None else built.fit_counts
+        report = dict(zip(FIT_FIELDS, fits, strict=True))
+        report |= {"num_neighbors": rows.length, "normal_order": built.normal_order}
+        report |= {name: t for name, t in vars(rows).items() if name in ROW_FIELDS}
+        parts = {name: getattr(built, name) for name in ("points", "mass", "frames", "faces")}
+        values = torch.cat([rows.laplacian[None], rows.gradient.T])
+        parts |= {
+            "stencil": Csr.with_transpose(rows.crow, rows.col, values),
+            "record": Record({name: report[name] for name in (*ROW_FIELDS, *FIT_FIELDS)}),
             "normals": points[:0] if built.normals is None else built.normals,
-            "faces": built.faces,
         }
-        fits = built.fit_counts
-        fits = rows.length.new_zeros(4, len(points)) if fits is None else fits
-        buffers |= {f"report_{name}": t for name, t in zip(FIT_FIELDS, fits, strict=True)}
-        pair = built.whole_pair
         if pair is not None:
-            buffers |= pair.buffers
+            parts["weak"] = Csr(**vars(pair.matrices))
+            parts |= {} if pair.linear is None else {"linear": Csr(**vars(pair.linear))}
         if built.on_boundary is not None and built.on_boundary.any():
-            buffers["on_boundary"] = built.on_boundary
-        lb = cls.from_buffers(buffers, {"source": built.source, "options": built.options})
+            parts["on_boundary"] = built.on_boundary
+        lb = cls.of_parts(parts, {"source": built.source, "options": built.options})
         lb.certificate, lb.surface, lb._plan = built.certificate, built.surface, built.plan
         if lb.has_weak_form:
             _ = lb.radius  # from values that are not yet rounded
         return lb.to(float_type(given))
 
-    def extra_repr(self) -> str:
+    def __repr__(self) -> str:
         """N, d, n, source and options."""
         if self.source == "empty":
-            return "empty"
+            return "LaplaceBeltrami(empty)"
         size = f"{self.num_points} points, dim={self.dim} in R^{self.points.shape[1]}, from {self.source}"
         options = self.options | {"condition": self.condition}
         options = [f"{k}={v!r}" for k, v in options.items() if v is not None]
         certified = "" if self.certificate is None or self.certificate.holds else "NOT STABLE"
-        last = [f"{self.col.shape[0]} entries", str(self.values.dtype), certified]
-        return ", ".join(part for part in [size, *options, *last] if part)
+        last = [f"{len(self.stencil.col)} entries", str(self.dtype), certified]
+        inside = ", ".join(part for part in [size, *options, *last] if part)
+        return f"LaplaceBeltrami({inside})"
 
 
 # A whole module can be read back with torch.load(weights_only=True) where torchlb is imported.
-torch.serialization.add_safe_globals([LaplaceBeltrami, Certificate, SurfaceSummary])
+torch.serialization.add_safe_globals([LaplaceBeltrami, Csr, Record, Certificate, SurfaceSummary])

@@ -9,9 +9,8 @@ from torch import Tensor
 from torchlb.errors import InputError
 from torchlb.geometry.boundary import boundary_faces
 from torchlb.linalg.checks import check_tensor
-from torchlb.linalg.sparse import csr_product, csr_tensor
 from torchlb.operator.report import StencilReport
-from torchlb.operator.storage import REPORT_FIELDS, OperatorStorage
+from torchlb.operator.storage import OperatorStorage
 
 
 class StencilFace(OperatorStorage):
@@ -20,15 +19,14 @@ class StencilFace(OperatorStorage):
     @property
     def matrix(self) -> Tensor:
         """Δ as a torch sparse CSR tensor (N, N), 1/ℓ²; a view of the buffers."""
-        return csr_tensor(self.crow, self.col, self.values, self.num_points)
+        return self.stencil.tensor(0)
 
     @property
     def report(self) -> StencilReport:
         """What order each point reached, and why not more; print it."""
-        if len(self.report_order) != self.num_points:
+        if len(self.record.order) != self.num_points:
             raise InputError("report: PyG's Data do not carry it; it is with the operator as built")
-        fields = {name: getattr(self, f"report_{name}") for name in REPORT_FIELDS}
-        order = self.options.get("order", 0)
+        order, fields = self.options.get("order", 0), self.record.tensors
         return StencilReport(order, self.dim, **fields, surface=self.surface)
 
     def forward(self, f: Float[Tensor, "*batch N C"] | Float[Tensor, " N"]) -> Tensor:
@@ -37,7 +35,7 @@ class StencilFace(OperatorStorage):
         Near a boundary that of functions which satisfy its condition, ∂f/∂ν + a f = 0 or f = 0; of any other it is
         far off there, and `divergence(gradient(f))` is right.
         """
-        return self._apply_rows(self.values, f)
+        return self.stencil.product(0, f)
 
     def __matmul__(self, f: Tensor) -> Tensor:
         """``lb @ f`` is ``lb(f)``."""
@@ -48,30 +46,7 @@ class StencilFace(OperatorStorage):
 
         In the inner product of the mass π the adjoint is Lᵀ(πf)/π.
         """
-        return self._apply_rows(self.values, f, transposed=True)
-
-    def _apply_rows(self, values: Tensor, f: Tensor, transposed: bool = False) -> Tensor:
-        """The product with one set of values on the pattern of Δ, or its transpose, for any layout of f."""
-        pattern = [self.crow, self.col, self.crow_t, self.col_t, self.order_t]
-        return self._multiplied(pattern, values, f, transposed)
-
-    def _multiplied(
-        self, pattern: list[Tensor], values: Tensor, f: Tensor, transposed: bool = False
-    ) -> Tensor:
-        """As `csr_product`, for any layout of f."""
-        check_tensor(f)
-        if f.ndim == 1:
-            return self._multiplied(pattern, values, f[:, None], transposed)[:, 0]
-        if not (f.ndim in (2, 3) and f.shape[-2] == self.num_points):
-            raise InputError(
-                f"expected f of shape (N,), (N, C) or (B, N, C) with N = {self.num_points}, "
-                f"got {tuple(f.shape)}"
-            )
-        columns = f if f.ndim == 2 else f.transpose(0, 1).flatten(1)
-        result = csr_product(pattern, values, columns, transposed)
-        if f.ndim == 2:
-            return result
-        return result.view(f.shape[1], f.shape[0], f.shape[2]).transpose(0, 1)
+        return self.stencil.product(0, f, transposed=True)
 
     def local_gradient(self, f: Tensor) -> Tensor:
         """∇f in the frames, (N, d, C) for f (N, C), (N, d) for (N,), (B, N, d, C) for (B, N, C). Units of f by 1/ℓ."""
@@ -79,7 +54,7 @@ class StencilFace(OperatorStorage):
         if torch.is_autocast_enabled(f.device.type):
             with torch.autocast(f.device.type, enabled=False):
                 return self.local_gradient(f)
-        parts = [self._apply_rows(values, f) for values in self.gradient_values]
+        parts = [self.stencil.product(c, f) for c in range(1, 1 + self.dim)]
         return torch.stack(parts, dim=1 if f.ndim < 3 else 2)
 
     def gradient(self, f: Tensor) -> Tensor:
@@ -139,8 +114,7 @@ class StencilFace(OperatorStorage):
         normal, rim = self(self.points), self._rim()
         if not rim.any():
             return normal
-        row = torch.arange(self.num_points, device=self.col.device)
-        row = row.repeat_interleave(self.crow.diff())[rim[self.col]]
+        row = self.stencil.row[rim[self.stencil.col]]
         free = torch.ones_like(rim).index_fill(0, row, False)[:, None]
         return torch.where(free, normal, self.divergence(self.gradient(self.points)))
 

@@ -1,45 +1,31 @@
-"""The tensors of an operator, and how they travel: copies, types, files, and the eigenbasis once it is known."""
+"""The parts of an operator, and how they travel: copies, types, files, and the eigenbasis once it is known."""
 
 from __future__ import annotations
 
+from collections import OrderedDict
 from collections.abc import Sequence
 from dataclasses import asdict
 from typing import Any, TypeVar
+from weakref import finalize
 
 import torch
 from jaxtyping import Bool, Float
-from torch import Tensor, nn
+from torch import Tensor
 
 from torchlb.certified.certificate import Certificate
 from torchlb.cloud.surface import SurfaceSummary
 from torchlb.errors import InputError, warn
+from torchlb.linalg.csr import Csr, Record, Tensors
 from torchlb.linalg.exponential import spectral_radius
-from torchlb.linalg.sparse import to_scipy, transpose_pattern
+from torchlb.linalg.sparse import to_scipy
 from torchlb.operator.checks import check_same_points
 from torchlb.spectral.eigenbasis import Eigenbasis
 from torchlb.stencils.conditions import Condition, condition_of, kind_of
 
-REAL_FIELDS = ("growth", "condition", "off_diagonal_ratio")
 FIT_FIELDS = ("fit_degree", "fit_reason", "edges", "curved_edges")
-REPORT_FIELDS = (
-    *("order", "normal_order", "num_neighbors", *REAL_FIELDS, "rule", "reason"),
-    *FIT_FIELDS,
-)
-PAIRS = ("weak", "linear")
-"""The weak pair (K, M), and the linear pair beside it, by the names of their buffers."""
-BUFFERS = ("crow", "col", "values", "gradient_values", "mass", "points", "frames", "normals")
-TRANSPOSE = ("crow_t", "col_t", "order_t")
-Storage = TypeVar("Storage", bound="OperatorStorage")
+REAL_FIELDS = ("growth", "condition", "off_diagonal_ratio")
+ROW_FIELDS = ("order", "normal_order", "num_neighbors", *REAL_FIELDS, "rule", "reason")
 BASIS = ("eigenvalues", "eigenvectors", "left", "relative_errors")
-FORMER = ("basis_decay_rates", "basis_modal_transform")
-"""Of a state of an older torchlb, whose stencils had eigenpairs of their own."""
-
-
-def no_pairs(like: Tensor) -> dict[str, Tensor]:
-    """The buffers of both pairs where there are none, of the type and on the device of a tensor."""
-    index, values = like.new_zeros(0, dtype=torch.int64), like.new_zeros(2, 0)
-    parts = {"crow": index, "col": index, "values": values}
-    return {f"{pair}_{part}": t.clone() for pair in PAIRS for part, t in parts.items()}
 
 
 def with_added(values: Float[Tensor, "terms nnz"]) -> Float[Tensor, "2 nnz"]:
@@ -47,42 +33,62 @@ def with_added(values: Float[Tensor, "terms nnz"]) -> Float[Tensor, "2 nnz"]:
     return values[:2] if len(values) < 4 else torch.stack([values[0] + values[3], values[1]])
 
 
-class OperatorStorage(nn.Module):
-    """Plain buffers of any size, which an empty instance takes from any `state_dict`.
+Storage = TypeVar("Storage", bound="OperatorStorage")
 
-    Attributes are those of `LaplaceBeltrami`; the transpose's pattern and, unless asked for, the basis are left out of
-    `state_dict`. ``weak_crow``, ``weak_col``, ``weak_values`` (2, nnz) are stiffness and mass matrix on one pattern,
-    (3, nnz) with the mass matrix of the boundary, (4, nnz) with what a condition adds to the stiffness; ``linear_…``
-    those of linear elements, empty where they are the same.
-    ``faces`` are those of the mesh, or of the surface through a cloud; ``surface`` says how that was found.
+
+class OperatorCache:
+    """What was computed of an operator and is kept with it, in memory alone: copies and files are without.
+
+    Attributes
+    ----------
+    values
+        Those of the weak pair that all is of; where an operator has others, it has another cache.
+    systems
+        Linear systems with their factors.
+    elements
+        Those of the weak pair, once a conductivity has asked for them.
+    shapes
+        Of a batch its shapes, whose caches serve it, each with the values that it had.
     """
 
-    crow: Tensor
-    col: Tensor
-    values: Tensor
-    gradient_values: Tensor
+    def __init__(self, values: Tensor) -> None:
+        self.values = values
+        self.systems: OrderedDict[Any, Any] = OrderedDict()
+        self.elements: Any = None
+        self.shapes: tuple[tuple[Any, Tensor], ...] = ()
+        finalize(self, self.systems.clear)  # cholespy reports factors that outlive Python as leaks
+
+
+class OperatorStorage(Tensors):
+    """Tensors of any size, which an empty instance takes from any `state_dict`.
+
+    Attributes
+    ----------
+    weak, linear
+        Matrices of the weak pair: stiffness and mass matrix; on a shape with a boundary the mass matrix of that; and
+        what a condition adds to the stiffness. Those of linear elements, of no rows where they are the same.
+    record
+        The fields of a `StencilReport`.
+    modes
+        The eigenbasis, as far as it is known; `state_dict` has it where it is asked to.
+    """
+
     mass: Tensor
     points: Tensor
     frames: Tensor
     normals: Tensor
     on_boundary: Tensor
     faces: Tensor
-    weak_crow: Tensor
-    weak_col: Tensor
-    weak_values: Tensor
-    linear_crow: Tensor
-    linear_col: Tensor
-    linear_values: Tensor
-    crow_t: Tensor
-    col_t: Tensor
-    order_t: Tensor
-    basis_eigenvalues: Tensor
-    basis_eigenvectors: Tensor
-    basis_left: Tensor
-    basis_relative_errors: Tensor
+    stencil: Csr
+    weak: Csr
+    linear: Csr
+    record: Record
+    modes: Record
 
     def __init__(self) -> None:
-        super().__init__()
+        none, whole = torch.zeros(0), torch.zeros(0, dtype=torch.int64)
+        by_point = dict.fromkeys(("mass", "points", "frames", "normals"), none)
+        super().__init__(by_point | {"on_boundary": whole.bool(), "faces": whole.view(0, 3)})
         self.source = "empty"
         self.options: dict[str, Any] = {}
         self.certificate: Certificate | None = None
@@ -92,29 +98,26 @@ class OperatorStorage(nn.Module):
         self._plan: Any = None
         self._radius: Tensor | None = None
         self._pairs = torch.empty(0, 0)  # as many rows as `num_pairs`
-        for name in BUFFERS:
-            self.register_buffer(name, torch.zeros(0))
-        self.register_buffer("on_boundary", torch.zeros(0, dtype=torch.bool))
-        self.register_buffer("faces", torch.zeros(0, 3, dtype=torch.int64))
-        self.crow, self.col = torch.zeros(1, dtype=torch.int64), torch.zeros(0, dtype=torch.int64)
-        for name, tensor in no_pairs(torch.zeros(0)).items():
-            self.register_buffer(name, tensor)
-        for name in REPORT_FIELDS:
-            dtype = torch.get_default_dtype() if name in REAL_FIELDS else torch.int64
-            self.register_buffer(f"report_{name}", torch.zeros(0, dtype=dtype))
-        for name in TRANSPOSE:  # for the backward pass
-            self.register_buffer(name, torch.zeros(0, dtype=torch.int64), persistent=False)
-        for name in BASIS:
-            self.register_buffer(f"basis_{name}", torch.zeros(0), persistent=False)
+        self._cache: OperatorCache | None = None
+        self.stencil, self.weak, self.linear = Csr(order_t=whole), Csr(), Csr()
+        fields = {n: none if n in REAL_FIELDS else whole for n in (*ROW_FIELDS, *FIT_FIELDS)}
+        self.record = Record(fields)
+        self.modes = Record(dict.fromkeys(BASIS, none), persistent=False)
 
     def __getstate__(self) -> dict[str, Any]:
-        """For copies and files: without the plan, which is made again when it is asked for."""
-        return {**self.__dict__, "_plan": None}
+        """For copies and files: without the plan, which is made again when it is asked for, and the cache."""
+        return {**self.__dict__, "_plan": None, "_cache": None}
 
-    def __getattr__(self, name: str) -> Any:
-        """A buffer. Not by way of `nn.Module`, for whose buffers `torch.compile` makes a graph of every size."""
-        buffers = self.__dict__.get("_buffers", {})
-        return buffers[name] if name in buffers else super().__getattr__(name)
+    @property
+    def cache(self) -> OperatorCache:
+        """Factors and elements, kept as long as the operator and its matrices; ``del lb.cache`` lets them go."""
+        if self._cache is None or self._cache.values is not self.weak.values:
+            self._cache = OperatorCache(self.weak.values)
+        return self._cache
+
+    @cache.deleter
+    def cache(self) -> None:
+        self._cache = None
 
     @property
     def sizes(self) -> tuple[int, ...] | None:
@@ -127,35 +130,28 @@ class OperatorStorage(nn.Module):
         self._sizes = None if sizes is None else [torch.empty(n, 0) for n in sizes]
 
     @classmethod
-    def from_buffers(
+    def of_parts(
         cls: type[Storage],
-        buffers: dict[str, Tensor],
+        parts: dict[str, Any],
         state: dict[str, Any],
         basis: Eigenbasis | None = None,
     ) -> Storage:
-        """An operator of given tensors, by their names here, and of what `get_extra_state` has beside them.
+        """An operator of given tensors, matrices and records by name, and of what `get_extra_state` has beside them.
 
-        Without the pattern of the transpose it is found; all else that is left out stays empty.
+        What is left out stays empty.
         """
         lb = cls()
-        for name, tensor in buffers.items():
-            setattr(lb, name, tensor)
+        for name, part in parts.items():
+            setattr(lb, name, part)
         lb.set_extra_state(state)
-        if "order_t" not in buffers:
-            lb._transpose()
         if basis is not None:
             lb.keep_basis(basis)
         return lb
 
     @property
-    def tensors(self) -> dict[str, Tensor]:
-        """All buffers by name, also those that share their memory, as the patterns of Δ and K of the cotangent."""
-        return dict(self.named_buffers(remove_duplicate=False))
-
-    @property
     def num_points(self) -> int:
         """Number of points N."""
-        return self.crow.shape[0] - 1
+        return self.mass.shape[0]
 
     @property
     def dim(self) -> int:
@@ -191,11 +187,10 @@ class OperatorStorage(nn.Module):
     @property
     def losing(self) -> Bool[Tensor, " N"] | None:
         """Mask of the points where a condition keeps constants out of the null space of the pair; None for none."""
-        _, col, values = self.channels("linear" if len(self.linear_crow) else "weak")
-        if len(values) < 4:
+        if len(self.near.values) < 4:
             return self.fixed
         mask = torch.zeros_like(self.mass, dtype=torch.bool)
-        mask[col[values[3] > 0]] = True  # on the diagonal
+        mask[self.near.col[self.near.values[3] > 0]] = True  # on the diagonal
         return mask if self.fixed is None else mask | self.fixed
 
     @property
@@ -212,12 +207,12 @@ class OperatorStorage(nn.Module):
     @property
     def dtype(self) -> torch.dtype:
         """Floating type of the matrix."""
-        return self.values.dtype
+        return self.stencil.values.dtype
 
     @property
     def device(self) -> torch.device:
         """Where the buffers are."""
-        return self.values.device
+        return self.stencil.values.device
 
     @property
     def offsets(self) -> tuple[int, ...]:
@@ -242,47 +237,42 @@ class OperatorStorage(nn.Module):
     @property
     def pair(self) -> tuple[Tensor, Tensor, Tensor]:
         """(crow, col, values (2, nnz)) of K, with what a condition adds to it, and M: what all is computed by."""
-        crow, col, values = self.channels("weak")
-        return crow, col, with_added(values)
+        return self.weak.crow, self.weak.col, with_added(self.weak.values)
+
+    @property
+    def near(self) -> Csr:
+        """The matrices of linear elements, close to the weak pair and 20 times sparser."""
+        return self.linear if self.linear.num_rows else self.weak
 
     @property
     def linear_pair(self) -> tuple[Tensor, Tensor, Tensor]:
-        """The same of the pair of linear elements, close to (K, M) and 20 times sparser."""
-        crow, col, values = self.channels("linear" if len(self.linear_crow) else "weak")
-        return crow, col, with_added(values)
-
-    def channels(self, pair: str) -> tuple[Tensor, Tensor, Tensor]:
-        """The buffers of the pair "weak" or "linear": crow, col, and values of K, M, B, and of what is added to K."""
-        return tuple(getattr(self, f"{pair}_{part}") for part in ("crow", "col", "values"))  # type: ignore[return-value]
+        """As `pair`, of linear elements."""
+        return self.near.crow, self.near.col, with_added(self.near.values)
 
     def set_radius(self, radius: float | None) -> None:
         """Hold what is known of the spectrum; it is neither rounded nor moved with the buffers."""
         known = None if radius is None else torch.tensor(radius, dtype=torch.float64, device="cpu")
         self._radius = known
 
-    def _transpose(self) -> None:
-        self.crow_t, self.col_t, self.order_t = transpose_pattern(
-            self.crow, self.col, self.num_points
-        )
-
     @property
     def basis(self) -> Eigenbasis | None:
         """All eigenpairs that are stored; None if there are none."""
-        if len(self.basis_left) == 0:
+        held = self.modes
+        if len(held.left) == 0:
             return None
-        pairs = (self.basis_eigenvalues, self.basis_eigenvectors, self.mass, self.basis_left)
-        errors = self.basis_relative_errors if len(self.basis_relative_errors) else None
+        errors = held.relative_errors if len(held.relative_errors) else None
+        pairs = held.eigenvalues, held.eigenvectors, self.mass, held.left
         return Eigenbasis(*pairs, self.sizes, errors)
 
     def keep_basis(self, basis: Eigenbasis | None = None, *, store: bool | None = None) -> None:
-        """Hold a basis (None: the one there is) in buffers, in `state_dict` or not (None: as it was)."""
-        for name in BASIS:
-            key = f"basis_{name}"
-            value = getattr(self, key) if basis is None else getattr(basis, name)
-            value = self.values.new_zeros(0) if value is None else value.to(self.values)
-            outside = key in self._non_persistent_buffers_set
-            self.register_buffer(key, value, persistent=not outside if store is None else store)
-        self._pairs = torch.empty(self._count_pairs(), 0)
+        """Hold a basis (None: the one there is), in `state_dict` or not (None: as it was)."""
+        store = not self.modes._non_persistent_buffers_set if store is None else store
+        none = self.mass.new_zeros(0)
+        held = {name: getattr(basis or self.modes, name) for name in BASIS}
+        held = {name: none if t is None else t.to(none) for name, t in held.items()}
+        self.modes = Record(held, persistent=store)
+        if len(held["left"]) > 0:
+            self._count_pairs(self.modes.eigenvectors)
 
     @property
     def num_pairs(self) -> int:
@@ -293,16 +283,14 @@ class OperatorStorage(nn.Module):
         """Whether k eigenpairs of each shape are stored, or all that it has."""
         return min(k, max(self.sizes or (self.num_points,))) <= self.num_pairs
 
-    def _count_pairs(self) -> int:
-        """`num_pairs` of the basis in the buffers: a batch pads short ones, and a Dirichlet condition takes points."""
-        if len(self.basis_left) == 0:
-            return 0
+    def _count_pairs(self, eigenvectors: Float[Tensor, "N k"]) -> None:
+        """Set `num_pairs`: a batch pads the bases of its shapes, and a Dirichlet condition takes points."""
         sizes = self.sizes or (self.num_points,)
-        fixed = self.fixed if len(self.weak_crow) else None
-        free = torch.ones_like(self.mass, dtype=torch.bool) if fixed is None else ~fixed
-        parts = zip(self.basis_eigenvectors.split(sizes), free.split(sizes), strict=True)
+        free = torch.ones_like(self.mass, dtype=torch.bool) if self.fixed is None else ~self.fixed
+        parts = zip(eigenvectors.split(sizes), free.split(sizes), strict=True)
         counts = [(int((modes != 0).any(0).sum()), int(inside.sum())) for modes, inside in parts]
-        return min((held for held, most in counts if held < most), default=max(sizes))
+        known = min((held for held, most in counts if held < most), default=max(sizes))
+        self._pairs = torch.empty(known, 0)
 
     def check_points(self, points: Tensor) -> None:
         """InputError unless the operator was built from these points: as many, each in its place to float32 rounding.
@@ -333,20 +321,8 @@ class OperatorStorage(nn.Module):
         self.sizes, self.parts = None if sizes is None else tuple(sizes), state.get("parts")
         self.set_radius(radius)
 
-    def _load_from_state_dict(
-        self,
-        state_dict: Any,
-        prefix: str,
-        local_metadata: Any,
-        strict: bool,
-        missing_keys: Any,
-        unexpected_keys: Any,
-        error_msgs: Any,
-    ) -> None:
-        """Take buffers of any size: an operator is data, not parameters of a fixed shape.
-
-        Where that replaces an operator on other points a warning says so.
-        """
+    def _load_from_state_dict(self, state_dict: Any, prefix: str, *given: Any) -> None:
+        """Where that replaces an operator on other points a warning says so."""
         theirs = state_dict.get(f"{prefix}points")
         if self.num_points and theirs is not None:
             try:
@@ -356,27 +332,11 @@ class OperatorStorage(nn.Module):
                     f"{prefix or 'LaplaceBeltrami'}: the operator on {self.num_points} points is replaced by one on "
                     f"{len(theirs)} others; leave it out of the state to keep the one that is there"
                 )
-        for name in FORMER:
-            state_dict.pop(prefix + name, None)
-        for name in BASIS:
-            stored = f"{prefix}basis_{name}" in state_dict
-            self.register_buffer(f"basis_{name}", self.values.new_zeros(0), persistent=stored)
-        self._radius = None
-        missing = {"faces": torch.zeros(0, 3, dtype=torch.int64)} | no_pairs(torch.zeros(0))
-        for name, tensor in missing.items():  # as in a state of an older torchlb
-            state_dict.setdefault(prefix + name, tensor)
-        for name, buffer in self.tensors.items():
-            incoming = state_dict.get(prefix + name)
-            if incoming is not None:
-                setattr(self, name, torch.empty_like(incoming, device=buffer.device))
-        super()._load_from_state_dict(
-            state_dict,
-            prefix,
-            local_metadata,
-            strict,
-            missing_keys,
-            unexpected_keys,
-            error_msgs,
-        )
-        self._transpose()
-        self.keep_basis()
+        stored = f"{prefix}modes.left" in state_dict
+        none = self.mass.new_zeros(0)
+        self.modes = Record(dict.fromkeys(BASIS, none), persistent=stored)
+        self._radius = self._plan = self._cache = None
+        self._pairs = torch.empty(0, 0)
+        super()._load_from_state_dict(state_dict, prefix, *given)
+        if stored:
+            self._count_pairs(state_dict[f"{prefix}modes.eigenvectors"])

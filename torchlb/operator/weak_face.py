@@ -9,7 +9,8 @@ from scipy import sparse
 from torch import Tensor
 
 from torchlb.errors import InputError
-from torchlb.linalg.sparse import csr_tensor, to_scipy
+from torchlb.linalg.csr import Csr
+from torchlb.linalg.sparse import to_scipy
 from torchlb.linalg.threads import threads_for
 from torchlb.operator.batching import shapes_of
 from torchlb.operator.checks import check_tolerance
@@ -35,7 +36,7 @@ class WeakFace(OperatorStorage):
     @property
     def has_weak_form(self) -> bool:
         """Whether there is a weak pair, as there is unless built with weak_form=False."""
-        return self.weak_crow.shape[0] > 0
+        return self.weak.num_rows > 0
 
     def check_pair(self) -> None:
         """InputError without a weak pair, which eigenpairs, flows and solves are of."""
@@ -50,7 +51,7 @@ class WeakFace(OperatorStorage):
         `fixed` is set, do inside, and solves take out its rows and columns; what Robin's adds to it is in `pair`.
         Raises InputError without a weak pair.
         """
-        return csr_tensor(*self.parts_of("stiffness"), self.num_points)
+        return self._tensor("stiffness")
 
     @property
     def mass_matrix(self) -> Tensor:
@@ -58,25 +59,28 @@ class WeakFace(OperatorStorage):
 
         Raises InputError without a weak pair.
         """
-        return csr_tensor(*self.parts_of("mass"), self.num_points)
+        return self._tensor("mass")
 
     @property
     def boundary_mass(self) -> Tensor:
         """B, torch sparse CSR (N, N), ℓ^{d−1}: uᵀBv = ∫uv along the boundary. Raises InputError where there is none."""
-        return csr_tensor(*self.parts_of("boundary_mass"), self.num_points)
+        return self._tensor("boundary_mass")
 
-    def parts_of(self, name: str) -> tuple[Tensor, Tensor, Tensor]:
-        """crow, col and values of a matrix: "laplacian", "stiffness", "mass" or "boundary_mass"."""
+    def _tensor(self, name: MatrixName) -> Tensor:
+        matrices, channel = self._channel(name)
+        return matrices.tensor(channel)
+
+    def _channel(self, name: str) -> tuple[Csr, int]:
+        """Where a matrix is: "laplacian", "stiffness", "mass" or "boundary_mass"."""
         if name not in get_args(MatrixName):
             raise InputError(f"name: expected one of {list(get_args(MatrixName))}, got {name!r}")
         if name == "laplacian":
-            return self.crow, self.col, self.values
+            return self.stencil, 0
         if not self.has_weak_form:
             raise InputError(NO_PAIR.format(name))
-        if name == "boundary_mass" and len(self.weak_values) < 3:
+        if name == "boundary_mass" and len(self.weak.values) < 3:
             raise InputError("boundary_mass: the shape is closed")
-        number = get_args(MatrixName).index(name) - 1
-        return self.weak_crow, self.weak_col, self.weak_values[number]
+        return self.weak, get_args(MatrixName).index(name) - 1
 
     def to_scipy(self, name: MatrixName = "laplacian") -> sparse.csr_array:
         """Δ, or another matrix of the operator, as a scipy CSR matrix (N, N) on the CPU.
@@ -89,7 +93,8 @@ class WeakFace(OperatorStorage):
 
         Weak matrices with the signs and masses of other libraries: `torchlb.interop.conventions`.
         """
-        return to_scipy(*self.parts_of(name), self.shape)
+        matrices, channel = self._channel(name)
+        return matrices.to_scipy(channel)
 
     def eigenbasis(
         self, k: int, *, tolerance: float | None = None, store: bool = False
@@ -125,7 +130,7 @@ class WeakFace(OperatorStorage):
         """At least k eigenpairs, all that are solved, so that their span is invariant under Δ; else as `eigenbasis`."""
         k = check_num_pairs(k)
         check_tolerance(tolerance)
-        errors = self.basis_relative_errors[..., :k]
+        errors = self.modes.relative_errors[..., :k]
         if not self.has_pairs(k) or (tolerance is not None and (errors > tolerance).any()):
             # It is kept, and a training may follow.
             with torch.inference_mode(False), threads_for(self.num_points):
@@ -161,7 +166,7 @@ class WeakFace(OperatorStorage):
         bases = []
         for start, end in zip(self.offsets[:-1], self.offsets[1:], strict=True):
             block = slice(start, end)
-            near = None if len(self.linear_crow) == 0 else [m[block, block] for m in linear]
+            near = None if self.linear.num_rows == 0 else [m[block, block] for m in linear]
             bases.append(
                 pencil_eigenbasis(
                     stiffness[block, block],

@@ -13,9 +13,10 @@ from torchlb.errors import InputError, first_few
 from torchlb.galerkin.forms import Forms
 from torchlb.galerkin.pair import stored
 from torchlb.linalg.checks import check_tensor
+from torchlb.linalg.csr import Csr
 from torchlb.linalg.sparse import to_scipy
 from torchlb.operator.laplace_beltrami import LaplaceBeltrami
-from torchlb.operator.medium import forms_of
+from torchlb.operator.storage import OperatorCache
 
 
 @dataclass(frozen=True, eq=False)
@@ -26,15 +27,11 @@ class Conducting:
     forms: Forms
     pair: tuple[Tensor, Tensor, Tensor]
     linear_pair: tuple[Tensor, Tensor, Tensor]
+    cache: OperatorCache
 
     def __getattr__(self, name: str) -> Any:
         """What κ does not change, as of the operator."""
         return getattr(self.lb, name)
-
-    @property
-    def values(self) -> Tensor:
-        """What factors are kept by."""
-        return self.pair[2]
 
     def slope(
         self, conductivity: Tensor, w: Float[Tensor, "N C"], u: Float[Tensor, "N C"]
@@ -48,6 +45,27 @@ class Conducting:
         return torch.autograd.grad(total, kappa)[0].to(conductivity)
 
 
+def elements_of(lb: LaplaceBeltrami) -> Forms:
+    """The elements of an operator's weak pair; made once, and kept with it.
+
+    Raises
+    ------
+    InputError
+        For batches, and operators without a weak pair.
+    """
+    if lb.cache.elements is None:
+        if lb.source == "batch" or not lb.has_weak_form:
+            remedy = "solve shape by shape, lb.unbatch()"
+            if lb.source != "batch":
+                remedy = "build it with its weak pair, from_mesh if there is none of the points"
+            raise InputError(f"conductivity: this operator has no elements; {remedy}")
+        points = lb.points.detach().cpu().double()
+        linear = lb.source == "cotangent"
+        made = Forms.linear(points, lb.faces.cpu()) if linear else lb.plan.forms(points)
+        lb.cache.elements = made
+    return lb.cache.elements
+
+
 def conducting(lb: LaplaceBeltrami, conductivity: Tensor) -> Conducting:
     """The operator with the stiffness of div κ∇, κ > 0 of the vertices (N,) or of the faces (F,).
 
@@ -57,7 +75,7 @@ def conducting(lb: LaplaceBeltrami, conductivity: Tensor) -> Conducting:
         For another shape, values that are not positive, and operators that are without elements.
     """
     check_tensor(conductivity, "conductivity")
-    forms = forms_of(lb)
+    forms = elements_of(lb)
     kappa = conductivity.detach().cpu().double()
     if kappa.shape not in ((lb.num_points,), (forms.num_faces,)):
         raise InputError(
@@ -71,16 +89,17 @@ def conducting(lb: LaplaceBeltrami, conductivity: Tensor) -> Conducting:
             f"{len(kappa)} vertices or faces ({first_few(bad)})"
         )
     values = forms.conductivities(kappa)
-    pair = linear = _with_rest(lb, "weak", forms.matrix(values))
-    if len(lb.linear_crow):
-        linear = _with_rest(lb, "linear", forms.near(values))
-    return Conducting(lb, forms, pair, linear)
+    pair = linear = _with_rest(lb.weak, forms.matrix(values))
+    if lb.linear.num_rows:
+        linear = _with_rest(lb.linear, forms.near(values))
+    return Conducting(lb, forms, pair, linear, OperatorCache(pair[2]))
 
 
-def _with_rest(lb: LaplaceBeltrami, pair: str, matrix: Any) -> tuple[Tensor, Tensor, Tensor]:
+def _with_rest(pair: Csr, matrix: Any) -> tuple[Tensor, Tensor, Tensor]:
     """K(κ) with M, and with what the condition adds, whatever κ is."""
-    crow, col, values = lb.channels(pair)
-    _, mass, *rest = (to_scipy(crow, col, v.double(), lb.shape) for v in values)
+    shape = pair.num_rows, pair.num_rows
+    _, mass, *rest = (to_scipy(pair.crow, pair.col, v.double(), shape) for v in pair.values)
     found = stored(matrix.real + 1j * mass, rest[1] if len(rest) > 1 else None)
+    device = pair.values.device
     values = torch.stack([found.values[0] + found.values[2:].sum(0), found.values[1]])
-    return found.crow.to(lb.device), found.col.to(lb.device), values.to(lb.device)
+    return found.crow.to(device), found.col.to(device), values.to(device)

@@ -73,7 +73,7 @@ def heat_flow(
     """
     x = as_columns(f, lb)
     method = checked_method(method)
-    dtype = compute_dtype(x, lb.values)
+    dtype = compute_dtype(x, lb.mass)
     time = as_times(t, x, dtype)
     with torch.autocast(x.device.type, enabled=False):
         y = flow(lb, x.to(dtype), time, method, k, tolerance)

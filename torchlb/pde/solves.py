@@ -69,7 +69,7 @@ def implicit_step(
     """
     check_tolerance(tolerance)
     x = as_columns(f, lb)
-    dtype = torch.float64 if tolerance < SINGLE else compute_dtype(x, lb.values)
+    dtype = torch.float64 if tolerance < SINGLE else compute_dtype(x, lb.mass)
     columns, time = _columns(x, as_times(t, x, torch.float64), dtype)
     given, poured = (_data(lb, d, n, f) for d, n in ((boundary_values, 0), (flux, 1)))
     medium = lb if conductivity is None else conducting(lb, conductivity)
@@ -150,8 +150,7 @@ def potential(
     if field is not None:
         weighted = lb.mass.to(field.dtype)[:, None, None] * field
         products += [
-            lb._apply_rows(values, part, transposed=True)
-            for values, part in zip(lb.gradient_values, weighted.unbind(-2), strict=True)
+            lb.stencil.product(1 + c, weighted[..., c, :], transposed=True) for c in range(lb.dim)
         ]
     lb.check_pair()
     columns, _ = _columns(sum(products[1:], products[0]), None)
@@ -204,15 +203,15 @@ def _data(lb: LaplaceBeltrami, data: Tensor | float | None, kind: int, f: Tensor
 
 def _poured(lb: LaplaceBeltrami, free: Tensor) -> Tensor:
     """(N,), points of the boundary whose flux comes to a free point."""
-    if len(lb.weak_values) < 3:
+    if len(lb.weak.values) < 3:
         return torch.zeros_like(free)
-    size = lb.weak_values[2].abs()
-    return symmetric_product(lb.weak_crow, lb.weak_col, size, free.to(size)[:, None])[:, 0] > 0
+    size = lb.weak.values[2].abs()
+    return symmetric_product(lb.weak.crow, lb.weak.col, size, free.to(size)[:, None])[:, 0] > 0
 
 
 def _missing(lb: LaplaceBeltrami, kind: int) -> str:
     """Why there is no point for Dirichlet values (kind 0) or for fluxes (1)."""
-    if len(lb.weak_values) < 3:
+    if len(lb.weak.values) < 3:
         return "the shape is closed; it has no boundary for them"
     if kind == 0:
         return "no Dirichlet condition; build with condition='dirichlet'"

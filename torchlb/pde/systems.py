@@ -10,7 +10,6 @@ as long as the operator that they belong to; a batch takes those of its shapes.
 
 from __future__ import annotations
 
-import atexit
 import math
 from collections import OrderedDict
 from collections.abc import Callable
@@ -23,7 +22,6 @@ from jaxtyping import Float
 from scipy import sparse
 from scipy.sparse import csgraph
 from torch import Tensor
-from torch.utils.weak import WeakIdKeyDictionary
 
 from torchlb.linalg.conjugate_gradients import Linear, conjugate_gradients
 from torchlb.linalg.factor import Factor
@@ -47,14 +45,11 @@ SINGLE, STIFFEST = 1e-5, 1e5
 area: what is rounded there would show."""
 TINY = 1e-300
 Operator = LaplaceBeltrami | Conducting
-_SYSTEMS: Any = WeakIdKeyDictionary()
-atexit.register(_SYSTEMS.clear)  # cholespy reports factors that outlive Python as leaks
 
 
 def pair_system(lb: Operator) -> PairSystem:
     """That of an operator with a weak pair, for all times."""
-    kept = _SYSTEMS.setdefault(lb.values, OrderedDict())
-    return _kept(kept, None, lambda: PairSystem(lb))
+    return _kept(lb.cache.systems, None, lambda: PairSystem(lb))
 
 
 def _kept(kept: OrderedDict[Any, Any], key: Any, make: Callable[[], Any]) -> Any:
@@ -123,7 +118,7 @@ class PairSystem:
         self.ones_mass = self.mass_product(self.one)
         self.area = self.components.sums(self.one, self.ones_mass)
         self.stiff = float(self.stiffness.double().abs().sum() / self.mass.double().sum())
-        self.smooths = len(lb.linear_crow) > 0  # the cotangent's pair is the linear one
+        self.smooths = lb.linear.num_rows > 0  # the cotangent's pair is the linear one
         self.steps = 0
         crow, col, linear = lb.linear_pair
         first, second = (to_scipy(crow, col, v.double(), lb.shape) for v in linear)

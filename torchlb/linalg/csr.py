@@ -1,0 +1,233 @@
+"""Stored tensors as modules: records with a row for each point, and sparse matrices on one pattern.
+
+What is stored of an operator is made of these two. `.to`, copies and `state_dict` are theirs by `nn.Module`; a state of
+any size loads into them, and they are joined to those of a batch, and split again, once for all that is stored.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from itertools import accumulate
+from typing import Any
+
+import torch
+from jaxtyping import Float, Int
+from scipy import sparse
+from torch import Tensor, nn
+from torch.nn.functional import pad
+
+from torchlb.errors import InputError
+from torchlb.linalg.checks import check_tensor
+from torchlb.linalg.sparse import csr_product, csr_tensor, to_scipy, transpose_pattern
+
+
+def starts(counts: Sequence[int]) -> list[int]:
+    """Where each of several blocks starts.
+
+    >>> starts([3, 2, 4])
+    [0, 3, 5]
+    """
+    return [0, *accumulate(counts)][: len(counts)]
+
+
+class Tensors(nn.Module):
+    """Plain buffers by name, which take those of a state whatever their size: they are data, not parameters."""
+
+    def __init__(self, tensors: Mapping[str, Tensor], *, persistent: bool = True) -> None:
+        super().__init__()
+        for name, tensor in tensors.items():
+            self.register_buffer(name, tensor, persistent=persistent)
+
+    def __getattr__(self, name: str) -> Any:
+        """A buffer or a part. Not by `nn.Module`, for whose buffers `torch.compile` makes a graph of every size."""
+        for kind in ("_buffers", "_modules"):
+            held = self.__dict__.get(kind, {})
+            if name in held:
+                return held[name]
+        return super().__getattr__(name)
+
+    @property
+    def tensors(self) -> dict[str, Tensor]:
+        """All buffers by name, those of parts and those that share their memory, too."""
+        return dict(self.named_buffers(remove_duplicate=False))
+
+    def _load_from_state_dict(self, state_dict: Any, prefix: str, *given: Any) -> None:  # pyright: ignore[reportIncompatibleMethodOverride]
+        for name, buffer in self._buffers.items():
+            incoming = state_dict.get(prefix + name)
+            if incoming is not None and buffer is not None:
+                setattr(self, name, torch.empty_like(incoming, device=buffer.device))
+        super()._load_from_state_dict(state_dict, prefix, *given)
+
+
+class Record(Tensors):
+    """Tensors with a row for each point; those of a batch have the rows of its shapes below each other.
+
+    Parameters
+    ----------
+    tensors
+        (N, …), of any type.
+    persistent
+        Whether `state_dict` has them.
+
+    >>> record = Record({"order": torch.tensor([3, 3, 0])})
+    >>> [part.order.tolist() for part in record.split([2, 1])]
+    [[3, 3], [0]]
+    """
+
+    @staticmethod
+    def join(records: Sequence[Tensors]) -> Record:
+        """The record of a batch."""
+        names = records[0].tensors
+        return Record({n: torch.cat([each.tensors[n] for each in records]) for n in names})
+
+    def split(self, sizes: Sequence[int]) -> list[Record]:
+        """The records of the shapes of a batch with so many points."""
+        rows = zip(*(tensor.split(list(sizes)) for tensor in self.tensors.values()), strict=True)
+        copies = [map(torch.clone, row) for row in rows]  # which do not hold the batch
+        return [Record(dict(zip(self.tensors, row, strict=True))) for row in copies]
+
+
+class Csr(Tensors):
+    """Sparse matrices (N, N) on one pattern, a channel of values each; of a batch block-diagonal.
+
+    Parameters
+    ----------
+    crow, col
+        (N + 1,), (nnz,), CSR with ascending columns; by default of no rows.
+    values
+        (c, nnz).
+    order_t
+        (nnz,), the entries sorted by columns; None for symmetric matrices.
+
+    >>> one = Csr(torch.tensor([0, 1]), torch.tensor([0]), torch.tensor([[2.0]]))
+    >>> Csr.join([one, one]).col.tolist()
+    [0, 1]
+    """
+
+    crow: Int[Tensor, " N_plus_1"]
+    col: Int[Tensor, " nnz"]
+    values: Float[Tensor, "c nnz"]
+    crow_t: Int[Tensor, " N_plus_1"]
+    col_t: Int[Tensor, " nnz"]
+    order_t: Int[Tensor, " nnz"]
+
+    def __init__(
+        self,
+        crow: Tensor | None = None,
+        col: Tensor | None = None,
+        values: Tensor | None = None,
+        order_t: Tensor | None = None,
+    ) -> None:
+        crow = torch.zeros(1, dtype=torch.int64) if crow is None else crow
+        col = crow[:0].clone() if col is None else col
+        values = torch.zeros(2, 0) if values is None else values
+        super().__init__({"crow": crow, "col": col, "values": values})
+        self.symmetric = order_t is None
+        if order_t is not None:
+            self._transpose(order_t)
+
+    @staticmethod
+    def with_transpose(crow: Tensor, col: Tensor, values: Tensor) -> Csr:
+        """Matrices that are not symmetric."""
+        return Csr(crow, col, values, transpose_pattern(crow, col, len(crow) - 1)[2])
+
+    def _transpose(self, order_t: Tensor | None = None) -> None:
+        pattern = transpose_pattern(self.crow, self.col, self.num_rows, order_t)
+        for name, tensor in zip(("crow_t", "col_t", "order_t"), pattern, strict=True):
+            self.register_buffer(name, tensor, persistent=False)
+
+    @property
+    def num_rows(self) -> int:
+        """N; 0 where there are no matrices."""
+        return self.crow.shape[0] - 1
+
+    @property
+    def row(self) -> Int[Tensor, " nnz"]:
+        """The row of every entry."""
+        count = torch.arange(self.num_rows, device=self.crow.device)
+        return count.repeat_interleave(self.crow.diff())
+
+    @property
+    def pattern(self) -> list[Tensor]:
+        """crow, col, and those of the transpose, as `csr_product` takes them."""
+        if self.symmetric:
+            order = torch.arange(len(self.col), device=self.col.device)
+            return [self.crow, self.col, self.crow, self.col, order]
+        return [self.crow, self.col, self.crow_t, self.col_t, self.order_t]
+
+    def tensor(self, channel: int) -> Tensor:
+        """A matrix as a torch sparse CSR tensor, which shares its memory."""
+        return csr_tensor(self.crow, self.col, self.values[channel], self.num_rows)
+
+    def to_scipy(self, channel: int) -> sparse.csr_array:
+        """A matrix as a scipy CSR matrix on the CPU."""
+        shape = self.num_rows, self.num_rows
+        return to_scipy(self.crow, self.col, self.values[channel], shape)
+
+    def product(
+        self,
+        channel: int,
+        f: Float[Tensor, "*batch N C"] | Float[Tensor, " N"],
+        *,
+        transposed: bool = False,
+        dtype: torch.dtype | None = None,
+    ) -> Tensor:
+        """A matrix, or its transpose, times f: (N,), (N, C) or (B, N, C), of that shape; types as in `csr_product`.
+
+        Parameters
+        ----------
+        channel
+            Number of the matrix.
+        f
+            Dense, of any floating type.
+        transposed
+            Whether it is the transpose.
+        dtype
+            To which the values are cast before; None for their own.
+
+        Raises InputError for another shape.
+        """
+        check_tensor(f)
+        if f.ndim == 1:
+            options: Any = {"transposed": transposed, "dtype": dtype}
+            return self.product(channel, f[:, None], **options)[:, 0]
+        if not (f.ndim in (2, 3) and f.shape[-2] == self.num_rows):
+            raise InputError(
+                f"expected f of shape (N,), (N, C) or (B, N, C) with N = {self.num_rows}, got {tuple(f.shape)}"
+            )
+        columns = f if f.ndim == 2 else f.transpose(0, 1).flatten(1)
+        values = self.values[channel] if dtype is None else self.values[channel].to(dtype)
+        result = csr_product(self.pattern, values, columns, transposed)
+        if f.ndim == 2:
+            return result
+        return result.view(f.shape[1], f.shape[0], f.shape[2]).transpose(0, 1)
+
+    @staticmethod
+    def join(records: Sequence[Csr]) -> Csr:
+        """Block-diagonal, with as many channels as one of them has: zeros where another has fewer."""
+        most = max(len(each.values) for each in records)
+        first = starts([len(each.col) for each in records])
+        rows = starts([each.num_rows for each in records])
+        crows = [each.crow[1:] + start for each, start in zip(records, first, strict=True)]
+        orders = [r.order_t + e for r, e in zip(records, first, strict=True) if not r.symmetric]
+        return Csr(
+            torch.cat([records[0].crow[:1], *crows]),
+            torch.cat([each.col + start for each, start in zip(records, rows, strict=True)]),
+            torch.cat([pad(r.values, (0, 0, 0, most - len(r.values))) for r in records], dim=1),
+            torch.cat(orders) if orders else None,
+        )
+
+    def split(self, sizes: Sequence[int]) -> list[Csr]:
+        """The diagonal blocks."""
+        blocks = []
+        ends = self.crow[[0, *accumulate(sizes)]].tolist()
+        for start, size, first, last in zip(starts(sizes), sizes, ends, ends[1:], strict=False):
+            crow, col = self.crow[start : start + size + 1] - first, self.col[first:last] - start
+            order_t = None if self.symmetric else self.order_t[first:last] - first
+            blocks.append(Csr(crow, col, self.values[:, first:last].clone(), order_t))
+        return blocks
+
+    def _load_from_state_dict(self, state_dict: Any, prefix: str, *given: Any) -> None:  # pyright: ignore[reportIncompatibleMethodOverride]
+        super()._load_from_state_dict(state_dict, prefix, *given)
+        if not self.symmetric:
+            self._transpose()
