@@ -108,7 +108,7 @@ class Forms:
 
         A star's simplex is in those of all its corners, each of which has an equal share of it.
         """
-        nodes, own, flats = plan.nodes, ~plan.coarse, []
+        nodes, flats, own = plan.nodes, [], ~plan.coarse
         if mesh.cover is not None:
             same: Any = sparse.eye_array(len(own), format="csr")
             mix = mesh.cover.mixed() @ same[plan.coarse.numpy()]
@@ -117,10 +117,13 @@ class Forms:
             lengths = sound_lengths(edge_lengths(fits.points, stars), stars)
             flats.append(FlatCells(stars, lengths, 1 / stars.shape[1], False, None))
         p = prolongation(fit_plan, fits, plan, mesh)
-        cells, faces = (nodes.cells[own], mesh.lengths[own]), own.nonzero()[:, 0]
-        curved = p, nodes.elements[own], mesh.metric[own], simplex(nodes.dim, nodes.degree)
-        shares = None if shares is None else shares[own]
-        return cls(*cells, faces, len(own), *curved, shares, flats)
+        every = torch.arange(len(own))
+        parts = nodes.cells, mesh.lengths, every, nodes.elements, mesh.metric
+        if mesh.cover is not None:
+            parts, shares = [x[own] for x in parts], None if shares is None else shares[own]
+        cells, lengths, faces, elements, metric = parts
+        curved = p, elements, metric, simplex(nodes.dim, nodes.degree)
+        return cls(cells, lengths, faces, len(own), *curved, shares, flats)
 
     @classmethod
     def linear(cls, points: Float[Tensor, "N n"], faces: Int[Tensor, "F corners"]) -> Forms:
@@ -170,7 +173,7 @@ class Forms:
     def matrix(self, conductivities: list[Tensor] | None = None) -> sparse.csr_array:
         """K + iM, (N, N), positive semidefinite for every κ > 0; the rows of K sum to zero."""
         kappa = None if conductivities is None else conductivities[0]
-        return congruence(self.prolongation, self.elements(kappa)) + self.flat(conductivities)
+        return self.with_flat(congruence(self.prolongation, self.elements(kappa)), conductivities)
 
     def elements(self, conductivity: Float[Tensor, "T Q"] | None = None) -> sparse.csr_array:
         """K_FE + iM_FE of the curved elements, (N + X, N + X)."""
@@ -185,17 +188,23 @@ class Forms:
             means = conductivities[0] @ self.element.weights / self.element.weights.sum()
         count = self.prolongation.shape[1]
         own = linear_elements(self.lengths, self.cells, count, means, shares=self.shares)
-        return own + self.flat(conductivities)
+        return self.with_flat(own, conductivities)
 
-    def flat(self, conductivities: list[Tensor] | None = None) -> sparse.csr_array:
+    def flat(self) -> sparse.csr_array:
         """K + iM of the flat cells."""
         count = self.prolongation.shape[1]
-        total: Any = sparse.csr_array((count, count), dtype=complex)
+        return self.with_flat(sparse.csr_array((count, count), dtype=complex))
+
+    def with_flat(
+        self, matrix: Any, conductivities: list[Tensor] | None = None
+    ) -> sparse.csr_array:
+        """A matrix with that of the flat cells added."""
         for number, flat in enumerate(self.flats, 1):
             kappa = None if conductivities is None else conductivities[number]
-            part = linear_elements(flat.lengths, flat.cells, count, kappa, lumped=flat.lumped)
-            total = total + flat.share * part
-        return total
+            rest = matrix.shape[0], kappa
+            part = linear_elements(flat.lengths, flat.cells, *rest, lumped=flat.lumped)
+            matrix = matrix + flat.share * part
+        return matrix
 
     def sensitivity(self, w: Float[Tensor, "N C"], u: Float[Tensor, "N C"]) -> list[Tensor]:
         """∂/∂κ of Σ_c w_cᵀK(κ)u_c, of the shapes of `conductivities`: weights times ∇w·∇u."""
@@ -218,10 +227,20 @@ def edge_lengths(
 
 
 def congruence(p: Any, matrix: sparse.csr_array) -> sparse.csr_array:
-    """PᵀAP, some rows at a time."""
+    """PᵀAP, some rows at a time, each of which is let go of once it is with the others."""
     left: Any = sparse.csr_array(p.T)
     parts = [left[first : first + ROWS] @ matrix @ p for first in range(0, p.shape[1], ROWS)]
-    return parts[0] if len(parts) == 1 else sparse.csr_array(sparse.vstack(parts))
+    if len(parts) == 1:
+        return parts[0]
+    length = np.concatenate([np.diff(part.indptr) for part in parts])
+    indptr = np.concatenate([[0], length.cumsum(dtype=parts[0].indptr.dtype)])
+    indices = np.empty(indptr[-1], parts[0].indices.dtype)
+    data, first = np.empty(indptr[-1], parts[0].dtype), 0
+    while parts:
+        part = parts.pop(0)
+        place = slice(first, first := first + part.nnz)
+        indices[place], data[place] = part.indices, part.data
+    return sparse.csr_array((data, indices, indptr), shape=2 * p.shape[1:])
 
 
 def _renumbered(matrix: Any, columns: Int[Tensor, " C"], count: int) -> sparse.csr_array:

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Complex, Float, Int
 from scipy import sparse
 from torch import Tensor
 
@@ -41,10 +42,56 @@ class SparsePair:
     col: Int[Tensor, " nnz"]
     values: Float[Tensor, "terms nnz"]
 
-    def restored(self, numbering: Numbering) -> SparsePair:
-        """With the user's numbers."""
-        crow, col, entry = numbering.restored_pattern(self.crow, self.col)
-        return SparsePair(crow, col, self.values[:, entry])
+
+@dataclass(frozen=True)
+class Pattern:
+    """Where the entries of a matrix with a symmetric pattern are in the user's numbers.
+
+    Attributes
+    ----------
+    crow, col
+        As of a `SparsePair`.
+    order, mirror
+        (nnz,), of each entry and of that across the diagonal the places in the matrix as it was computed.
+    diagonal
+        (N,), places of the diagonal.
+    given
+        (N,), the user's numbers of its rows as it was computed.
+    """
+
+    crow: Int[Tensor, " N_plus_1"]
+    col: Int[Tensor, " nnz"]
+    order: Int[np.ndarray, " nnz"]
+    mirror: Int[np.ndarray, " nnz"]
+    diagonal: Int[np.ndarray, " N"]
+    given: Int[np.ndarray, " N"]
+
+    @classmethod
+    def of(cls, matrix: Any, numbering: Numbering | None = None) -> Pattern:
+        """That of a matrix; without a numbering it is in the user's numbers."""
+        count = matrix.shape[0]
+        given = np.arange(count) if numbering is None else numbering.given.numpy()
+        given = given.astype(np.int32)
+        places = np.arange(matrix.nnz, dtype=np.int32), given[matrix.indices], matrix.indptr
+        turned: Any = sparse.csr_array(sparse.csr_array(places, shape=matrix.shape).T)
+        turned.indices = given[turned.indices]
+        whole: Any = sparse.csr_array(turned.T)  # sorted as it comes
+        del turned
+        mirror: Any = sparse.csr_array(whole.T)
+        row = np.arange(count, dtype=np.int32).repeat(np.diff(whole.indptr))
+        diagonal = np.flatnonzero(row == whole.indices)
+        crow, col = (torch.from_numpy(part).long() for part in (whole.indptr, whole.indices))
+        return cls(crow, col, whole.data, mirror.data, diagonal, given)
+
+    def symmetric(self, data: Complex[np.ndarray, " nnz"]) -> SparsePair:
+        """K + iM, exactly symmetric and with rows of K that sum to zero, as real matrices."""
+        total = data[self.order]
+        total += data[self.mirror]
+        values = np.empty((2, len(total)))
+        for value, part in zip(values, (total.real, total.imag), strict=True):
+            np.divide(part, 2, out=value)
+        values[0, self.diagonal] -= np.add.reduceat(values[0], self.crow.numpy()[:-1])
+        return SparsePair(self.crow, self.col, torch.from_numpy(values))
 
 
 @dataclass(frozen=True)
@@ -62,11 +109,6 @@ class WeakPair:
     matrices: SparsePair
     linear: SparsePair | None = None
     mass: Float[Tensor, " N"] | None = None
-
-    def restored(self, numbering: Numbering) -> WeakPair:
-        """With the user's numbers."""
-        linear = None if self.linear is None else self.linear.restored(numbering)
-        return WeakPair(self.matrices.restored(numbering), linear, self.mass)
 
 
 ELEMENTS = {1: (2, (2,)), 2: (2, (2,)), 3: (2, (3, 2)), 4: (3, (4, 2)), 5: (4, (6, 4, 2))}
@@ -95,15 +137,23 @@ class PairPlan:
     shares: Float[Tensor, " F"] | None
     lowered: Int[Tensor, " L"]
 
+    @cached_property
+    def patterns(self) -> dict[str, Pattern]:
+        """Those of the matrices, by their names in `WeakPair`, once they have been evaluated."""
+        return {}
+
     def forms(self, points: Float[Tensor, "N n"], fits: LocalFits) -> tuple[Forms, CurvedMesh]:
         """The elements at these points, from the fits there, and where their nodes stand."""
         mesh = self.curving.at(points, self.fits, fits)
         rest = self.stars, self.shares
         return Forms.curved(self.fits, fits, self.curving, mesh, *rest), mesh
 
-    def at(self, points: Float[Tensor, "N n"], fits: LocalFits) -> WeakPair:
-        """The pair at these points, from the fits there."""
-        return assembled_pair(self, *self.forms(points, fits), points)[0]
+    def at(
+        self, points: Float[Tensor, "N n"], fits: LocalFits, numbering: Numbering | None = None
+    ) -> WeakPair:
+        """The pair at these points, from the fits there, its matrices in the user's numbers."""
+        mesh = self.curving.at(points, self.fits, fits)
+        return assembled_pair(self, fits, mesh, numbering, self.patterns)[0]
 
     @property
     def counts(self) -> Int[Tensor, "4 N"]:
@@ -126,6 +176,7 @@ def mesh_pair(
     stars: Int[Tensor, "S corners"] | None = None,
     held: Bool[Tensor, " N"] | None = None,
     shares: Float[Tensor, " F"] | None = None,
+    numbering: Numbering | None = None,
 ) -> tuple[PairPlan, WeakPair]:
     """The pair of a mesh of d-simplices, from the fits of its vertices, with elements of degree r ≥ 2.
 
@@ -138,23 +189,34 @@ def mesh_pair(
     curving, mesh = curve(points, fit_plan, fits, nodes, boundary, held)
     stars = cells[:0] if stars is None else stars
     plan = PairPlan(fit_plan, curving, stars, shares, torch.zeros(0, dtype=torch.int64))
-    forms = Forms.curved(fit_plan, fits, curving, mesh, stars, shares)
-    pair, lowered = assembled_pair(plan, forms, mesh, points)
+    pair, lowered = assembled_pair(plan, fits, mesh, numbering, {})
     return replace(plan, lowered=lowered), pair
 
 
 def assembled_pair(
-    plan: PairPlan, forms: Forms, mesh: CurvedMesh, points: Float[Tensor, "N n"]
+    plan: PairPlan,
+    fits: LocalFits,
+    mesh: CurvedMesh,
+    numbering: Numbering | None,
+    patterns: dict[str, Pattern],
 ) -> tuple[WeakPair, Int[Tensor, " L"]]:
-    """The matrices and the mass, and the rows of P that were lowered for it."""
+    """The matrices in the user's numbers, the mass, and the rows of P that were lowered for it.
+
+    Patterns that are not known yet are found and kept.
+    """
+    forms = Forms.curved(plan.fits, fits, plan.curving, mesh, plan.stars, plan.shares)
     elements, near, flat = forms.elements(), forms.near(), _row_sums(forms.flat())
     p, weights = forms.prolongation, _row_sums(elements)
     mass, lowered = positive_mass(p, weights, plan, _row_sums(near) - flat)
-    rim = boundary_mass(points, plan.curving, mesh, p)
-    linear = stored(near)
-    del near
-    pair = stored(congruence(p, elements) + forms.flat(), rim)
-    return WeakPair(pair, linear, torch.from_numpy(mass + flat)), lowered
+    rim = boundary_mass(fits.points, plan.curving, mesh, p)
+    whole = forms.with_flat(congruence(p, elements))
+    del forms, p, elements  # as large as the pair
+    found = {}
+    for name, matrix in {"linear": near, "matrices": whole}.items():
+        if name not in patterns:
+            patterns[name] = Pattern.of(matrix, numbering)
+        found[name] = stored(matrix, rim if matrix is whole else None, patterns[name])
+    return WeakPair(**found, mass=torch.from_numpy(mass + flat)), lowered
 
 
 def positive_mass(
@@ -210,25 +272,16 @@ def boundary_mass(points: Tensor, plan: CurvingPlan, mesh: CurvedMesh, p: Any) -
     return result
 
 
-def stored(matrix: Any, rim: Any = None) -> SparsePair:
-    """K + iM, exactly symmetric and with rows of K that sum to zero, as real matrices; `rim` is the boundary's mass."""
-    matrix = sparse.csr_array(matrix)
-    matrix.sort_indices()
-    other: Any = sparse.csr_array(matrix.T)
-    count, crow, col = matrix.shape[0], matrix.indptr.astype(np.int64), matrix.indices
-    data = other.data
-    data += matrix.data
-    data /= 2
-    del matrix, other  # the largest of a build
-    values = np.stack([data.real, data.imag])
-    del data
-    row = np.arange(count, dtype=col.dtype).repeat(np.diff(crow))
-    values[0, row == col] -= np.add.reduceat(values[0], crow[:-1])
-    found = torch.from_numpy(values)
-    if rim is not None:
-        line: Any = sparse.coo_array((rim + rim.T) / 2)
-        extra = np.zeros_like(values[:1])
-        wanted = line.coords[0].astype(np.int64) * count + line.coords[1]
-        extra[0, np.searchsorted(row.astype(np.int64) * count + col, wanted)] = line.data
-        found = torch.cat([found, torch.from_numpy(extra)])
-    return SparsePair(torch.from_numpy(crow), torch.from_numpy(col).long(), found)
+def stored(matrix: Any, rim: Any = None, pattern: Pattern | None = None) -> SparsePair:
+    """K + iM as `Pattern.symmetric` makes it; `rim` is the boundary's mass, in the numbers of the matrix."""
+    pattern = Pattern.of(matrix) if pattern is None else pattern
+    pair = pattern.symmetric(matrix.data)
+    if rim is None:
+        return pair
+    line: Any = sparse.coo_array((rim + rim.T) / 2)
+    first, second = (pattern.given[place] for place in line.coords)
+    count = len(pair.crow) - 1
+    row = torch.arange(count).repeat_interleave(pair.crow.diff())
+    extra, wanted = np.zeros((1, len(row))), first.astype(np.int64) * count + second
+    extra[0, np.searchsorted((row * count + pair.col).numpy(), wanted)] = line.data
+    return replace(pair, values=torch.cat([pair.values, torch.from_numpy(extra)]))

@@ -80,12 +80,11 @@ class AssembledOperator:
     def restored(
         self, numbering: Numbering, points: Float[Tensor, "N n"], faces: Int[Tensor, "F v"]
     ) -> AssembledOperator:
-        """From a numbering to the user's; points and faces are the user's."""
+        """From a numbering to the user's, in which points, faces and pair are."""
         names = "frames", "normals", "normal_order", "mass", "on_boundary"
         tensors = {name: getattr(self, name) for name in names}
         values = {name: numbering.restored(t) for name, t in tensors.items() if t is not None}
         if self.fit_counts is not None:
             values["fit_counts"] = self.fit_counts[:, numbering.here]
-        pair = None if self.pair is None else self.pair.restored(numbering)
         rows = self.rows.restored(numbering)
-        return replace(self, **values, rows=rows, pair=pair, points=points, faces=faces)
+        return replace(self, **values, rows=rows, points=points, faces=faces)

@@ -142,7 +142,7 @@ def on_cells(
             assert shape.fits is not None
             own = shape.plan.fits, shape.fits, degree, degrees
             rest = {"held": shape.held, "shares": shape.plan.shares}
-            plan, pair = mesh_pair(here, corners, *own, **rest)
+            plan, pair = mesh_pair(here, corners, *own, **rest, numbering=numbering)
             assert pair.mass is not None
             shape = replace(shape, areas=pair.mass)
         built = replace(finished(shape, source, options, progress, pair, plan), faces=cells)

@@ -159,7 +159,8 @@ def _on_surface(
         assert shape.plan is not None
         assert shape.fits is not None
         own = surface.cells, shape.plan.fits, shape.fits, degree, degrees
-        plan, pair = mesh_pair(shape.points, *own, surface.stars, shape.held)
+        rest = surface.stars, shape.held
+        plan, pair = mesh_pair(shape.points, *own, *rest, numbering=numbering)
         assert pair.mass is not None
         shape = replace(shape, areas=pair.mass)
         warn_of_doubts(surface, plan.fits, pair.mass)

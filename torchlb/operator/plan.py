@@ -94,7 +94,7 @@ def evaluate(plan: Plan, points: Float[Tensor, "N n"]) -> AssembledOperator:
         )
     with renumbered(plan.numbering.given), threads_for(len(points)):
         placed, fits = plan.shape.at(here)
-        pair = plan.pair.at(fits.points, fits)
+        pair = plan.pair.at(fits.points, fits, plan.numbering)
         assert pair.mass is not None
         shape = Shape(
             **vars(placed),
