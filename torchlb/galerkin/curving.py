@@ -5,6 +5,7 @@ Curves along the boundary, mollified lengths and normals are of triangles alone;
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Protocol, runtime_checkable
 
@@ -22,6 +23,8 @@ from torchlb.geometry.frames import vertex_normals
 from torchlb.geometry.local_fits import FitPlan, LocalFits
 from torchlb.geometry.vectors import at
 
+AT_ONCE = 2**11
+"""Vertices whose nodes are looked at together: some 10 MB at degree 4."""
 ROUNDS = 2
 """Of moving the nodes to the graphs of their vertices."""
 AGREE, STEEP = 0.075, 0.3
@@ -34,11 +37,30 @@ STRETCH = 3.0
 
 @dataclass(frozen=True)
 class Ends:
-    """Pairs of a node beyond the vertices and a vertex that it asks, with the vertex's share."""
+    """Pairs of a node beyond the vertices and a vertex that it asks, by the vertices.
+
+    Attributes
+    ----------
+    node, vertex, share
+        (E,), the pairs, with the vertex's share in the node.
+    uses
+        (N,), number of ends at each vertex.
+    """
 
     node: Int[Tensor, " E"]
     vertex: Int[Tensor, " E"]
     share: Float[Tensor, " E"]
+    uses: Int[Tensor, " N"]
+
+    def of(
+        self, vertices: Int[Tensor, " b"]
+    ) -> Iterator[tuple[Int[Tensor, " c"], Int[Tensor, "c e"], Bool[Tensor, "c e"]]]:
+        """Some places in `vertices` at a time, the numbers of the ends there, padded, and which are no padding."""
+        start, uses = (self.uses.cumsum(0) - self.uses)[vertices], self.uses[vertices]
+        for part in uses.argsort().split(AT_ONCE):  # of about as many ends each
+            slot = torch.arange(int(uses[part[-1]]))
+            own = start[part, None] + slot
+            yield part, own.clamp_max(len(self.node) - 1), slot < uses[part, None]
 
 
 @dataclass(frozen=True)
@@ -101,8 +123,8 @@ class CurvingPlan:
     def at(self, points: Float[Tensor, "N n"], plan: FitPlan, fits: LocalFits) -> CurvedMesh:
         """The cells at these points."""
         nodes, boundary = self.nodes, self.boundary.at(points)
-        flat = flat_places(points, nodes)
-        standing, _ = _moved(points, plan, fits, nodes, _start(flat, boundary), boundary)
+        ends, flat = node_ends(nodes, len(points)), flat_places(points, nodes)
+        standing, _ = _moved(points, plan, fits, nodes, ends, _start(flat, boundary), boundary)
         places = torch.cat([points, torch.where(self.bent[:, None], standing, flat)])
         lengths, some = (
             sound_lengths(nodes.lengths(points), nodes.cells),
@@ -113,7 +135,7 @@ class CurvingPlan:
         for part in some.nonzero()[:, 0].split(CHUNK):
             g[part] = metric(places, nodes.elements[part], shape)
         cover = self.cover(lengths, self.flips)
-        return CurvedMesh(places, g, lengths, cover, boundary)
+        return CurvedMesh(places, g, lengths, cover, boundary, ends)
 
     def cover(self, lengths: Float[Tensor, "F e"], flips: list[Tensor] | None) -> Cover | None:
         """The Delaunay triangulation of the coarse triangles and their mirror image, glued along the free boundary."""
@@ -140,6 +162,8 @@ class CurvedMesh:
         What stands for the coarse triangles; None if there are none.
     boundary
         What is known of the nodes along the boundary.
+    ends
+        Which vertices the nodes ask.
     """
 
     places: Float[Tensor, "NX n"]
@@ -147,6 +171,7 @@ class CurvedMesh:
     lengths: Float[Tensor, "F e"]
     cover: Cover | None
     boundary: BoundaryNodes
+    ends: Ends
 
 
 def curve(
@@ -163,8 +188,9 @@ def curve(
     edges between them are no mirrors.
     """
     boundary, flat = edge_nodes.at(points), flat_places(points, nodes)
+    ends = node_ends(nodes, len(points))
     start = _start(flat, boundary)
-    standing, sound = _moved(points, plan, fits, nodes, start, boundary)
+    standing, sound = _moved(points, plan, fits, nodes, ends, start, boundary)
     ratio = (start - flat).norm(dim=1) / _sizes(points, nodes)
     curved, *whole = nodes.by_side(sound & (ratio <= STEEP))
     uses = nodes.sides[2].uses
@@ -183,7 +209,7 @@ def curve(
     cover = decided.cover(lengths, None)
     if cover is not None:
         decided.flips.extend(cover.flips)
-    return decided, CurvedMesh(places, g, lengths, cover, boundary)
+    return decided, CurvedMesh(places, g, lengths, cover, boundary, ends)
 
 
 def flat_places(points: Float[Tensor, "N n"], nodes: Nodes) -> Float[Tensor, "X n"]:
@@ -202,10 +228,13 @@ def _opposed(points: Tensor, nodes: Nodes) -> Bool[Tensor, " E"]:
     return vertex_normals(points, nodes.faces)[nodes.edges].sum(1).norm(dim=1) <= 1
 
 
-def node_ends(nodes: Nodes) -> Ends:
-    """The vertices with a share in each node."""
+def node_ends(nodes: Nodes, count: int) -> Ends:
+    """The vertices, of so many, with a share in each node."""
     node, place = (nodes.shares > 0).nonzero(as_tuple=True)
-    return Ends(node, nodes.corners[node, place], nodes.shares[node, place])
+    vertex = nodes.corners[node, place]
+    order = vertex.argsort(stable=True)
+    uses = torch.bincount(vertex, minlength=count)
+    return Ends(node[order], vertex[order], nodes.shares[node, place][order], uses)
 
 
 def _sizes(points: Tensor, nodes: Nodes) -> Float[Tensor, " X"]:
@@ -219,6 +248,7 @@ def _moved(
     plan: FitPlan,
     fits: LocalFits,
     nodes: Nodes,
+    ends: Ends,
     start: Float[Tensor, "X n"],
     boundary: BoundaryNodes,
 ) -> tuple[Float[Tensor, "X n"], Bool[Tensor, " X"]]:
@@ -226,13 +256,12 @@ def _moved(
 
     Asked again from there they do so at the same place, but for h⁶. Nodes along the boundary of triangles stay.
     """
-    ends, size, place = node_ends(nodes), _sizes(points, nodes), start
-    parts = list(zip(ends.node.split(CHUNK), ends.vertex.split(CHUNK), strict=True))
-    apart = torch.zeros_like(size[ends.node])
+    size, place, lots = _sizes(points, nodes), start, list(ends.of(torch.arange(len(points))))
+    apart, moves = torch.zeros_like(at(size, ends.node)), torch.zeros_like(at(start, ends.node))
     for _ in range(ROUNDS):
-        moves = torch.cat(
-            [_to_graph(fits, plan.highest, at(place, node), vertex) for node, vertex in parts]
-        )
+        for vertices, own, used in lots:
+            asked = at(place, at(ends.node, own))
+            moves[own[used]] = _to_graph(fits, plan.highest, asked, vertices)[used]
         mean = torch.zeros_like(start).index_add_(0, ends.node, ends.share[:, None] * moves)
         place, apart = place + mean, (moves - at(mean, ends.node)).norm(dim=1)
     bad = (apart > AGREE * at(size, ends.node)) | (plan.degree[ends.vertex] == 0)
@@ -244,13 +273,13 @@ def _moved(
 
 
 def _to_graph(
-    fits: LocalFits, degree: int, places: Float[Tensor, "E n"], vertex: Int[Tensor, " E"]
-) -> Float[Tensor, "E n"]:
-    """From places to the graph of the surface at a vertex, orthogonally to its frame."""
-    frame, offset = at(fits.initial, vertex), places - at(fits.points, vertex)
-    along = offset[:, None] @ frame
+    fits: LocalFits, degree: int, places: Float[Tensor, "c e n"], vertex: Int[Tensor, " c"]
+) -> Float[Tensor, "c e n"]:
+    """From places to the graph of the surface at each vertex, orthogonally to its frame."""
+    frame, offset = at(fits.initial, vertex), places - at(fits.points, vertex)[:, None]
+    along = offset @ frame
     powers = monomials(along / fits.surface_radius[vertex, None, None], degree)
-    return (powers @ at(fits.heights, vertex) + along @ frame.mT)[:, 0] - offset
+    return powers @ at(fits.heights, vertex) + along @ frame.mT - offset
 
 
 def _flattened(
