@@ -18,6 +18,7 @@ from torchlb.fits.polynomials import (
     laplacian_functional,
     monomial_derivatives,
     monomials,
+    num_monomials,
 )
 
 ON_LINE = 1e-5
@@ -165,8 +166,6 @@ class CenteredFit:
         (B, M − 1, K − 1). Their rows of |α| = 1, over the radius, are the weights of the gradient.
     radius
         (B,), ℓ: distance ρ of the farthest neighbour in local coordinates.
-    residual
-        (B,): largest violation of the moment equations of the first derivatives.
     values
         (B, K − 1, M − 1), the monomials V at the neighbours.
     root
@@ -177,14 +176,22 @@ class CenteredFit:
 
     coefficients: Float[Tensor, "B M neighbors"]
     radius: Float[Tensor, " B"]
-    residual: Float[Tensor, " B"]
     values: Float[Tensor, "B neighbors M"]
     root: Float[Tensor, "B neighbors"]
     degree: int
 
-    def lebesgue(self, places: Float[Tensor, "B P d"]) -> Float[Tensor, " B"]:
-        """Lebesgue constant: by how much the fit can exceed the values at these places, ℓ, in local coordinates."""
-        rows = cardinal(self.coefficients, places / self.radius[:, None, None], self.degree)
+    def residual(self, dim: int) -> Float[Tensor, " B"]:
+        """Largest violation of the moment equations of the `dim` first derivatives."""
+        wanted = torch.eye(self.values.shape[-1])[:dim].to(self.values)
+        return (self.coefficients[:, :dim] @ self.values - wanted).abs().amax((1, 2))
+
+    def lebesgue(self, places: Float[Tensor, "B P d"], degree: int) -> Float[Tensor, " B"]:
+        """Lebesgue constant: by how much the fit can exceed the values at these places, ℓ, in local coordinates.
+
+        Of its terms up to a degree.
+        """
+        kept = self.coefficients[:, : num_monomials(places.shape[2], degree) - 1]
+        rows = cardinal(kept, places / self.radius[:, None, None], degree)
         return rows.abs().sum(-1).amax(1)
 
     def misfit(
@@ -210,10 +217,7 @@ def centered_fit(
     """
     radius, _, values, root = scaled_system(coords, degree, keep)
     coefficients, _ = left_inverse(values, root)
-    dim = coords.shape[-1]
-    first = coefficients[:, :dim] @ values - torch.eye(values.shape[-1])[:dim].to(values)
-    residual = first.abs().amax((1, 2))
-    return CenteredFit(coefficients, radius, residual, values, root, degree)
+    return CenteredFit(coefficients, radius, values, root, degree)
 
 
 def cardinal(

@@ -85,11 +85,12 @@ class Pattern:
 
     def symmetric(self, data: Complex[np.ndarray, " nnz"]) -> SparsePair:
         """K + iM, exactly symmetric and with rows of K that sum to zero, as real matrices."""
-        total = data[self.order]
-        total += data[self.mirror]
-        values = np.empty((2, len(total)))
-        for value, part in zip(values, (total.real, total.imag), strict=True):
-            np.divide(part, 2, out=value)
+        values = np.empty((2, len(data)))
+        for value, part in zip(values, (data.real, data.imag), strict=True):
+            np.multiply(part, 0.5, out=value)
+            half = value.copy()
+            np.take(half, self.order, out=value, mode="clip")  # unbuffered
+            value += half.take(self.mirror)
         values[0, self.diagonal] -= np.add.reduceat(values[0], self.crow.numpy()[:-1])
         return SparsePair(self.crow, self.col, torch.from_numpy(values))
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from math import ceil
 
 import torch
@@ -115,7 +114,7 @@ class FitSearch:
         for number, rows, index in search:
             block = _block(self.candidates[number].degree, centers[rows], index)
             fit, heights, graph = self.fits.fitted(block)
-            regular = is_regular(fit, middles[rows])
+            regular = is_regular(fit, middles[rows], block.degree)
             flat_enough = slope_of(fit, graph, self.fits.initial).square().sum((1, 2)) <= steepest
             passed = regular & flat_enough  # false for NaN
             self.order[centers[rows[passed]]] = block.degree
@@ -182,20 +181,19 @@ class FitSearch:
         self, block: Neighborhoods, fit: CenteredFit, heights: Tensor, graph: Tensor
     ) -> Bool[Tensor, " b"]:
         """Keep the fits of functions that pass; which do."""
-        terms = num_monomials(self.balls.dim, min(block.degree, self.jet)) - 1
-        kept = replace(
-            fit,
-            coefficients=fit.coefficients[:, :terms],
-            values=fit.values[..., :terms],
-            degree=min(block.degree, self.jet),
-        )
-        regular = is_regular(kept, self.balls.middles(block.vertices))
+        degree = min(block.degree, self.jet)
+        terms = num_monomials(self.balls.dim, degree) - 1
+        regular = is_regular(fit, self.balls.middles(block.vertices), degree)
         good = self._keep_surface(block, fit, heights, graph, regular, torch.zeros_like(regular))
         if good.any():
             found, size = block.vertices[good], block.points.shape[1]
             none = torch.zeros(2, len(found), dtype=torch.bool)
             self._pile(self._functions, block).add(
-                found, block.points[good].int(), block.keep[good], *none, kept.coefficients[good]
+                found,
+                block.points[good].int(),
+                block.keep[good],
+                *none,
+                fit.coefficients[good, :terms],
             )
             self.degree[found], self.size[found] = block.degree, size
             self.fits.radius[found] = fit.radius[good]
@@ -256,6 +254,12 @@ def _kept(degree: int, columns: list[Tensor], rows: Bool[Tensor, " b"]) -> Neigh
     return Neighborhoods(degree, *(column[rows] for column in columns))
 
 
-def is_regular(fit: CenteredFit, middles: Float[Tensor, "B E d"]) -> Bool[Tensor, " B"]:
-    """Whether the neighbours determine a fit, and well in the middles of the edges, ℓ: `MAX_LEBESGUE`."""
-    return (fit.residual <= MAX_RESIDUAL) & (fit.lebesgue(middles) <= MAX_LEBESGUE)
+def is_regular(
+    fit: CenteredFit, middles: Float[Tensor, "B E d"], degree: int
+) -> Bool[Tensor, " B"]:
+    """Whether the neighbours determine a fit, and well in the middles of the edges, ℓ: `MAX_LEBESGUE`.
+
+    Of its terms up to a degree.
+    """
+    exact = fit.residual(middles.shape[2]) <= MAX_RESIDUAL
+    return exact & (fit.lebesgue(middles, degree) <= MAX_LEBESGUE)

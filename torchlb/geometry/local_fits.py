@@ -143,24 +143,27 @@ class LocalFits:
             terms = num_monomials(dim, min(block.degree, plan.jet)) - 1
             kept = points.new_empty(len(block.vertices), terms, block.keep.shape[1])
             for place, part in block.parts(dim):
-                fit, _, _ = found.fitted(part)
+                fit, *_ = found.fit(part)
                 kept[place] = fit.coefficients[:, :terms]
                 found.radius[part.vertices] = fit.radius
             found.coefficients.append(kept)
         return found
 
+    def fit(self, block: Neighborhoods) -> tuple[CenteredFit, Tensor, Tensor]:
+        """The fits; vectors to the neighbours, (b, K − 1, n), and their components in the initial planes."""
+        frame, places = at(self.initial, block.vertices), at(self.points, block.points)
+        offset = places[:, 1:] - places[:, :1]
+        coords, keep = offset @ frame, None if block.keep.all() else block.keep
+        return centered_fit(coords, block.degree, keep), offset, coords
+
     def fitted(
         self, block: Neighborhoods
     ) -> tuple[CenteredFit, Float[Tensor, "b neighbors n"], Float[Tensor, "b M n"]]:
         """The fits, the heights over the initial planes that they are to follow, and the graphs that they make."""
-        frame, places = at(self.initial, block.vertices), at(self.points, block.points)
-        offset = places[:, 1:] - places[:, :1]
-        coords = offset @ frame
-        heights = offset - coords @ frame.mT
-        keep = None if block.keep.all() else block.keep
-        if keep is not None:
-            heights = heights * keep[..., None]
-        fit = centered_fit(coords, block.degree, keep)
+        fit, offset, coords = self.fit(block)
+        heights = offset - coords @ at(self.initial, block.vertices).mT
+        if not block.keep.all():
+            heights = heights * block.keep[..., None]
         return fit, heights, fit.coefficients @ heights
 
     def take_surface(

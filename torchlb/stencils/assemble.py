@@ -204,7 +204,7 @@ class Stencils:
         """Weights of a batch, with the data of the boundary where `with_data` says so.
 
         Where they were decided for, positive ones are of the neighbours `keep`, and gradients beside data of the degree
-        `slope`.
+        `slope`; what they leave of the heights is not asked then.
         """
         parts, order = [], []
         for data, rows in ((False, ~with_data), (True, with_data)):
@@ -225,7 +225,7 @@ class Stencils:
     ) -> Weights:
         points, frames = self.shape.points, self.shape.frames
         coords = local_offsets(points, frames, centers, index[:, 1:], self.projection)
-        heights = self._heights(centers, index, coords)
+        heights = self._heights(centers, index, coords) if slope is None else None
         if keep is not None:
             return least_squares_weights(coords, candidate.degree, keep, heights=heights)
         return WEIGHT_RULES[candidate.rule](coords, candidate.degree, heights=heights)
@@ -254,7 +254,7 @@ class Stencils:
             weights = positive_weights(coords, degree, flux=flux, share=share[index])
         else:
             weights = least_squares_weights(coords, degree, keep, flux, share[index])
-        heights = self._heights(centers, index, coords)
+        heights = self._heights(centers, index, coords) if slope is None else None
         free = part = least_squares_weights(coords, degree, heights=heights)
         gradient, left = free.gradient.clone(), torch.arange(len(centers))
         settled = torch.zeros_like(left) if slope is None else slope
