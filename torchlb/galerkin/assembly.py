@@ -149,5 +149,9 @@ def summed(
     """The matrix of all elements from the matrix of each, rows by rows."""
     size, nodes = nodes.shape[1], nodes.int()
     row, col = nodes.repeat_interleave(size, dim=1).flatten(), nodes.repeat(1, size).flatten()
-    where = row.numpy(), col.numpy()
-    return sparse.csr_array((blocks.flatten().numpy(), where), shape=(num_nodes, num_nodes))
+    entries = blocks.flatten().numpy(), (row.numpy(), col.numpy())
+    del blocks, row, col
+    result = sparse.csr_array(entries, shape=(num_nodes, num_nodes))
+    del entries
+    result.data, result.indices = result.data.copy(), result.indices.copy()  # without duplicates
+    return result

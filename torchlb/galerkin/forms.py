@@ -171,40 +171,37 @@ class Forms:
         return found
 
     def matrix(self, conductivities: list[Tensor] | None = None) -> sparse.csr_array:
-        """K + iM, (N, N), positive semidefinite for every κ > 0; the rows of K sum to zero."""
+        """K + iM, (N, N), positive semidefinite for every κ > 0, the upper triangle; the rows of K sum to zero."""
         kappa = None if conductivities is None else conductivities[0]
-        return self.with_flat(congruence(self.prolongation, self.elements(kappa)), conductivities)
+        elements = summed(self.blocks(kappa), self.nodes, self.prolongation.shape[0])
+        return upper_congruence(self.prolongation, elements) + self.flat(conductivities)
 
-    def elements(self, conductivity: Float[Tensor, "T Q"] | None = None) -> sparse.csr_array:
-        """K_FE + iM_FE of the curved elements, (N + X, N + X)."""
+    def blocks(self, conductivity: Float[Tensor, "T Q"] | None = None) -> Tensor:
+        """K_FE + iM_FE of each of the curved elements, (T, n²)."""
         blocks = element_matrices(self.metric, self.element, conductivity)
-        blocks = blocks if self.shares is None else self.shares[:, None] * blocks
-        return summed(blocks, self.nodes, self.prolongation.shape[0])
+        return blocks if self.shares is None else self.shares[:, None] * blocks
 
     def near(self, conductivities: list[Tensor] | None = None) -> sparse.csr_array:
-        """K₁ + iM₁ of linear elements on flat simplices, with the mean of κ on each: it preconditions."""
+        """K₁ + iM₁ of linear elements on flat simplices, with the mean of κ on each: it preconditions.
+
+        The upper triangle.
+        """
         means = None
         if conductivities is not None:
             means = conductivities[0] @ self.element.weights / self.element.weights.sum()
         count = self.prolongation.shape[1]
         own = linear_elements(self.lengths, self.cells, count, means, shares=self.shares)
-        return self.with_flat(own, conductivities)
+        return sparse.triu(own, format="csr") + self.flat(conductivities)
 
-    def flat(self) -> sparse.csr_array:
-        """K + iM of the flat cells."""
+    def flat(self, conductivities: list[Tensor] | None = None) -> sparse.csr_array:
+        """K + iM of the flat cells, the upper triangle."""
         count = self.prolongation.shape[1]
-        return self.with_flat(sparse.csr_array((count, count), dtype=complex))
-
-    def with_flat(
-        self, matrix: Any, conductivities: list[Tensor] | None = None
-    ) -> sparse.csr_array:
-        """A matrix with that of the flat cells added."""
+        total: Any = sparse.csr_array((count, count), dtype=complex)
         for number, flat in enumerate(self.flats, 1):
             kappa = None if conductivities is None else conductivities[number]
-            rest = matrix.shape[0], kappa
-            part = linear_elements(flat.lengths, flat.cells, *rest, lumped=flat.lumped)
-            matrix = matrix + flat.share * part
-        return matrix
+            part = linear_elements(flat.lengths, flat.cells, count, kappa, lumped=flat.lumped)
+            total = total + flat.share * sparse.triu(part, format="csr")
+        return total
 
     def sensitivity(self, w: Float[Tensor, "N C"], u: Float[Tensor, "N C"]) -> list[Tensor]:
         """∂/∂κ of Σ_c w_cᵀK(κ)u_c, of the shapes of `conductivities`: weights times ∇w·∇u."""
@@ -226,21 +223,21 @@ def edge_lengths(
     return (ends[:, :, 1] - ends[:, :, 0]).norm(dim=2)
 
 
-def congruence(p: Any, matrix: sparse.csr_array) -> sparse.csr_array:
-    """PᵀAP, some rows at a time, each of which is let go of once it is with the others."""
-    left: Any = sparse.csr_array(p.T)
-    parts = [left[first : first + ROWS] @ matrix @ p for first in range(0, p.shape[1], ROWS)]
-    if len(parts) == 1:
-        return parts[0]
-    length = np.concatenate([np.diff(part.indptr) for part in parts])
-    indptr = np.concatenate([[0], length.cumsum(dtype=parts[0].indptr.dtype)])
-    indices = np.empty(indptr[-1], parts[0].indices.dtype)
-    data, first = np.empty(indptr[-1], parts[0].dtype), 0
-    while parts:
-        part = parts.pop(0)
-        place = slice(first, first := first + part.nnz)
-        indices[place], data[place] = part.indices, part.data
-    return sparse.csr_array((data, indices, indptr), shape=2 * p.shape[1:])
+def upper_congruence(p: Any, matrix: sparse.csr_array) -> sparse.csr_array:
+    """The upper triangle of the symmetric PᵀAP, some rows at a time."""
+    left, parts, count = sparse.csr_array(p.T), [], p.shape[1]
+    for first in range(0, count, ROWS):
+        part: Any = left[first : first + ROWS] @ matrix @ p
+        row = np.arange(first, first + part.shape[0], dtype=np.int32).repeat(np.diff(part.indptr))
+        upper = np.flatnonzero(part.indices >= row)
+        length = np.bincount(row[upper] - first, minlength=part.shape[0])
+        parts.append((length, part.indices.take(upper), part.data.take(upper)))
+    indptr = np.concatenate([[0], *(length for length, *_ in parts)]).cumsum()
+    indices, data = np.empty(indptr[-1], np.int32), np.empty(indptr[-1], parts[0][2].dtype)
+    for first in range(0, count, ROWS):
+        place = slice(indptr[first], indptr[min(first + ROWS, count)])
+        _, indices[place], data[place] = parts.pop(0)  # which frees it
+    return sparse.csr_array((data, indices, indptr), shape=(count, count))
 
 
 def _renumbered(matrix: Any, columns: Int[Tensor, " C"], count: int) -> sparse.csr_array:

@@ -12,12 +12,12 @@ from jaxtyping import Bool, Complex, Float, Int
 from scipy import sparse
 from torch import Tensor
 
-from torchlb.galerkin.assembly import area_element, assemble_mass, metric
+from torchlb.galerkin.assembly import area_element, assemble_mass, metric, summed
 from torchlb.galerkin.boundary import boundary_nodes
 from torchlb.galerkin.coarse import boundary_shares
 from torchlb.galerkin.curving import CurvedMesh, CurvingPlan, curve
 from torchlb.galerkin.elements import simplex
-from torchlb.galerkin.forms import Forms, congruence
+from torchlb.galerkin.forms import Forms, upper_congruence
 from torchlb.galerkin.nodes import lagrange_nodes
 from torchlb.geometry.local_fits import FitPlan, LocalFits
 from torchlb.geometry.numbering import Numbering
@@ -45,52 +45,48 @@ class SparsePair:
 
 @dataclass(frozen=True)
 class Pattern:
-    """Where the entries of a matrix with a symmetric pattern are in the user's numbers.
+    """Where the entries of a symmetric matrix, of which the upper triangle was computed, are in the user's numbers.
 
     Attributes
     ----------
     crow, col
         As of a `SparsePair`.
-    order, mirror
-        (nnz,), of each entry and of that across the diagonal the places in the matrix as it was computed.
+    order
+        (nnz,), of each entry the place in the upper triangle.
     diagonal
         (N,), places of the diagonal.
     given
-        (N,), the user's numbers of its rows as it was computed.
+        (N,), the user's numbers of the rows that the triangle was computed in.
     """
 
     crow: Int[Tensor, " N_plus_1"]
     col: Int[Tensor, " nnz"]
     order: Int[np.ndarray, " nnz"]
-    mirror: Int[np.ndarray, " nnz"]
     diagonal: Int[np.ndarray, " N"]
     given: Int[np.ndarray, " N"]
 
     @classmethod
-    def of(cls, matrix: Any, numbering: Numbering | None = None) -> Pattern:
-        """That of a matrix; without a numbering it is in the user's numbers."""
-        count = matrix.shape[0]
+    def of(cls, upper: Any, numbering: Numbering | None = None) -> Pattern:
+        """That of a matrix from its upper triangle; without a numbering it is in the user's numbers."""
+        count = upper.shape[0]
         given = np.arange(count) if numbering is None else numbering.given.numpy()
         given = given.astype(np.int32)
-        places = np.arange(matrix.nnz, dtype=np.int32), given[matrix.indices], matrix.indptr
-        turned: Any = sparse.csr_array(sparse.csr_array(places, shape=matrix.shape).T)
-        turned.indices = given[turned.indices]
-        whole: Any = sparse.csr_array(turned.T)  # sorted as it comes
-        del turned
-        mirror: Any = sparse.csr_array(whole.T)
+        row, col = given.repeat(np.diff(upper.indptr)), given[upper.indices]
+        beyond = np.flatnonzero(row != col).astype(np.int32)
+        places = np.concatenate([np.arange(upper.nnz, dtype=np.int32), beyond])
+        where = np.concatenate([row, col[beyond]]), np.concatenate([col, row[beyond]])
+        whole: Any = sparse.csr_array((places, where), shape=upper.shape)
+        del places, where, beyond
         row = np.arange(count, dtype=np.int32).repeat(np.diff(whole.indptr))
         diagonal = np.flatnonzero(row == whole.indices)
         crow, col = (torch.from_numpy(part).long() for part in (whole.indptr, whole.indices))
-        return cls(crow, col, whole.data, mirror.data, diagonal, given)
+        return cls(crow, col, whole.data, diagonal, given)
 
-    def symmetric(self, data: Complex[np.ndarray, " nnz"]) -> SparsePair:
-        """K + iM, exactly symmetric and with rows of K that sum to zero, as real matrices."""
-        values = np.empty((2, len(data)))
+    def pair(self, data: Complex[np.ndarray, " upper"]) -> SparsePair:
+        """K + iM from the upper triangle as real matrices, the rows of K summing to zero."""
+        values = np.empty((2, len(self.order)))
         for value, part in zip(values, (data.real, data.imag), strict=True):
-            np.multiply(part, 0.5, out=value)
-            half = value.copy()
-            np.take(half, self.order, out=value, mode="clip")  # unbuffered
-            value += half.take(self.mirror)
+            np.take(part.copy(), self.order, out=value, mode="clip")  # which is not buffered
         values[0, self.diagonal] -= np.add.reduceat(values[0], self.crow.numpy()[:-1])
         return SparsePair(self.crow, self.col, torch.from_numpy(values))
 
@@ -187,10 +183,10 @@ def mesh_pair(
     """
     nodes = lagrange_nodes(cells, len(points), degree, closed=shares is not None)
     boundary = boundary_nodes(points, nodes, degrees, held)
-    curving, mesh = curve(points, fit_plan, fits, nodes, boundary, held)
+    curving, *mesh = curve(points, fit_plan, fits, nodes, boundary, held)
     stars = cells[:0] if stars is None else stars
     plan = PairPlan(fit_plan, curving, stars, shares, torch.zeros(0, dtype=torch.int64))
-    pair, lowered = assembled_pair(plan, fits, mesh, numbering, {})
+    pair, lowered = assembled_pair(plan, fits, mesh.pop(), numbering, {})  # which lets go of it
     return replace(plan, lowered=lowered), pair
 
 
@@ -206,18 +202,23 @@ def assembled_pair(
     Patterns that are not known yet are found and kept.
     """
     forms = Forms.curved(plan.fits, fits, plan.curving, mesh, plan.stars, plan.shares)
-    elements, near, flat = forms.elements(), forms.near(), _row_sums(forms.flat())
-    p, weights = forms.prolongation, _row_sums(elements)
-    mass, lowered = positive_mass(p, weights, plan, _row_sums(near) - flat)
+    near, flat, p = forms.near(), forms.flat(), forms.prolongation
     rim = boundary_mass(fits.points, plan.curving, mesh, p)
-    whole = forms.with_flat(congruence(p, elements))
-    del forms, p, elements  # as large as the pair
+    blocks, nodes = [forms.blocks()], forms.nodes
+    del forms, mesh  # some of what is here is as large as the pair, and is let go of in time
+    fits.let_go()
+    elements = summed(blocks.pop(), nodes, p.shape[0])
+    weights, beside = elements.imag.sum(axis=1), _row_sums(flat)
+    mass, lowered = positive_mass(p, weights, plan, _row_sums(near) - beside)
+    upper = upper_congruence(p, elements)
+    upper = upper + flat if flat.nnz else upper
+    del p, elements
     found = {}
-    for name, matrix in {"linear": near, "matrices": whole}.items():
+    for name, matrix in {"linear": near, "matrices": upper}.items():
         if name not in patterns:
             patterns[name] = Pattern.of(matrix, numbering)
-        found[name] = stored(matrix, rim if matrix is whole else None, patterns[name])
-    return WeakPair(**found, mass=torch.from_numpy(mass + flat)), lowered
+        found[name] = stored(matrix, rim if matrix is upper else None, patterns[name])
+    return WeakPair(**found, mass=torch.from_numpy(mass + beside)), lowered
 
 
 def positive_mass(
@@ -252,10 +253,10 @@ def positive_mass(
     return mass, torch.from_numpy(np.flatnonzero(lowered) - count)
 
 
-def _row_sums(pair: Any) -> Float[np.ndarray, " N"]:
-    """M1."""
-    sums: Any = pair.sum(axis=1)
-    return sums.imag.copy()
+def _row_sums(upper: Any) -> Float[np.ndarray, " N"]:
+    """M1, from the upper triangle of K + iM."""
+    mass = upper.imag
+    return mass.sum(axis=1) + mass.sum(axis=0) - mass.diagonal()
 
 
 def boundary_mass(points: Tensor, plan: CurvingPlan, mesh: CurvedMesh, p: Any) -> Any:
@@ -273,10 +274,10 @@ def boundary_mass(points: Tensor, plan: CurvingPlan, mesh: CurvedMesh, p: Any) -
     return result
 
 
-def stored(matrix: Any, rim: Any = None, pattern: Pattern | None = None) -> SparsePair:
-    """K + iM as `Pattern.symmetric` makes it; `rim` is the boundary's mass, in the numbers of the matrix."""
-    pattern = Pattern.of(matrix) if pattern is None else pattern
-    pair = pattern.symmetric(matrix.data)
+def stored(upper: Any, rim: Any = None, pattern: Pattern | None = None) -> SparsePair:
+    """K + iM as `Pattern.pair` makes it; `rim` is the boundary's mass, in the numbers of the upper triangle."""
+    pattern = Pattern.of(upper) if pattern is None else pattern
+    pair = pattern.pair(upper.data)
     if rim is None:
         return pair
     line: Any = sparse.coo_array((rim + rim.T) / 2)

@@ -39,8 +39,9 @@ def prolongation(
             parts.append((count + asked[used], length, points.flatten(), weights[used].flatten()))
     row, length, col, value = (torch.cat(columns) for columns in zip(*parts, strict=True))
     del parts
-    indptr = torch.cat([length.new_zeros(1), length.cumsum(0)])
-    which = torch.ones(len(row)).numpy(), (row.numpy(), torch.arange(len(row)).numpy())
+    indptr = torch.cat([length.new_zeros(1), length.cumsum(0)]).int()
+    each = row.int().numpy(), torch.arange(len(row)).int().numpy()
+    which = torch.ones(len(row)).numpy(), each
     added: Any = sparse.csr_array(which, shape=(len(mesh.places), len(row)))
     entries = value.numpy(), col.numpy(), indptr.numpy()
     return added @ sparse.csr_array(entries, shape=(len(row), count))

@@ -149,6 +149,10 @@ class LocalFits:
             found.coefficients.append(kept)
         return found
 
+    def let_go(self) -> None:
+        """Of the graphs and the fits of functions, which nothing asks once there is a pair."""
+        self.heights, self.coefficients = self.heights[:0].clone(), []
+
     def fit(self, block: Neighborhoods) -> tuple[CenteredFit, Tensor, Tensor]:
         """The fits; vectors to the neighbours, (b, K − 1, n), and their components in the initial planes."""
         frame, places = at(self.initial, block.vertices), at(self.points, block.points)

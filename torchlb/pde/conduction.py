@@ -7,6 +7,7 @@ from typing import Any
 
 import torch
 from jaxtyping import Float
+from scipy import sparse
 from torch import Tensor
 
 from torchlb.errors import InputError, first_few
@@ -99,7 +100,8 @@ def _with_rest(pair: Csr, matrix: Any) -> tuple[Tensor, Tensor, Tensor]:
     """K(κ) with M, and with what the condition adds, whatever κ is."""
     shape = pair.num_rows, pair.num_rows
     _, mass, *rest = (to_scipy(pair.crow, pair.col, v.double(), shape) for v in pair.values)
-    found = stored(matrix.real + 1j * mass, rest[1] if len(rest) > 1 else None)
+    upper = matrix.real + 1j * sparse.triu(mass, format="csr")
+    found = stored(upper, rest[1] if len(rest) > 1 else None)
     device = pair.values.device
     values = torch.stack([found.values[0] + found.values[2:].sum(0), found.values[1]])
     return found.crow.to(device), found.col.to(device), values.to(device)
