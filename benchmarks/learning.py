@@ -74,7 +74,8 @@ class Original:
         self.basis = Eigenbasis(
             tensor(values).clamp_min(0), evecs, self.mass, evecs * self.mass[:, None]
         )
-        self.num_pairs = k
+        self.modes = self
+        self.count = k
         gradients = tangent_gradients(points, None if faces is None else faces.numpy())
         self.stencil = Gradients(gradients)
 
@@ -86,14 +87,13 @@ class Original:
         self.basis = Eigenbasis(*(part.to(device) for part in parts))
         return self
 
-    def check_pair(self) -> None:
-        """Its basis stands for a pair."""
+    has_weak_form = True  # its basis stands for a pair
 
     def eigenbasis(self, k: int) -> Eigenbasis:
         return self.basis.truncate(k)
 
-    def has_pairs(self, k: int) -> bool:
-        return k <= self.num_pairs
+    def has(self, k: int) -> bool:
+        return k <= self.count
 
     def local_gradient(self, x: Tensor) -> Tensor:
         return torch.stack([torch.mm(values, x) for values in self.stencil], dim=1)

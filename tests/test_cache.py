@@ -440,5 +440,5 @@ def test_a_file_remembers_the_boundary_condition_and_the_spectral_radius(tmp_pat
     found = load_operator(tmp_path / "disk.npz")
     assert found.condition == "dirichlet"
     assert torch.equal(found.boundary, lb.boundary)
-    assert torch.equal(found.radius, lb.radius)
+    assert torch.equal(found.weak.radius, lb.weak.radius)
     assert repr(found) == repr(lb)

@@ -66,7 +66,7 @@ def test_stiffness_is_symmetric_and_positive_for_any_conductivity(kind):
     lb = build(kind)
     for count in (80, len(lb.faces)):
         kappa = (3 * torch.randn(count, dtype=torch.float64)).exp()
-        crow, col, values = conducting(lb, kappa).pair
+        crow, col, values = conducting(lb, kappa).weak.pair
         dense = torch.sparse_csr_tensor(crow, col, values[0]).to_dense()
         scale = dense.abs().max()
         assert (dense - dense.T).abs().max() <= 1e-12 * scale

@@ -49,7 +49,7 @@ def generator(lb):
 
 def lumped(lb):
     """K₁ of the linear pair and the row sums of M₁."""
-    crow, col, values = lb.linear_pair
+    crow, col, values = lb.weak.linear_pair
     stiffness, mass = (torch.sparse_csr_tensor(crow, col, v).to_dense() for v in values[:2])
     return stiffness, mass.sum(1)
 
@@ -205,7 +205,7 @@ def test_the_radius_bounds_the_spectrum_of_the_linear_pair(name):
     stiffness, diagonal = lumped(lb)
     root = diagonal.sqrt()
     largest = torch.linalg.eigvalsh(stiffness / root / root[:, None])[-1]
-    assert largest <= lb.radius <= 1.25 * largest
+    assert largest <= lb.weak.radius <= 1.25 * largest
 
 
 def test_a_surface_with_slivers_does_not_blow_up():

@@ -13,7 +13,7 @@ from torchlb.cloud.cocone import FOLD, best_manifold, wings
 from torchlb.fits.least_squares import left_inverse
 from torchlb.fits.weights import scaled_system
 from torchlb.galerkin import forms
-from torchlb.galerkin.pair import stored
+from torchlb.galerkin.pair import Pattern
 from torchlb.geometry.admission import MAX_SLOPE, MIN_ALIGNMENT, admissible, normal_frames
 from torchlb.geometry.complex import components, edges_of, spanning_pairs, tree_sides
 from torchlb.linalg import kernels
@@ -88,7 +88,8 @@ def test_stored_matrices_are_symmetric(count):
     matrix = sparse.csr_array(parts[0] + 1j * parts[1])
     matrix = sparse.csr_array(matrix + matrix.T + (1 + 1j) * sparse.eye_array(count))
     matrix.data *= 1 + 1e-15 * generator.standard_normal(len(matrix.data))
-    one = stored(sparse.triu(matrix, format="csr")[:, ::-1][:, ::-1])
+    upper = sparse.triu(matrix, format="csr")[:, ::-1][:, ::-1]
+    one = Pattern.of(upper).pair(upper)
     k, m = (sparse.csr_array((v, one.col, one.crow), 2 * (count,)).toarray() for v in one.values)
     assert np.array_equal(k, k.T)
     assert np.array_equal(m, m.T)

@@ -17,7 +17,7 @@ from torch.autograd import gradcheck, gradgradcheck
 
 from torchlb import InputError, LaplaceBeltrami, collate, load_or_build
 from torchlb.linalg.sparse import to_scipy
-from torchlb.operator.storage import BASIS
+from torchlb.operator.parts import BASIS
 from torchlb.surfaces import (
     Circle,
     CliffordTorus,
@@ -278,30 +278,30 @@ def test_the_spectral_radius_travels_with_it(lb):
     other = LaplaceBeltrami()
     other.load_state_dict(state)
     for copied in (copy.deepcopy(lb).half(), pickle.loads(pickle.dumps(lb)), other):
-        assert copied._radius is not None
-        assert copied.radius == lb.radius
+        assert copied.weak._radius is not None
+        assert copied.weak.radius == lb.weak.radius
     del state["_extra_state"]["radius"]
     other.load_state_dict(state)
-    assert other._radius is None
-    assert float(other.radius) == pytest.approx(float(lb.radius))
+    assert other.weak._radius is None
+    assert float(other.weak.radius) == pytest.approx(float(lb.weak.radius))
 
 
 def test_a_batch_has_the_radius_of_its_shapes():
     """The largest, which nothing is solved for."""
     shapes = [built(name) for name in ("points", "mesh", "cotangent")]
     batch = LaplaceBeltrami.batch(shapes)
-    assert batch._radius is not None
-    assert batch.radius == max(shape.radius for shape in shapes)
+    assert batch.weak._radius is not None
+    assert batch.weak.radius == max(shape.weak.radius for shape in shapes)
 
 
 def test_the_radius_bounds_the_linear_pair_with_lumped_mass(lb):
     """Eigenvalues of D⁻¹K₁, and by no more than a half too large."""
-    crow, col, (stiffness, mass, *_) = lb.linear_pair
+    crow, col, (stiffness, mass, *_) = lb.weak.linear_pair
     size = (lb.num_points, lb.num_points)
     k, m = (to_scipy(crow, col, values, size).toarray() for values in (stiffness, mass))
     root = m.sum(1) ** -0.5
     largest = np.linalg.eigvalsh(root[:, None] * k * root).max()
-    assert largest <= float(lb.radius) <= 1.5 * largest
+    assert largest <= float(lb.weak.radius) <= 1.5 * largest
 
 
 def test_repr_says_what_it_is(lb):
@@ -350,7 +350,7 @@ def test_unbatch_is_the_inverse_of_batch(pairs):
     for found, expected in zip(LaplaceBeltrami.batch(shapes).unbatch(), shapes, strict=True):
         assert_identical(found, expected)
     for shape in shapes:
-        shape.keep_basis(None, store=False)
+        shape._keep_basis(None, stored=False)
         for name in BASIS:
             setattr(shape.modes, name, shape.mass.new_zeros(0))
     nested = LaplaceBeltrami.batch([LaplaceBeltrami.batch(shapes[:2]), *shapes[2:]])

@@ -272,7 +272,7 @@ def test_a_batch_asks_for_the_pairs_that_one_of_its_shapes_lacks():
     long, short = (LaplaceBeltrami.from_mesh(*s.mesh(100)) for s in (Sphere(), Torus()))
     long.eigenbasis(40), short.eigenbasis(10)
     batch, f = LaplaceBeltrami.batch([long, short]), torch.randn(200, 2, dtype=torch.float64)
-    assert batch.num_pairs == 10
+    assert batch.modes.count == 10
     for method in ("deflated", "spectral"):
         for k in (10, 30):
             alone = [
@@ -281,7 +281,7 @@ def test_a_batch_asks_for_the_pairs_that_one_of_its_shapes_lacks():
             ]
             flowed = heat_flow(batch, f, 0.1, method=method, k=k)
             torch.testing.assert_close(flowed, torch.cat(alone), rtol=1e-6, atol=1e-6)
-    assert (long.num_pairs, short.num_pairs, batch.num_pairs) == (40, 30, 30)
+    assert (long.modes.count, short.modes.count, batch.modes.count) == (40, 30, 30)
 
 
 def test_a_batch_does_not_follow_what_becomes_of_its_shapes():

@@ -198,7 +198,7 @@ def info(file: Path) -> None:
         return
     lb = found["operator"]
     click.echo(f"{lb}\n\n{lb.report}\n{_stability(lb)}")
-    pairs = 0 if lb.basis is None else lb.basis.eigenvectors.shape[1]
+    pairs = lb.modes.left.shape[-1]
     click.echo(f"{pairs} eigenpairs stored")
     click.echo(f"{file.stat().st_size / 1e6:.1f} MB, written by torchlb {found['version']}")
 

@@ -186,10 +186,7 @@ class CenteredFit:
         return (self.coefficients[:, :dim] @ self.values - wanted).abs().amax((1, 2))
 
     def lebesgue(self, places: Float[Tensor, "B P d"], degree: int) -> Float[Tensor, " B"]:
-        """Lebesgue constant: by how much the fit can exceed the values at these places, ℓ, in local coordinates.
-
-        Of its terms up to a degree.
-        """
+        """Lebesgue constant: by how much its terms up to a degree can exceed the values at these places, ℓ."""
         kept = self.coefficients[:, : num_monomials(places.shape[2], degree) - 1]
         rows = cardinal(kept, places / self.radius[:, None, None], degree)
         return rows.abs().sum(-1).amax(1)

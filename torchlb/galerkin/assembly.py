@@ -5,6 +5,8 @@ A symmetric (d, d) matrix is kept as its upper triangle, row by row.
 
 from __future__ import annotations
 
+from itertools import combinations_with_replacement
+
 import torch
 from jaxtyping import Complex, Float, Int, Shaped
 from scipy import sparse
@@ -24,12 +26,13 @@ def metric(
     if dim == 0:
         return places.new_zeros(len(elements), len(shape.weights), 0)
     slopes = torch.cat([*shape.gradients.unbind(-1)]).T.contiguous()  # (n, d Q)
-    entries = [places.new_zeros(())] * (dim * (dim + 1) // 2)
+    entries = places.new_zeros(dim * (dim + 1) // 2, len(elements), len(shape.weights))
     for coordinate in places.T:
         along = (coordinate[elements] @ slopes).chunk(dim, 1)
-        products = [x * y for a, x in enumerate(along) for y in along[a:]]
-        entries = [entry + part for entry, part in zip(entries, products, strict=True)]
-    return torch.stack(entries, -1)
+        pairs = combinations_with_replacement(along, 2)
+        for entry, (x, y) in zip(entries, pairs, strict=True):
+            entry += x * y
+    return entries.movedim(0, -1)
 
 
 def flat_metric(lengths: Float[Tensor, "T e"]) -> Float[Tensor, "T S"]:
@@ -103,7 +106,7 @@ def element_matrices(
     for first in range(0, len(g), CHUNK):
         part = slice(first, first + CHUNK)
         root = area_element(g[part])
-        inverse = shape.weights[:, None] * cofactors(g[part]) / root[..., None]
+        inverse = cofactors(g[part]) * (shape.weights / root)[..., None]
         if conductivity is not None:
             inverse = conductivity[part, :, None] * inverse
         stiffness = inverse.flatten(1) @ gradients

@@ -37,15 +37,7 @@ STRETCH = 3.0
 
 @dataclass(frozen=True)
 class Ends:
-    """Pairs of a node beyond the vertices and a vertex that it asks, by the vertices.
-
-    Attributes
-    ----------
-    node, vertex, share
-        (E,), the pairs, with the vertex's share in the node.
-    uses
-        (N,), number of ends at each vertex.
-    """
+    """Pairs of a node beyond the vertices and a vertex that it asks, with its share, by vertices; how many of each."""
 
     node: Int[Tensor, " E"]
     vertex: Int[Tensor, " E"]

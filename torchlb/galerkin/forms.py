@@ -182,16 +182,14 @@ class Forms:
         return blocks if self.shares is None else self.shares[:, None] * blocks
 
     def near(self, conductivities: list[Tensor] | None = None) -> sparse.csr_array:
-        """K₁ + iM₁ of linear elements on flat simplices, with the mean of κ on each: it preconditions.
-
-        The upper triangle.
-        """
+        """K₁ + iM₁ of linear elements on flat simplices, with the mean of κ on each, the upper triangle."""
         means = None
         if conductivities is not None:
             means = conductivities[0] @ self.element.weights / self.element.weights.sum()
         count = self.prolongation.shape[1]
         own = linear_elements(self.lengths, self.cells, count, means, shares=self.shares)
-        return sparse.triu(own, format="csr") + self.flat(conductivities)
+        upper: Any = sparse.triu(own, format="csr")
+        return upper + self.flat(conductivities) if self.flats else upper
 
     def flat(self, conductivities: list[Tensor] | None = None) -> sparse.csr_array:
         """K + iM of the flat cells, the upper triangle."""

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Complex, Float, Int
+from jaxtyping import Bool, Float, Int
 from scipy import sparse
 from torch import Tensor
 
@@ -55,14 +55,18 @@ class Pattern:
         (nnz,), of each entry the place in the upper triangle.
     diagonal
         (N,), places of the diagonal.
+    indptr, indices
+        (N + 1,), (upper,), of that triangle as it was computed.
     given
-        (N,), the user's numbers of the rows that the triangle was computed in.
+        (N,), the user's numbers of the rows there.
     """
 
     crow: Int[Tensor, " N_plus_1"]
     col: Int[Tensor, " nnz"]
     order: Int[np.ndarray, " nnz"]
     diagonal: Int[np.ndarray, " N"]
+    indptr: Int[np.ndarray, " N_plus_1"]
+    indices: Int[np.ndarray, " upper"]
     given: Int[np.ndarray, " N"]
 
     @classmethod
@@ -80,14 +84,27 @@ class Pattern:
         row = np.arange(count, dtype=np.int32).repeat(np.diff(whole.indptr))
         diagonal = np.flatnonzero(row == whole.indices)
         crow, col = (torch.from_numpy(part).long() for part in (whole.indptr, whole.indices))
-        return cls(crow, col, whole.data, diagonal, given)
+        return cls(crow, col, whole.data, diagonal, upper.indptr, upper.indices, given)
 
-    def pair(self, data: Complex[np.ndarray, " upper"]) -> SparsePair:
-        """K + iM from the upper triangle as real matrices, the rows of K summing to zero."""
+    def is_of(self, upper: Any) -> bool:
+        """Whether it is that of a triangle: products leave out what is zero at some points, but not at others."""
+        ours, theirs = (self.indptr, self.indices), (upper.indptr, upper.indices)
+        return all(np.array_equal(x, y) for x, y in zip(ours, theirs, strict=True))
+
+    def pair(self, upper: Any, *others: Any) -> SparsePair:
+        """K + iM as real matrices, the rows of K summing to zero; beside them others, such as the boundary's mass."""
         values = np.empty((2, len(self.order)))
-        for value, part in zip(values, (data.real, data.imag), strict=True):
+        for value, part in zip(values, (upper.data.real, upper.data.imag), strict=True):
             np.take(part.copy(), self.order, out=value, mode="clip")  # which is not buffered
         values[0, self.diagonal] -= np.add.reduceat(values[0], self.crow.numpy()[:-1])
+        for other in others:
+            line: Any = sparse.coo_array((other + other.T) / 2)
+            first, second = (self.given[place].astype(np.int64) for place in line.coords)
+            count, crow = len(self.given), self.crow.numpy()
+            places = np.arange(count).repeat(np.diff(crow)) * count + self.col.numpy()
+            extra = np.zeros((1, len(places)))
+            extra[0, np.searchsorted(places, first * count + second)] = line.data
+            values = np.concatenate([values, extra])
         return SparsePair(self.crow, self.col, torch.from_numpy(values))
 
 
@@ -139,17 +156,14 @@ class PairPlan:
         """Those of the matrices, by their names in `WeakPair`, once they have been evaluated."""
         return {}
 
-    def forms(self, points: Float[Tensor, "N n"], fits: LocalFits) -> tuple[Forms, CurvedMesh]:
-        """The elements at these points, from the fits there, and where their nodes stand."""
-        mesh = self.curving.at(points, self.fits, fits)
-        rest = self.stars, self.shares
-        return Forms.curved(self.fits, fits, self.curving, mesh, *rest), mesh
+    def forms(self, fits: LocalFits, mesh: CurvedMesh | None = None) -> Forms:
+        """The elements from the fits at given points; `mesh` is where the cells are there, if it is known."""
+        mesh = self.curving.at(fits.points, self.fits, fits) if mesh is None else mesh
+        return Forms.curved(self.fits, fits, self.curving, mesh, self.stars, self.shares)
 
-    def at(
-        self, points: Float[Tensor, "N n"], fits: LocalFits, numbering: Numbering | None = None
-    ) -> WeakPair:
-        """The pair at these points, from the fits there, its matrices in the user's numbers."""
-        mesh = self.curving.at(points, self.fits, fits)
+    def at(self, fits: LocalFits, numbering: Numbering) -> WeakPair:
+        """The pair from the fits at given points, its matrices in the user's numbers."""
+        mesh = self.curving.at(fits.points, self.fits, fits)
         return assembled_pair(self, fits, mesh, numbering, self.patterns)[0]
 
     @property
@@ -201,7 +215,7 @@ def assembled_pair(
 
     Patterns that are not known yet are found and kept.
     """
-    forms = Forms.curved(plan.fits, fits, plan.curving, mesh, plan.stars, plan.shares)
+    forms = plan.forms(fits, mesh)
     near, flat, p = forms.near(), forms.flat(), forms.prolongation
     rim = boundary_mass(fits.points, plan.curving, mesh, p)
     blocks, nodes = [forms.blocks()], forms.nodes
@@ -211,13 +225,14 @@ def assembled_pair(
     weights, beside = elements.imag.sum(axis=1), _row_sums(flat)
     mass, lowered = positive_mass(p, weights, plan, _row_sums(near) - beside)
     upper = upper_congruence(p, elements)
-    upper = upper + flat if flat.nnz else upper
+    upper = upper + flat if flat.nnz else upper  # without a copy
     del p, elements
     found = {}
     for name, matrix in {"linear": near, "matrices": upper}.items():
-        if name not in patterns:
+        if name not in patterns or not patterns[name].is_of(matrix):
             patterns[name] = Pattern.of(matrix, numbering)
-        found[name] = stored(matrix, rim if matrix is upper else None, patterns[name])
+        more = () if rim is None or matrix is near else (rim,)
+        found[name] = patterns[name].pair(matrix, *more)
     return WeakPair(**found, mass=torch.from_numpy(mass + beside)), lowered
 
 
@@ -272,18 +287,3 @@ def boundary_mass(points: Tensor, plan: CurvingPlan, mesh: CurvedMesh, p: Any) -
         shares = boundary_shares(points, elements[coarse, :2], mesh.cover)
         result = result + sparse.diags_array(shares.numpy(), format="csr")
     return result
-
-
-def stored(upper: Any, rim: Any = None, pattern: Pattern | None = None) -> SparsePair:
-    """K + iM as `Pattern.pair` makes it; `rim` is the boundary's mass, in the numbers of the upper triangle."""
-    pattern = Pattern.of(upper) if pattern is None else pattern
-    pair = pattern.pair(upper.data)
-    if rim is None:
-        return pair
-    line: Any = sparse.coo_array((rim + rim.T) / 2)
-    first, second = (pattern.given[place] for place in line.coords)
-    count = len(pair.crow) - 1
-    row = torch.arange(count).repeat_interleave(pair.crow.diff())
-    extra, wanted = np.zeros((1, len(row))), first.astype(np.int64) * count + second
-    extra[0, np.searchsorted((row * count + pair.col).numpy(), wanted)] = line.data
-    return replace(pair, values=torch.cat([pair.values, torch.from_numpy(extra)]))

@@ -188,13 +188,9 @@ class FitSearch:
         if good.any():
             found, size = block.vertices[good], block.points.shape[1]
             none = torch.zeros(2, len(found), dtype=torch.bool)
-            self._pile(self._functions, block).add(
-                found,
-                block.points[good].int(),
-                block.keep[good],
-                *none,
-                fit.coefficients[good, :terms],
-            )
+            points, kept = block.points[good].int(), fit.coefficients[good, :terms]
+            rows = found, points, block.keep[good], *none, kept
+            self._pile(self._functions, block).add(*rows)
             self.degree[found], self.size[found] = block.degree, size
             self.fits.radius[found] = fit.radius[good]
         return good
@@ -254,12 +250,7 @@ def _kept(degree: int, columns: list[Tensor], rows: Bool[Tensor, " b"]) -> Neigh
     return Neighborhoods(degree, *(column[rows] for column in columns))
 
 
-def is_regular(
-    fit: CenteredFit, middles: Float[Tensor, "B E d"], degree: int
-) -> Bool[Tensor, " B"]:
-    """Whether the neighbours determine a fit, and well in the middles of the edges, ℓ: `MAX_LEBESGUE`.
-
-    Of its terms up to a degree.
-    """
+def is_regular(fit: CenteredFit, middles: Tensor, degree: int) -> Bool[Tensor, " B"]:
+    """Whether neighbours determine a fit, and terms up to a degree well in the middles (B, E, d) of the edges, ℓ."""
     exact = fit.residual(middles.shape[2]) <= MAX_RESIDUAL
     return exact & (fit.lebesgue(middles, degree) <= MAX_LEBESGUE)

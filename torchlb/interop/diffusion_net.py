@@ -159,7 +159,7 @@ def _tuple(
     gradient = torch.einsum("exd,de->xe", turn[row], lb.stencil.values[1:])
     weak = -lb.mass[row] * lb.stencil.values[0]
     if symmetric and lb.has_weak_form:
-        crow, col, values = lb.pair
+        crow, col, values = lb.weak.pair
         rows = torch.arange(lb.num_points).repeat_interleave(crow.diff())
         matrix = _coo(torch.stack([rows, col]), values[0], like)
     elif symmetric:

@@ -33,11 +33,12 @@ except ModuleNotFoundError as error:
 from torchlb.errors import InputError, TorchlbError, first_few, warn
 from torchlb.io.cache import load_or_build
 from torchlb.linalg.csr import Csr
-from torchlb.operator.batching import join_states, without_zeros
+from torchlb.operator.batching import join_states
 from torchlb.operator.dispatch import Operator, build_operator
 from torchlb.operator.laplace_beltrami import LaplaceBeltrami
-from torchlb.operator.storage import BASIS
+from torchlb.operator.parts import BASIS, PairMatrices
 from torchlb.spectral.eigenbasis import Eigenbasis, stack_eigenbases
+from torchlb.stencils.conditions import kind_of
 
 __all__ = ["LaplaceBeltramiTransform", "to_operator"]
 
@@ -167,9 +168,9 @@ def _keys(lb: LaplaceBeltrami, k: int) -> dict[str, Any]:
     }
     if len(lb.normals):
         keys["lb_normals"] = lb.normals
-    kind = lb.conditions[0]
+    kind = kind_of(lb.options.get("condition"))
     width = 3 if kind.conserves or kind.fixes else 4  # of every shape with this condition
-    for name, pair in {"stencil": lb.stencil, "weak": lb.weak, "linear": lb.near}.items():
+    for name, pair in {"stencil": lb.stencil, "weak": lb.weak, "linear": lb.weak.near}.items():
         more = 0 if name == "stencil" else width - len(pair.values)
         keys[f"lb_{name}_index"] = torch.stack([pair.col, pair.row])
         keys[f"lb_{name}_values"] = pad(pair.values, (0, 0, 0, more)).T.contiguous()
@@ -216,9 +217,10 @@ def _parts(data: Any, sizes: Int[Tensor, " S"]) -> dict[str, Any]:
         "points": points,
         "frames": data.lb_frames,
         "normals": data.get("lb_normals", points[:0]),
-        "on_boundary": boundary[: None if boundary.any() else 0],
+        "_on_boundary": boundary[: None if boundary.any() else 0],
         "faces": data.lb_face_index.T,
     }
+    pair = {}
     for name in ("stencil", "weak", "linear"):
         col, row = data[f"lb_{name}_index"]
         count = torch.bincount(row, minlength=len(points))
@@ -232,7 +234,9 @@ def _parts(data: Any, sizes: Int[Tensor, " S"]) -> dict[str, Any]:
             order_t = data.lb_order_t + ends[:-1].repeat_interleave(entries)
             parts[name] = Csr(crow, col.contiguous(), values, order_t)
         else:
-            parts[name] = without_zeros(Csr(crow, col.contiguous(), values))
+            pair[name] = Csr(crow, col.contiguous(), values)
+    if pair:
+        parts["weak"] = PairMatrices.trimmed(pair["weak"], pair["linear"])
     return parts
 
 

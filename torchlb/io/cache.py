@@ -85,7 +85,7 @@ def load_or_build(
     if path.parent.exists() and not path.parent.is_dir():
         raise InputError(f"cache: expected a folder, {path.parent} is a file")
     lb = None if overwrite else _cached(path, key)
-    if lb is None or not lb.has_pairs(k):
+    if lb is None or not lb.modes.has(k):
         if lb is None:
             lb = build_operator(points, corners, operator=operator, progress=progress, **options)
         if k > 0:

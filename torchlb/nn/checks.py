@@ -35,10 +35,10 @@ def check_features(
             f"expected features of the type of the layer's parameters, {parameter.dtype}, got {x.dtype}: cast one of "
             "them, x.to(…) or layer.to(…); the operator may have any type"
         )
-    if k and not torch.compiler.is_compiling() and lb.num_pairs and not lb.has_pairs(k):
+    if k and not torch.compiler.is_compiling() and lb.modes.count and not lb.modes.has(k):
         warnings.warn(
-            f"the operator holds a basis of {lb.num_pairs} pairs, a layer asks for k = {k}: it is solved anew, for "
-            f"each operator that is made; store k = {k} pairs, or give the layer k = {lb.num_pairs}",
+            f"the operator holds a basis of {lb.modes.count} pairs, a layer asks for k = {k}: it is solved anew, for "
+            f"each operator that is made; store k = {k} pairs, or give the layer k = {lb.modes.count}",
             stacklevel=2,
         )
     return torch.promote_types(x.dtype, torch.float32)

@@ -10,6 +10,7 @@ import torch
 
 from torchlb.errors import InputError
 from torchlb.linalg.csr import Csr, Record, starts
+from torchlb.operator.parts import PairMatrices
 from torchlb.operator.storage import OperatorStorage
 
 Parts = dict[str, Any]
@@ -29,10 +30,7 @@ def check_alike(shapes: Sequence[OperatorStorage]) -> None:
 
 
 def joined_parts(shapes: Sequence[OperatorStorage]) -> Parts:
-    """What the block-diagonal operator stores, from what its shapes store.
-
-    The weak pairs, if all shapes have one, and, if any shape has one of its own, the linear ones.
-    """
+    """What the block-diagonal operator stores, from what its shapes store."""
     parts: Parts = {
         n: torch.cat([getattr(s, n) for s in shapes]) for n in ("mass", "points", "frames")
     }
@@ -40,58 +38,34 @@ def joined_parts(shapes: Sequence[OperatorStorage]) -> Parts:
     parts["faces"] = torch.cat([s.faces + start for s, start in zip(shapes, first, strict=True)])
     if all(len(s.normals) for s in shapes):
         parts["normals"] = torch.cat([s.normals for s in shapes])
-    if any(len(s.on_boundary) for s in shapes):
-        masks = [s.on_boundary if len(s.on_boundary) else s.mass < 0 for s in shapes]
-        parts["on_boundary"] = torch.cat(masks)
-    parts["record"] = Record.join([s.record for s in shapes])
+    if any(s.boundary is not None for s in shapes):
+        masks = [s.mass < 0 if s.boundary is None else s.boundary for s in shapes]
+        parts["_on_boundary"] = torch.cat(masks)
+    parts["_record"] = Record.join([s._record for s in shapes])
     parts["stencil"] = Csr.join([s.stencil for s in shapes])
-    if all(s.weak.num_rows for s in shapes):
-        parts["weak"] = Csr.join([s.weak for s in shapes])
-        if any(s.linear.num_rows for s in shapes):
-            parts["linear"] = Csr.join([s.near for s in shapes])
+    parts["weak"] = PairMatrices.join([s.weak for s in shapes])
     return parts
 
 
 def split_parts(batch: OperatorStorage, sizes: Sequence[int]) -> list[Parts]:
     """The inverse of `joined_parts`."""
     names = [
-        n for n in ("mass", "points", "frames", "normals", "on_boundary") if len(getattr(batch, n))
+        n for n in ("mass", "points", "frames", "normals", "_on_boundary") if len(getattr(batch, n))
     ]
-    columns: dict[str, Any] = {
-        name: [part.clone() for part in getattr(batch, name).split(list(sizes))] for name in names
-    }
+    by_point = Record({name: getattr(batch, name) for name in names}).split(sizes)
+    columns: dict[str, Any] = {n: [getattr(part, n) for part in by_point] for n in names}
     first = batch.faces.new_tensor(starts(sizes))
     of_shape = torch.bucketize(batch.faces[:, 0].contiguous(), first[1:], right=True)
     faces = batch.faces.split(torch.bincount(of_shape, minlength=len(sizes)).tolist())
     columns["faces"] = [own - start for own, start in zip(faces, first, strict=True)]
-    if len(batch.record.order):  # data of PyG do not carry it
-        columns["record"] = batch.record.split(sizes)
-    for name in ("stencil", "weak", "linear"):
-        matrices: Csr = getattr(batch, name)
-        if matrices.num_rows:
-            columns[name] = matrices.split(sizes)
+    columns["stencil"], columns["weak"] = batch.stencil.split(sizes), batch.weak.split(sizes)
+    if len(batch._record.order):  # data of PyG do not carry it
+        columns["_record"] = batch._record.split(sizes)
     shapes = [dict(zip(columns, row, strict=True)) for row in zip(*columns.values(), strict=True)]
-    return [_trimmed(shape) for shape in shapes]
-
-
-def _trimmed(shape: Parts) -> Parts:
-    """Without what a shape has in a batch because others have it."""
-    for name in ("weak", "linear"):
-        if name in shape:
-            shape[name] = without_zeros(shape[name])
-    pair, near = shape.get("weak"), shape.get("linear")
-    if pair and near and all(torch.equal(t, near.tensors[n]) for n, t in pair.tensors.items()):
-        del shape["linear"]
-    if "on_boundary" in shape and not shape["on_boundary"].any():
-        del shape["on_boundary"]
-    return shape
-
-
-def without_zeros(pair: Csr) -> Csr:
-    """Without the last matrices where they are zero: those of the boundary, and of what a condition adds."""
-    values = pair.values
-    most = 4 if values[3:].any() else 3 if values[2:].any() else 2
-    return Csr(pair.crow, pair.col, values[:most])
+    for shape in shapes:
+        if "_on_boundary" in shape and not shape["_on_boundary"].any():
+            del shape["_on_boundary"]
+    return shapes
 
 
 def remember_shapes(batch: OperatorStorage, shapes: Sequence[OperatorStorage]) -> None:

@@ -26,6 +26,7 @@ from torchlb.operator.batching import (
 from torchlb.operator.build_cloud import Reconstruction, build_cloud, built_again
 from torchlb.operator.inputs import ArrayLike, check_points, float_type, warn_of_gradients
 from torchlb.operator.options import Options
+from torchlb.operator.parts import Modes, PairMatrices
 from torchlb.operator.plan import Plan, evaluate
 from torchlb.operator.stencil_face import StencilFace
 from torchlb.operator.storage import FIT_FIELDS, ROW_FIELDS
@@ -229,10 +230,10 @@ class LaplaceBeltrami(StencilFace, WeakFace):
         sizes = [n for shape in shapes for n in shape.sizes or (shape.num_points,)]
         if all(shape.has_weak_form for shape in shapes):
             _ = [
-                shape.radius for shape in shapes
-            ]  # of one from an old state it is found here, once
+                shape.weak.radius for shape in shapes
+            ]  # of one that was loaded it is found here, once
         state = join_states([shape.get_extra_state() for shape in shapes], sizes)
-        bases = [shape.basis for shape in shapes if shape.basis and not shape.sizes]
+        bases = [shape._basis for shape in shapes if shape._basis and not shape.sizes]
         with torch.inference_mode(False):
             basis = stack_eigenbases(bases) if len(bases) == len(shapes) else None
             joined = cls.of_parts(joined_parts(shapes), state, basis)
@@ -311,11 +312,11 @@ class LaplaceBeltrami(StencilFace, WeakFace):
 
         But weak pairs only if all of them had one.
         """
-        if self.sizes is None or self.parts is None:
+        if self.sizes is None or self._states is None:
             raise InputError(f"unbatch: expected a batch of operators, got one from {self.source}")
-        basis = self.basis
+        basis = self._basis
         bases = [None] * len(self.sizes) if basis is None else unstack_eigenbases(basis)
-        shapes = zip(split_parts(self, self.sizes), self.parts, bases, strict=True)
+        shapes = zip(split_parts(self, self.sizes), self._states, bases, strict=True)
         return [type(self).of_parts(*shape) for shape in shapes]
 
     @classmethod
@@ -331,18 +332,18 @@ class LaplaceBeltrami(StencilFace, WeakFace):
         values = torch.cat([rows.laplacian[None], rows.gradient.T])
         parts |= {
             "stencil": Csr.with_transpose(rows.crow, rows.col, values),
-            "record": Record({name: report[name] for name in (*ROW_FIELDS, *FIT_FIELDS)}),
+            "_record": Record({name: report[name] for name in (*ROW_FIELDS, *FIT_FIELDS)}),
             "normals": points[:0] if built.normals is None else built.normals,
         }
         if pair is not None:
-            parts["weak"] = Csr(**vars(pair.matrices))
-            parts |= {} if pair.linear is None else {"linear": Csr(**vars(pair.linear))}
+            linear = None if pair.linear is None else Csr(**vars(pair.linear))
+            parts["weak"] = PairMatrices(**vars(pair.matrices), linear=linear)
         if built.on_boundary is not None and built.on_boundary.any():
-            parts["on_boundary"] = built.on_boundary
+            parts["_on_boundary"] = built.on_boundary
         lb = cls.of_parts(parts, {"source": built.source, "options": built.options})
         lb.certificate, lb.surface, lb._plan = built.certificate, built.surface, built.plan
         if lb.has_weak_form:
-            _ = lb.radius  # from values that are not yet rounded
+            _ = lb.weak.radius  # from values that are not yet rounded
         return lb.to(float_type(given))
 
     def __repr__(self) -> str:
@@ -359,4 +360,6 @@ class LaplaceBeltrami(StencilFace, WeakFace):
 
 
 # A whole module can be read back with torch.load(weights_only=True) where torchlb is imported.
-torch.serialization.add_safe_globals([LaplaceBeltrami, Csr, Record, Certificate, SurfaceSummary])
+torch.serialization.add_safe_globals(
+    [LaplaceBeltrami, Csr, PairMatrices, Modes, Record, Certificate, SurfaceSummary]
+)

@@ -69,8 +69,7 @@ class Plan:
         """The elements of the weak pair at the user's points, in the user's numbers."""
         here = self._sorted(points)
         _, fits = self.shape.at(here)
-        forms, _ = self.pair.forms(fits.points, fits)
-        return forms.restored(self.numbering, self.order, len(self.faces))
+        return self.pair.forms(fits).restored(self.numbering, self.order, len(self.faces))
 
     def _sorted(self, points: Float[Tensor, "N n"]) -> Float[Tensor, "N n"]:
         if len(self.moved):
@@ -94,7 +93,7 @@ def evaluate(plan: Plan, points: Float[Tensor, "N n"]) -> AssembledOperator:
         )
     with renumbered(plan.numbering.given), threads_for(len(points)):
         placed, fits = plan.shape.at(here)
-        pair = plan.pair.at(fits.points, fits, plan.numbering)
+        pair = plan.pair.at(fits, plan.numbering)
         assert pair.mass is not None
         shape = Shape(
             **vars(placed),

@@ -24,9 +24,9 @@ class StencilFace(OperatorStorage):
     @property
     def report(self) -> StencilReport:
         """What order each point reached, and why not more; print it."""
-        if len(self.record.order) != self.num_points:
+        if len(self._record.order) != self.num_points:
             raise InputError("report: PyG's Data do not carry it; it is with the operator as built")
-        order, fields = self.options.get("order", 0), self.record.tensors
+        order, fields = self.options.get("order", 0), self._record.tensors
         return StencilReport(order, self.dim, **fields, surface=self.surface)
 
     def forward(self, f: Float[Tensor, "*batch N C"] | Float[Tensor, " N"]) -> Tensor:

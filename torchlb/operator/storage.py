@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-from collections import OrderedDict
 from collections.abc import Sequence
 from dataclasses import asdict
 from typing import Any, TypeVar
-from weakref import finalize
 
 import torch
 from jaxtyping import Bool, Float
@@ -16,47 +14,16 @@ from torchlb.certified.certificate import Certificate
 from torchlb.cloud.surface import SurfaceSummary
 from torchlb.errors import InputError, warn
 from torchlb.linalg.csr import Csr, Record, Tensors
-from torchlb.linalg.exponential import spectral_radius
-from torchlb.linalg.sparse import to_scipy
 from torchlb.operator.checks import check_same_points
+from torchlb.operator.parts import Modes, OperatorCache, PairMatrices
 from torchlb.spectral.eigenbasis import Eigenbasis
 from torchlb.stencils.conditions import Condition, condition_of, kind_of
 
 FIT_FIELDS = ("fit_degree", "fit_reason", "edges", "curved_edges")
 REAL_FIELDS = ("growth", "condition", "off_diagonal_ratio")
 ROW_FIELDS = ("order", "normal_order", "num_neighbors", *REAL_FIELDS, "rule", "reason")
-BASIS = ("eigenvalues", "eigenvectors", "left", "relative_errors")
-
-
-def with_added(values: Float[Tensor, "terms nnz"]) -> Float[Tensor, "2 nnz"]:
-    """K + R and M, of K, M, B, R; R is what a condition adds, and there is none unless it has been stored."""
-    return values[:2] if len(values) < 4 else torch.stack([values[0] + values[3], values[1]])
-
 
 Storage = TypeVar("Storage", bound="OperatorStorage")
-
-
-class OperatorCache:
-    """What was computed of an operator and is kept with it, in memory alone: copies and files are without.
-
-    Attributes
-    ----------
-    values
-        Those of the weak pair that all is of; where an operator has others, it has another cache.
-    systems
-        Linear systems with their factors.
-    elements
-        Those of the weak pair, once a conductivity has asked for them.
-    shapes
-        Of a batch its shapes, whose caches serve it, each with the values that it had.
-    """
-
-    def __init__(self, values: Tensor) -> None:
-        self.values = values
-        self.systems: OrderedDict[Any, Any] = OrderedDict()
-        self.elements: Any = None
-        self.shapes: tuple[tuple[Any, Tensor], ...] = ()
-        finalize(self, self.systems.clear)  # cholespy reports factors that outlive Python as leaks
 
 
 class OperatorStorage(Tensors):
@@ -64,11 +31,8 @@ class OperatorStorage(Tensors):
 
     Attributes
     ----------
-    weak, linear
-        Matrices of the weak pair: stiffness and mass matrix; on a shape with a boundary the mass matrix of that; and
-        what a condition adds to the stiffness. Those of linear elements, of no rows where they are the same.
-    record
-        The fields of a `StencilReport`.
+    weak
+        The matrices of the weak pair.
     modes
         The eigenbasis, as far as it is known; `state_dict` has it where it is asked to.
     """
@@ -77,32 +41,30 @@ class OperatorStorage(Tensors):
     points: Tensor
     frames: Tensor
     normals: Tensor
-    on_boundary: Tensor
+    _on_boundary: Tensor
     faces: Tensor
     stencil: Csr
-    weak: Csr
-    linear: Csr
-    record: Record
-    modes: Record
+    weak: PairMatrices
+    modes: Modes
+    _record: Record
 
     def __init__(self) -> None:
         none, whole = torch.zeros(0), torch.zeros(0, dtype=torch.int64)
         by_point = dict.fromkeys(("mass", "points", "frames", "normals"), none)
-        super().__init__(by_point | {"on_boundary": whole.bool(), "faces": whole.view(0, 3)})
+        super().__init__(by_point | {"_on_boundary": whole.bool(), "faces": whole.view(0, 3)})
         self.source = "empty"
         self.options: dict[str, Any] = {}
         self.certificate: Certificate | None = None
         self.surface: SurfaceSummary | None = None
         self._sizes: list[Tensor] | None = None
-        self.parts: list[dict[str, Any]] | None = None  # the extra states of the shapes of a batch
+        self._states: list[dict[str, Any]] | None = (
+            None  # the extra states of the shapes of a batch
+        )
         self._plan: Any = None
-        self._radius: Tensor | None = None
-        self._pairs = torch.empty(0, 0)  # as many rows as `num_pairs`
         self._cache: OperatorCache | None = None
-        self.stencil, self.weak, self.linear = Csr(order_t=whole), Csr(), Csr()
+        self.stencil, self.weak, self.modes = Csr(order_t=whole), PairMatrices(), Modes(None, none)
         fields = {n: none if n in REAL_FIELDS else whole for n in (*ROW_FIELDS, *FIT_FIELDS)}
-        self.record = Record(fields)
-        self.modes = Record(dict.fromkeys(BASIS, none), persistent=False)
+        self._record = Record(fields)
 
     def __getstate__(self) -> dict[str, Any]:
         """For copies and files: without the plan, which is made again when it is asked for, and the cache."""
@@ -145,7 +107,7 @@ class OperatorStorage(Tensors):
             setattr(lb, name, part)
         lb.set_extra_state(state)
         if basis is not None:
-            lb.keep_basis(basis)
+            lb._keep_basis(basis)
         return lb
 
     @property
@@ -172,31 +134,22 @@ class OperatorStorage(Tensors):
     @property
     def boundary(self) -> Tensor | None:
         """(N,), mask of the points where `condition` holds; None on a closed shape."""
-        return self.on_boundary if len(self.on_boundary) else None
+        return self._on_boundary if len(self._on_boundary) else None
 
     @property
     def fixed(self) -> Bool[Tensor, " N"] | None:
         """Mask of the points where a Dirichlet condition holds; None if there are none."""
-        if len(self.on_boundary) == 0:
+        if len(self._on_boundary) == 0:
             return None
-        holds = [kind.fixes for kind in self.conditions]
+        holds = [kind.fixes for kind in self._kinds]
         sizes = self.sizes or (self.num_points,)
-        mask = torch.tensor(holds).repeat_interleave(torch.tensor(sizes)).to(self.on_boundary)
-        return mask & self.on_boundary if any(holds) else None
+        mask = torch.tensor(holds).repeat_interleave(torch.tensor(sizes)).to(self._on_boundary)
+        return mask & self._on_boundary if any(holds) else None
 
     @property
-    def losing(self) -> Bool[Tensor, " N"] | None:
-        """Mask of the points where a condition keeps constants out of the null space of the pair; None for none."""
-        if len(self.near.values) < 4:
-            return self.fixed
-        mask = torch.zeros_like(self.mass, dtype=torch.bool)
-        mask[self.near.col[self.near.values[3] > 0]] = True  # on the diagonal
-        return mask if self.fixed is None else mask | self.fixed
-
-    @property
-    def conditions(self) -> list[type[Condition]]:
+    def _kinds(self) -> list[type[Condition]]:
         """What kind of condition holds at the boundary of each shape."""
-        states = [{"options": self.options}] if self.parts is None else self.parts
+        states = [{"options": self.options}] if self._states is None else self._states
         return [kind_of(state["options"].get("condition")) for state in states]
 
     @property
@@ -221,76 +174,22 @@ class OperatorStorage(Tensors):
         return tuple(sum(sizes[:i]) for i in range(len(sizes) + 1))
 
     @property
-    def radius(self) -> Tensor:
-        """Bound on the eigenvalues of D⁻¹K₁, the linear pair with lumped mass, for flows beyond the basis.
+    def _basis(self) -> Eigenbasis | None:
+        """All eigenpairs that are known; None if there are none."""
+        return self.modes.basis(self.mass, self.sizes)
 
-        1/ℓ², a float64 tensor () on the CPU, which compiled code can take; found once, and stored with the operator.
-        """
-        if self._radius is None:
-            crow, col, values = self.linear_pair
-            stiffness, mass = (to_scipy(crow, col, v.double(), self.shape) for v in values)
-            lumped: Any = mass.sum(axis=1)
-            self.set_radius(spectral_radius(stiffness, lumped))
-        assert self._radius is not None
-        return self._radius
-
-    @property
-    def pair(self) -> tuple[Tensor, Tensor, Tensor]:
-        """(crow, col, values (2, nnz)) of K, with what a condition adds to it, and M: what all is computed by."""
-        return self.weak.crow, self.weak.col, with_added(self.weak.values)
-
-    @property
-    def near(self) -> Csr:
-        """The matrices of linear elements, close to the weak pair and 20 times sparser."""
-        return self.linear if self.linear.num_rows else self.weak
-
-    @property
-    def linear_pair(self) -> tuple[Tensor, Tensor, Tensor]:
-        """As `pair`, of linear elements."""
-        return self.near.crow, self.near.col, with_added(self.near.values)
-
-    def set_radius(self, radius: float | None) -> None:
-        """Hold what is known of the spectrum; it is neither rounded nor moved with the buffers."""
-        known = None if radius is None else torch.tensor(radius, dtype=torch.float64, device="cpu")
-        self._radius = known
-
-    @property
-    def basis(self) -> Eigenbasis | None:
-        """All eigenpairs that are stored; None if there are none."""
-        held = self.modes
-        if len(held.left) == 0:
-            return None
-        errors = held.relative_errors if len(held.relative_errors) else None
-        pairs = held.eigenvalues, held.eigenvectors, self.mass, held.left
-        return Eigenbasis(*pairs, self.sizes, errors)
-
-    def keep_basis(self, basis: Eigenbasis | None = None, *, store: bool | None = None) -> None:
+    def _keep_basis(self, basis: Eigenbasis | None, *, stored: bool | None = None) -> None:
         """Hold a basis (None: the one there is), in `state_dict` or not (None: as it was)."""
-        store = not self.modes._non_persistent_buffers_set if store is None else store
-        none = self.mass.new_zeros(0)
-        held = {name: getattr(basis or self.modes, name) for name in BASIS}
-        held = {name: none if t is None else t.to(none) for name, t in held.items()}
-        self.modes = Record(held, persistent=store)
-        if len(held["left"]) > 0:
-            self._count_pairs(self.modes.eigenvectors)
+        stored = self.modes.stored if stored is None else stored
+        self._hold(Modes(basis or self.modes, self.mass, stored=stored))
 
-    @property
-    def num_pairs(self) -> int:
-        """Number of eigenpairs that are stored of each shape of a batch, but for those that have no more."""
-        return self._pairs.shape[0]
-
-    def has_pairs(self, k: int) -> bool:
-        """Whether k eigenpairs of each shape are stored, or all that it has."""
-        return min(k, max(self.sizes or (self.num_points,))) <= self.num_pairs
-
-    def _count_pairs(self, eigenvectors: Float[Tensor, "N k"]) -> None:
-        """Set `num_pairs`: a batch pads the bases of its shapes, and a Dirichlet condition takes points."""
-        sizes = self.sizes or (self.num_points,)
+    def _hold(self, modes: Modes, vectors: Float[Tensor, "N k"] | None = None) -> None:
+        """Hold these eigenpairs, whose eigenvectors are to be loaded from `vectors` where that is given."""
+        vectors, sizes = modes.eigenvectors if vectors is None else vectors, self.sizes
         free = torch.ones_like(self.mass, dtype=torch.bool) if self.fixed is None else ~self.fixed
-        parts = zip(eigenvectors.split(sizes), free.split(sizes), strict=True)
-        counts = [(int((modes != 0).any(0).sum()), int(inside.sum())) for modes, inside in parts]
-        known = min((held for held, most in counts if held < most), default=max(sizes))
-        self._pairs = torch.empty(known, 0)
+        self.modes = (
+            modes.counted(vectors, free, sizes or (self.num_points,)) if len(vectors) else modes
+        )
 
     def check_points(self, points: Tensor) -> None:
         """InputError unless the operator was built from these points: as many, each in its place to float32 rounding.
@@ -306,8 +205,8 @@ class OperatorStorage(Tensors):
             "options": self.options,
             "certificate": None if self.certificate is None else asdict(self.certificate),
             "sizes": None if self.sizes is None else list(self.sizes),
-            "radius": None if self._radius is None else float(self._radius),
-            "parts": self.parts,
+            "radius": self.weak.known_radius,
+            "parts": self._states,
             "surface": None if self.surface is None else asdict(self.surface),
         }
 
@@ -318,8 +217,8 @@ class OperatorStorage(Tensors):
         surface = state.get("surface")
         self.surface = None if surface is None else SurfaceSummary.of(surface)
         self.certificate = None if found is None else Certificate(**found)
-        self.sizes, self.parts = None if sizes is None else tuple(sizes), state.get("parts")
-        self.set_radius(radius)
+        self.sizes, self._states = None if sizes is None else tuple(sizes), state.get("parts")
+        self.weak.known_radius = radius
 
     def _load_from_state_dict(self, state_dict: Any, prefix: str, *given: Any) -> None:
         """Where that replaces an operator on other points a warning says so."""
@@ -332,11 +231,7 @@ class OperatorStorage(Tensors):
                     f"{prefix or 'LaplaceBeltrami'}: the operator on {self.num_points} points is replaced by one on "
                     f"{len(theirs)} others; leave it out of the state to keep the one that is there"
                 )
-        stored = f"{prefix}modes.left" in state_dict
-        none = self.mass.new_zeros(0)
-        self.modes = Record(dict.fromkeys(BASIS, none), persistent=stored)
-        self._radius = self._plan = self._cache = None
-        self._pairs = torch.empty(0, 0)
+        vectors = state_dict.get(f"{prefix}modes.eigenvectors")
+        self._plan = self._cache = None
         super()._load_from_state_dict(state_dict, prefix, *given)
-        if stored:
-            self._count_pairs(state_dict[f"{prefix}modes.eigenvectors"])
+        self._hold(Modes(None, self.mass, stored=vectors is not None), vectors)

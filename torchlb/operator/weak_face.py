@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Literal, get_args
+from typing import Any, Literal, get_args
 
 import torch
 from scipy import sparse
@@ -30,6 +30,12 @@ NO_PAIR = (
 )
 
 
+def check_pair(lb: Any) -> None:
+    """InputError for an operator without a weak pair, which eigenpairs, flows and solves are of."""
+    if not lb.has_weak_form:
+        raise InputError(NO_PAIR.format("eigenpairs, flows and solves"))
+
+
 class WeakFace(OperatorStorage):
     """Stiffness and mass matrix where there is a weak pair, and its eigenbasis."""
 
@@ -37,11 +43,6 @@ class WeakFace(OperatorStorage):
     def has_weak_form(self) -> bool:
         """Whether there is a weak pair, as there is unless built with weak_form=False."""
         return self.weak.num_rows > 0
-
-    def check_pair(self) -> None:
-        """InputError without a weak pair, which eigenpairs, flows and solves are of."""
-        if not self.has_weak_form:
-            raise InputError(NO_PAIR.format("eigenpairs, flows and solves"))
 
     @property
     def stiffness(self) -> Tensor:
@@ -131,19 +132,19 @@ class WeakFace(OperatorStorage):
         k = check_num_pairs(k)
         check_tolerance(tolerance)
         errors = self.modes.relative_errors[..., :k]
-        if not self.has_pairs(k) or (tolerance is not None and (errors > tolerance).any()):
+        if not self.modes.has(k) or (tolerance is not None and (errors > tolerance).any()):
             # It is kept, and a training may follow.
             with torch.inference_mode(False), threads_for(self.num_points):
-                self.keep_basis(self._solved_basis(max(k, self.num_pairs), tolerance))
+                self._keep_basis(self._solved_basis(max(k, self.modes.count), tolerance))
         if store:
-            self.keep_basis(store=True)
-        basis = self.basis
+            self._keep_basis(None, stored=True)
+        basis = self._basis
         assert basis is not None
         return basis
 
     def _solved_basis(self, k: int, tolerance: float | None) -> Eigenbasis:
         """Of a batch those of its shapes, which keep them, as long as they are known."""
-        self.check_pair()
+        check_pair(self)
         shapes = shapes_of(self)
         if shapes:
             bases = [shape.invariant_basis(k, tolerance=tolerance) for shape in shapes]
@@ -154,19 +155,18 @@ class WeakFace(OperatorStorage):
         """From the weak pair of each shape; the more exact, the higher the order."""
         (stiffness, mass), linear = (
             [to_scipy(crow, col, v.double(), self.shape) for v in values]
-            for crow, col, values in (self.pair, self.linear_pair)
+            for crow, col, values in (self.weak.pair, self.weak.linear_pair)
         )
-        none = torch.zeros_like(self.mass, dtype=torch.bool)
-        fixed, losing = (
-            (none if mask is None else mask).cpu().numpy() for mask in (self.fixed, self.losing)
-        )
+        fixed = torch.zeros_like(self.mass, dtype=torch.bool) if self.fixed is None else self.fixed
+        losing = self.weak.losing(fixed).cpu().numpy()
+        fixed = fixed.cpu().numpy()
         order = self.options.get("order") or 3
         if tolerance is None and order > 3:
             tolerance = 10.0 ** -(2 * min(order, 5) + 1)
         bases = []
         for start, end in zip(self.offsets[:-1], self.offsets[1:], strict=True):
             block = slice(start, end)
-            near = None if self.linear.num_rows == 0 else [m[block, block] for m in linear]
+            near = None if self.weak.linear.num_rows == 0 else [m[block, block] for m in linear]
             bases.append(
                 pencil_eigenbasis(
                     stiffness[block, block],

@@ -12,6 +12,7 @@ from torch import Tensor
 from torchlb.errors import InputError, InputTypeError
 from torchlb.linalg.checks import check_finite, check_tensor
 from torchlb.operator.laplace_beltrami import LaplaceBeltrami
+from torchlb.operator.weak_face import check_pair
 
 P = ParamSpec("P")
 T = TypeVar("T")
@@ -38,7 +39,7 @@ def as_columns(f: Tensor, lb: LaplaceBeltrami) -> Tensor:
     """
     x = f[:, None] if isinstance(f, Tensor) and f.ndim == 1 else f
     check_shape(x, lb)
-    lb.check_pair()
+    check_pair(lb)
     if x.is_complex():
         raise InputError(f"expected real f, got {x.dtype}; torch.view_as_real(f) makes channels")
     check_finite(x)

@@ -12,12 +12,12 @@ from torch import Tensor
 
 from torchlb.errors import InputError, first_few
 from torchlb.galerkin.forms import Forms
-from torchlb.galerkin.pair import stored
+from torchlb.galerkin.pair import Pattern
 from torchlb.linalg.checks import check_tensor
 from torchlb.linalg.csr import Csr
 from torchlb.linalg.sparse import to_scipy
 from torchlb.operator.laplace_beltrami import LaplaceBeltrami
-from torchlb.operator.storage import OperatorCache
+from torchlb.operator.parts import OperatorCache, PairMatrices
 
 
 @dataclass(frozen=True, eq=False)
@@ -26,8 +26,7 @@ class Conducting:
 
     lb: LaplaceBeltrami
     forms: Forms
-    pair: tuple[Tensor, Tensor, Tensor]
-    linear_pair: tuple[Tensor, Tensor, Tensor]
+    weak: PairMatrices
     cache: OperatorCache
 
     def __getattr__(self, name: str) -> Any:
@@ -90,18 +89,15 @@ def conducting(lb: LaplaceBeltrami, conductivity: Tensor) -> Conducting:
             f"{len(kappa)} vertices or faces ({first_few(bad)})"
         )
     values = forms.conductivities(kappa)
-    pair = linear = _with_rest(lb.weak, forms.matrix(values))
-    if lb.linear.num_rows:
-        linear = _with_rest(lb.linear, forms.near(values))
-    return Conducting(lb, forms, pair, linear, OperatorCache(pair[2]))
+    linear = _with_rest(lb.weak.linear, forms.near(values)) if lb.weak.linear.num_rows else None
+    whole = _with_rest(lb.weak, forms.matrix(values))
+    weak = PairMatrices(whole.crow, whole.col, whole.values, linear)
+    return Conducting(lb, forms, weak, OperatorCache(weak.values))
 
 
-def _with_rest(pair: Csr, matrix: Any) -> tuple[Tensor, Tensor, Tensor]:
+def _with_rest(pair: Csr, matrix: Any) -> Csr:
     """K(κ) with M, and with what the condition adds, whatever κ is."""
     shape = pair.num_rows, pair.num_rows
     _, mass, *rest = (to_scipy(pair.crow, pair.col, v.double(), shape) for v in pair.values)
     upper = matrix.real + 1j * sparse.triu(mass, format="csr")
-    found = stored(upper, rest[1] if len(rest) > 1 else None)
-    device = pair.values.device
-    values = torch.stack([found.values[0] + found.values[2:].sum(0), found.values[1]])
-    return found.crow.to(device), found.col.to(device), values.to(device)
+    return Csr(**vars(Pattern.of(upper).pair(upper, *rest))).to(pair.values.device)

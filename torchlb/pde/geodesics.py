@@ -94,7 +94,9 @@ def _edges(lb: LaplaceBeltrami) -> tuple[np.ndarray, np.ndarray]:
     """Pairs of neighbours, each in both directions: of faces and local stars; where there are none, of the stencils."""
     matrix: Any = mesh_graph(lb.faces.cpu(), lb.num_points)
     if len(lb.faces) == 0 or lb.source not in FROM_MESH:
-        crow, col = lb.linear_pair[:2] if lb.has_weak_form else (lb.stencil.crow, lb.stencil.col)
+        crow, col = (
+            lb.weak.linear_pair[:2] if lb.has_weak_form else (lb.stencil.crow, lb.stencil.col)
+        )
         where = (np.ones(len(col)), col.cpu().numpy(), crow.cpu().numpy())
         near = sparse.csr_array(where, shape=lb.shape)
         matrix = matrix + near + near.T

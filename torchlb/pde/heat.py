@@ -20,6 +20,7 @@ from torchlb.linalg.exponential import heat
 from torchlb.linalg.sparse import compute_dtype
 from torchlb.operator.checks import check_tolerance
 from torchlb.operator.laplace_beltrami import LaplaceBeltrami
+from torchlb.operator.weak_face import check_pair
 from torchlb.pde.checks import as_columns, as_times, check_choice
 from torchlb.pde.pair_flow import pair_flow
 from torchlb.spectral.eigenbasis import Eigenbasis
@@ -107,7 +108,7 @@ def flow(
         columns, times = x.transpose(0, 1).flatten(1), time.repeat(len(x))
         y = flow(lb, columns, times, method, k, tolerance)
         return y.view(x.shape[1], x.shape[0], x.shape[2]).transpose(0, 1)
-    lb.check_pair()
+    check_pair(lb)
     if method == "spectral":
         return _spectral(lb.eigenbasis(k), x, time)
     if method == "deflated":
@@ -129,15 +130,15 @@ def _deflated(
         x = x * ~lb.fixed[:, None]
     values, coefficients = basis.eigenvalues.to(x.dtype), basis.analyse(basis.left, x)
     slow = basis.from_basis(torch.exp(-values[..., None] * time) * coefficients)
-    if lb.has_pairs(lb.num_points):
+    if lb.modes.has(lb.num_points):
         return slow
     fastest = values.amax(-1)
     if basis.sizes is not None:  # a shape whose basis is complete has no rest
-        incomplete = [size > lb.num_pairs for size in basis.sizes]
+        incomplete = [size > lb.modes.count for size in basis.sizes]
         fastest = torch.where(torch.tensor(incomplete, device=x.device), fastest, torch.inf).amin()
     whole, time = time, torch.minimum(time, math.log(1 / tolerance) / fastest)
     pattern, matrix, root = _linear_flow(lb)
-    options = lb.radius, tolerance, lb.sizes or (lb.num_points,)
+    options = lb.weak.radius, tolerance, lb.sizes or (lb.num_points,)
     rest = root.to(x.dtype)[:, None] * (x - basis.from_basis(coefficients))
     rest = heat(pattern, matrix.to(x.dtype), rest, time, *options)
     rest = rest / root.to(x.dtype)[:, None] * torch.exp(-fastest * (whole - time))
@@ -146,7 +147,7 @@ def _deflated(
 
 def _linear_flow(lb: LaplaceBeltrami) -> tuple[list[Tensor], Tensor, Tensor]:
     """Pattern and values of −D^{−½}K₁D^{−½}, and D^½, D the row sums of M₁; nothing joins Dirichlet points."""
-    crow, col, (stiffness, mass, *_) = lb.linear_pair
+    crow, col, (stiffness, mass, *_) = lb.weak.linear_pair
     row = torch.arange(lb.num_points, device=col.device).repeat_interleave(
         crow.diff(), output_size=len(col)
     )

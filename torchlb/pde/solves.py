@@ -14,6 +14,7 @@ from torchlb.linalg.once import once_differentiable
 from torchlb.linalg.sparse import compute_dtype, symmetric_product
 from torchlb.operator.checks import check_tolerance
 from torchlb.operator.laplace_beltrami import LaplaceBeltrami
+from torchlb.operator.weak_face import check_pair
 from torchlb.pde.checks import as_columns, as_times, uncompiled
 from torchlb.pde.conduction import Conducting, conducting
 from torchlb.pde.systems import SINGLE, solve_columns
@@ -152,7 +153,7 @@ def potential(
         products += [
             lb.stencil.product(1 + c, weighted[..., c, :], transposed=True) for c in range(lb.dim)
         ]
-    lb.check_pair()
+    check_pair(lb)
     columns, _ = _columns(sum(products[1:], products[0]), None)
     if source is None and field is not None:
         source = field[..., 0, :]
@@ -220,7 +221,7 @@ def _missing(lb: LaplaceBeltrami, kind: int) -> str:
 
 def _product(lb: LaplaceBeltrami | Conducting, number: int, x: Tensor) -> Tensor:
     """K, with what a condition adds, or M times x."""
-    crow, col, values = lb.pair
+    crow, col, values = lb.weak.pair
     return symmetric_product(crow, col, values[number].to(x), x)
 
 

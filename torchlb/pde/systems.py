@@ -83,14 +83,13 @@ class _Components:
     """Means over the connected components of a shape, and which of them a condition holds: on these K is regular."""
 
     def __init__(self, lb: Operator) -> None:
-        crow, col, _ = lb.linear_pair
+        crow, col, _ = lb.weak.linear_pair
         where = (np.ones(len(col)), col.cpu().numpy(), crow.cpu().numpy())
         graph = sparse.csr_array(where, shape=lb.shape)
         self.count, number = csgraph.connected_components(graph, directed=False)
         self.of = torch.from_numpy(number.astype(np.int64)).to(col.device)
         held = torch.zeros(self.count, device=col.device)
-        if lb.losing is not None:
-            held = held.index_add(0, self.of, lb.losing.float())
+        held = held.index_add(0, self.of, lb.weak.losing(lb.fixed).float())
         if self.count > 1:
             held = held[self.of]
         self.free = (held == 0)[:, None]  # of the points; one for all if there is one component
@@ -108,7 +107,7 @@ class PairSystem:
 
     def __init__(self, lb: Operator) -> None:
         self.dim = lb.dim
-        crow, col, values = lb.pair
+        crow, col, values = lb.weak.pair
         self.stiffness, self.mass = self.parts = list(values.detach())
         self.units = [values.abs().max().double() for values in self.parts]
         self.pattern = crow.int(), col.int()
@@ -118,13 +117,12 @@ class PairSystem:
         self.ones_mass = self.mass_product(self.one)
         self.area = self.components.sums(self.one, self.ones_mass)
         self.stiff = float(self.stiffness.double().abs().sum() / self.mass.double().sum())
-        self.smooths = lb.linear.num_rows > 0  # the cotangent's pair is the linear one
+        self.smooths = lb.weak.linear.num_rows > 0  # the cotangent's pair is the linear one
         self.steps = 0
-        crow, col, linear = lb.linear_pair
+        crow, col, linear = lb.weak.linear_pair
         first, second = (to_scipy(crow, col, v.double(), lb.shape) for v in linear)
         sums = first.sum(1)  # in float32 it would be indefinite with what is below zero
-        if lb.losing is not None:
-            sums = np.where(lb.losing.cpu().numpy(), np.minimum(sums, 0.0), sums)
+        sums = np.where(lb.weak.losing(lb.fixed).cpu().numpy(), np.minimum(sums, 0.0), sums)
         first = first - sparse.diags_array(sums)
         self.linear, self.factors = (first, second), OrderedDict()
 
