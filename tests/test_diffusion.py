@@ -11,7 +11,7 @@ from torch.autograd import gradcheck
 
 from torchlb import Diffusion, InputError, LaplaceBeltrami, heat_flow
 from torchlb.linalg.exponential import chebyshev_coefficients, rational_coefficients
-from torchlb.pde.heat import Method, checked_method
+from torchlb.pde.heat import Method
 from torchlb.surfaces import Circle, Sphere, Torus, UnitDisk
 
 METHODS = get_args(Method)
@@ -238,16 +238,6 @@ def test_deflated_diffusion_takes_any_spectral_radius(monkeypatch):
         assert (one - other).norm() <= 1e-5 * one.norm()
 
 
-def test_former_names_of_methods_are_taken_with_a_warning():
-    for former, method in (
-        ("full", "deflated"),
-        ("chebyshev", "rational"),
-        ("contour", "rational"),
-    ):
-        with pytest.warns(DeprecationWarning, match=f"'{former}' is called '{method}' now"):
-            assert checked_method(former) == method
-
-
 def test_learned_times_stay_positive_and_are_learned():
     """A flow for t = 0.2 is found from t = 0.01, by unconstrained minimisation."""
     lb = KINDS["points"]()
@@ -273,7 +263,7 @@ def test_what_cannot_work_is_said():
     lb = KINDS["points"]()
     f = rough(300)
     with pytest.raises(InputError, match=r"expected one of \('deflated'.*got 'implicit'"):
-        checked_method("implicit")
+        heat_flow(lb, f, 0.1, method="implicit")
     for time in (-1.0, math.inf, math.nan):
         with pytest.raises(InputError, match="finite times of at least 0"):
             heat_flow(lb, f, time)

@@ -3,6 +3,7 @@
 import copy
 import functools
 import gc
+import inspect
 import pickle
 import weakref
 
@@ -11,6 +12,7 @@ import pytest
 import torch
 from torch.autograd import gradcheck
 
+import torchlb
 from torchlb import (
     DiffusionError,
     InputError,
@@ -497,10 +499,17 @@ def test_complex_functions_are_refused():
 
 
 def test_swapped_arguments_are_named(unchecked):
-    lb = LaplaceBeltrami.from_mesh(*Sphere().mesh(60), order=1)
-    for function in (heat_flow, implicit_step):
-        with pytest.raises(TypeError, match=r"expected an operator, got a Tensor .* \(lb, f\)"):
-            function(lb.mass, lb, 0.1)
+    """By every public function whose first argument is the operator."""
+    lb, functions = LaplaceBeltrami.from_mesh(*Sphere().mesh(60), order=1), 0
+    for function in vars(torchlb).values():
+        if not (inspect.isfunction(function) and "lb" in inspect.signature(function).parameters):
+            continue
+        parameters = inspect.signature(function).parameters.values()
+        rest = [0.1 for p in list(parameters)[2:] if p.default is p.empty]
+        with pytest.raises(TypeError, match="expected an operator, got a Tensor"):
+            function(lb.mass, lb, *rest)
+        functions += 1
+    assert functions >= 10
 
 
 def test_without_a_pair_there_are_no_solves():

@@ -22,6 +22,7 @@ import torch
 from torch import Tensor
 
 from torchlb.errors import CacheWarning, InputError, OperatorFileError, warn
+from torchlb.linalg.checks import check_operator
 from torchlb.operator.dispatch import Operator, build_operator, builder_of, complete_options
 from torchlb.operator.inputs import ArrayLike, as_tensor, float_type, warn_of_gradients
 from torchlb.operator.laplace_beltrami import LaplaceBeltrami
@@ -177,6 +178,7 @@ def save_operator(lb: LaplaceBeltrami, path: str | Path, *, key: str = "") -> No
     OSError
         Where the file cannot be written; nothing is left of it then.
     """
+    check_operator(lb)
     path = Path(path).expanduser()
     state = lb.state_dict()
     header = {"format": FORMAT, "version": __version__, "key": key}

@@ -21,6 +21,20 @@ def check_tensor(f: object, what: str = "f") -> None:
         )
 
 
+def check_operator(lb: object) -> None:
+    """InputTypeError unless it is an operator, as it is not where arguments are in another order.
+
+    >>> check_operator(torch.ones(3))  # doctest: +ELLIPSIS
+    Traceback (most recent call last):
+    torchlb.errors.InputTypeError: expected an operator, got a Tensor in its place: functions take (lb, f), ...
+    """
+    if not hasattr(lb, "num_points"):
+        raise InputTypeError(
+            f"expected an operator, got a {type(lb).__name__} in its place: functions take (lb, f), layers (x, lb); "
+            "several shapes are one operator, LaplaceBeltrami.batch(…), with features below each other, torch.cat(…)"
+        )
+
+
 def check_finite(f: Tensor, what: str = "f") -> None:
     """InputError that names the points where f, (N,) or (…, N, C), is NaN or infinite; not in compiled code.
 

@@ -12,7 +12,8 @@ from torch.nn.functional import softplus
 from torchlb.errors import InputError
 from torchlb.nn.checks import check_features
 from torchlb.operator.laplace_beltrami import LaplaceBeltrami
-from torchlb.pde.heat import TOLERANCE, Method, checked_method, flow
+from torchlb.pde.checks import check_choice
+from torchlb.pde.heat import TOLERANCE, Method, flow
 
 SHARPNESS = 100.0
 """Of the softplus that keeps learned times positive: above 0.05 ℓ² it is the identity to 1 %."""
@@ -75,8 +76,8 @@ class Diffusion(LearnedTimes):
         tolerance: float = TOLERANCE,
     ) -> None:
         super().__init__(channels, init_time)
-        self.method = checked_method(method)
-        self.k, self.tolerance = k, tolerance
+        check_choice("method", method, Method)
+        self.method, self.k, self.tolerance = method, k, tolerance
 
     def forward(self, x: Float[Tensor, "*B N C"], lb: LaplaceBeltrami) -> Float[Tensor, "*B N C"]:
         """The diffused features, of the shape and type of x: (N, C), or (B, N, C) on one surface."""

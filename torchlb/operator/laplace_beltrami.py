@@ -77,7 +77,7 @@ class LaplaceBeltrami(StencilFace, WeakFace):
 
     def __init__(self, *given: Any) -> None:
         if given:
-            raise TypeError(
+            raise InputTypeError(
                 "LaplaceBeltrami() takes no arguments; an operator is built by LaplaceBeltrami.from_mesh(vertices, "
                 "faces), from_points(points) or from_cotangent(vertices, faces)"
             )

@@ -9,8 +9,8 @@ from typing import Any, ParamSpec, TypeVar, get_args
 import torch
 from torch import Tensor
 
-from torchlb.errors import InputError, InputTypeError
-from torchlb.linalg.checks import check_finite, check_tensor
+from torchlb.errors import InputError
+from torchlb.linalg.checks import check_finite, check_operator, check_tensor
 from torchlb.operator.laplace_beltrami import LaplaceBeltrami
 from torchlb.operator.weak_face import check_pair
 
@@ -20,11 +20,7 @@ T = TypeVar("T")
 
 def check_shape(x: Tensor, lb: LaplaceBeltrami) -> None:
     """InputError unless x is (N, C) or (B, N, C) with the N of the operator, InputTypeError unless a tensor."""
-    if not hasattr(lb, "num_points"):
-        raise InputTypeError(
-            f"expected an operator, got a {type(lb).__name__} in its place: functions take (lb, f), layers (x, lb); "
-            "several shapes are one operator, LaplaceBeltrami.batch(…), with features below each other, torch.cat(…)"
-        )
+    check_operator(lb)
     check_tensor(x)
     if x.ndim not in (2, 3) or x.shape[-2] != lb.num_points:
         raise InputError(

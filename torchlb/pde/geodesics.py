@@ -19,6 +19,7 @@ from torch import Tensor
 
 from torchlb.errors import InputError
 from torchlb.geometry.neighbors import mesh_graph
+from torchlb.linalg.checks import check_operator
 from torchlb.operator.laplace_beltrami import LaplaceBeltrami
 
 TOLERANCE = 1e-6
@@ -61,6 +62,7 @@ def geodesic_distance(
     >>> bool((distance - exact).abs().mean() < 0.02)
     True
     """
+    check_operator(lb)
     start = _sources(lb, sources)
     points = lb.points.detach().cpu().double().numpy()
     row, col = _edges(lb)

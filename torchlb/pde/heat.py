@@ -9,8 +9,7 @@ dropped, also as t → 0. "rational" needs no basis, and is exact to the toleran
 from __future__ import annotations
 
 import math
-import warnings
-from typing import Literal, cast
+from typing import Literal
 
 import torch
 from jaxtyping import Shaped
@@ -26,7 +25,6 @@ from torchlb.pde.pair_flow import pair_flow
 from torchlb.spectral.eigenbasis import Eigenbasis
 
 Method = Literal["deflated", "spectral", "rational"]
-FORMER_NAMES = {"full": "deflated", "chebyshev": "rational", "contour": "rational"}
 TOLERANCE = 1e-7
 
 
@@ -73,27 +71,13 @@ def heat_flow(
     True
     """
     x = as_columns(f, lb)
-    method = checked_method(method)
+    check_choice("method", method, Method)
     dtype = compute_dtype(x, lb.mass)
     time = as_times(t, x, dtype)
     with torch.autocast(x.device.type, enabled=False):
         y = flow(lb, x.to(dtype), time, method, k, tolerance)
     y = y.to(x.dtype) if x.dtype.itemsize < 4 else y
     return y[:, 0] if f.ndim == 1 else y
-
-
-def checked_method(method: str) -> Method:
-    """The method, by its name of today.
-
-    >>> checked_method("rational")
-    'rational'
-    """
-    if method in FORMER_NAMES:
-        message = f"method={method!r} is called {FORMER_NAMES[method]!r} now"
-        warnings.warn(message, DeprecationWarning, stacklevel=3)
-        method = FORMER_NAMES[method]
-    check_choice("method", method, Method)
-    return cast(Method, method)
 
 
 def flow(

@@ -15,6 +15,7 @@ from jaxtyping import Float, Int, Shaped
 from torch import Tensor
 
 from torchlb.errors import EigenbasisError, InputError
+from torchlb.linalg.checks import check_operator
 from torchlb.spectral.eigenbasis import Eigenbasis, Spectral
 
 
@@ -80,6 +81,7 @@ def heat_kernel_signature(
     >>> bool((heat_kernel_signature(lb, torch.tensor([50.0])) * lb.mass.sum()).allclose(torch.tensor(1.0).double()))
     True
     """
+    check_operator(lb)
     basis = lb.eigenbasis(k)
     values = basis.eigenvalues
     if times is None:
@@ -111,6 +113,7 @@ def wave_kernel_signature(
     width
         Of the Gaussians, in such hundredths.
     """
+    check_operator(lb)
     basis = lb.eigenbasis(k)
     values = basis.eigenvalues
     low, high = _first_positive(basis).log(), values[..., -1:].log()
@@ -146,6 +149,7 @@ def spectral_wavelets(
     """
     if isinstance(f, Tensor) and f.ndim == 1:
         return spectral_wavelets(lb, f[:, None], scales, k=k)[..., 0]
+    check_operator(lb)
     basis = lb.eigenbasis(k)
     values = basis.eigenvalues
     gains = _wavelet_gains(values, _numbers("scales", scales, values))
@@ -173,6 +177,7 @@ def diffusion_map(
     The constants, of λ_0 = 0, are left out; a shape with a Dirichlet or Robin condition has none. `k` at least dim + 1
     may be given to share a basis. The time is in ℓ². On a cloud of any ambient dimension this is its diffusion map.
     """
+    check_operator(lb)
     basis = lb.eigenbasis(max(dim + 1, k or 0))
     values = basis.eigenvalues
     decay = torch.exp(-values * _numbers("time", time, values))
@@ -190,6 +195,7 @@ def diffusion_distance(
     The distance in L² between the heat that spreads from x and from y in the time t, ℓ². Raises ValueError for a
     batch, whose shapes have no distance from each other, and for numbers that no point has.
     """
+    check_operator(lb)
     if lb.sizes is not None:
         raise InputError("diffusion_distance: got a batch; ask each shape by itself")
     index = torch.as_tensor(sources)
