@@ -13,7 +13,6 @@ from scipy import sparse
 from torch import Tensor
 
 from torchlb.galerkin.assembly import (
-    CHUNK,
     area_element,
     cofactors,
     element_matrices,
@@ -28,9 +27,7 @@ from torchlb.galerkin.prolongation import prolongation
 from torchlb.geometry.local_fits import FitPlan, LocalFits
 from torchlb.geometry.numbering import Numbering
 from torchlb.linalg.once import once_differentiable
-
-ROWS = 2**15
-"""Rows of a product at a time, so that not all of AP is held."""
+from torchlb.linalg.precision import AT_ONCE
 
 
 class FlatCells(NamedTuple):
@@ -220,7 +217,7 @@ def edge_lengths(
 def congruence(p: Any, matrix: sparse.csr_array) -> sparse.csr_array:
     """PᵀAP, some rows at a time."""
     left: Any = sparse.csr_array(p.T)
-    parts = [left[first : first + ROWS] @ matrix @ p for first in range(0, p.shape[1], ROWS)]
+    parts = [left[first : first + AT_ONCE] @ matrix @ p for first in range(0, p.shape[1], AT_ONCE)]
     return parts[0] if len(parts) == 1 else sparse.csr_array(sparse.vstack(parts))
 
 
@@ -237,7 +234,7 @@ def _slopes(
 ) -> Float[Tensor, "T Q"]:
     """Weights times Σ_c ∇w_c·∇u_c at the Gauss points."""
     found = []
-    for part in torch.arange(len(nodes)).split(max(CHUNK // values[0].shape[1], 1)):
+    for part in torch.arange(len(nodes)).split(max(AT_ONCE // values[0].shape[1], 1)):
         g = metric[part]
         one, two = (
             torch.einsum("qnd,tnc->dtqc", element.gradients, x[nodes[part]]) for x in values

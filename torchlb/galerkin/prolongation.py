@@ -13,9 +13,7 @@ from torchlb.fits.weights import cardinal
 from torchlb.galerkin.curving import CurvedMesh, CurvingPlan, Ends, node_ends
 from torchlb.geometry.local_fits import FitPlan, LocalFits
 from torchlb.geometry.vectors import at
-
-AT_ONCE = 2**11
-"""Vertices whose nodes are looked at together: some 10 MB at degree 4."""
+from torchlb.linalg.precision import AT_ONCE
 
 
 def prolongation(
