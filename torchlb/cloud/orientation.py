@@ -78,20 +78,6 @@ def _carried(
     return torch.from_numpy(sign).to(points), torch.from_numpy(root)
 
 
-def orient_normals(
-    points: Float[Tensor, "N n"],
-    normals: Float[Tensor, "N n"],
-    candidates: Int[Tensor, "N K"],
-) -> Float[Tensor, "N n"]:
-    """Signs of the normals made consistent along a spanning tree of the nearest points, the surest edges first.
-
-    Every component is then turned so that the normal at its extreme point (largest last coordinate) points outward.
-    On a surface with one side only there is a seam.
-    """
-    sign, root = _carried(points, normals, candidates)
-    return normals * torch.where(normals[root, -1] < 0, -sign, sign)[:, None]
-
-
 def mended_normals(
     points: Float[Tensor, "N n"],
     normals: Float[Tensor, "N n"],
@@ -99,7 +85,7 @@ def mended_normals(
 ) -> tuple[Float[Tensor, "N n"], Bool[Tensor, " N"]]:
     """Normals of a user with the signs that those around them have, and where these have no side.
 
-    Points are turned that most around them contradict, again and again; or signs are carried as by `orient_normals`, to
+    Points are turned that most around them contradict, again and again; or signs are carried along a spanning tree, to
     the side that most of a component have, if fewer neighbours contradict each other then, also of those within 20°.
     Where many do, and the two sides are as even as chance makes them (three deviations), the component faces out.
     """
