@@ -170,7 +170,7 @@ class Tetrahedra:
         triangles, radius, normal = self.triangles[kept], radius[kept], normal[kept]
         ends = self.ends(kept)
         alignment = cloud.alignment(normal, triangles)
-        tangent = alignment > LOW
+        tangent = alignment > LOW  # walls between two rims have none
         for corner in triangles.T:
             left = np.flatnonzero(tangent)
             apex, axis = (x.take(corner[left], 0) for x in (cloud.points, cloud.normals))

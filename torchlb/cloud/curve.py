@@ -22,11 +22,11 @@ from torchlb.cloud.orientation import settled_normals
 from torchlb.cloud.places import in_words, places_of
 from torchlb.errors import InputError, first_few, warn
 from torchlb.geometry.neighbors import nearest_neighbors
-from torchlb.geometry.thresholds import CREASE, FACTOR, HALF_CREASE, RING, ROUGH, WIDER
+from torchlb.geometry.thresholds import CREASE, FACTOR, HALF_CREASE, OBTUSE, RING, ROUGH, WIDER
 from torchlb.geometry.vectors import inner, lengths
 from torchlb.linalg.precision import TINY
 
-NEAREST = 2 * RING
+NEAR = 2 * RING
 """Nearest points among which those beside a point are; and segments on either side that tell how long one is."""
 RANDOM = 2.0
 """A segment is a gap that is 3 + v (ln N + RANDOM) times as long as those around, with v = 0 of points at even steps
@@ -55,7 +55,7 @@ def cloud_curve(
     InputError
         For points that are far from all others.
     """
-    size = min(NEAREST + 1, len(points))
+    size = min(NEAR + 1, len(points))
     near, oriented = nearest_neighbors(points, size), False
     if normals is not None:
         normals, oriented = settled_normals(points, normals, near)
@@ -220,7 +220,8 @@ def _cut(
         turn = np.arccos(np.clip(cosine, -1, 1))
         if not closed:
             turn[:1] = 0
-        back = turn + np.append(turn[1:], turn[:1] if closed else 0) > 2 / 3 * np.pi
+        # half as long again is a gap, too, where the curve would turn back at its two ends together
+        back = turn + np.append(turn[1:], turn[:1] if closed else 0) > OBTUSE
         back &= noise == 0  # whose short segments have any direction
         share = length / np.maximum(np.where(back, WIDER, limit) * usual, TINY)
         gap = np.flatnonzero(share > 1)
@@ -238,11 +239,11 @@ def _cut(
 
 def _usual(length: Float[np.ndarray, " S"], closed: bool) -> Float[np.ndarray, " S"]:
     """The mean of the segments before each, or of those after it, whichever is larger: density may change at once."""
-    count, width = len(length), min(NEAREST, len(length) - 1) if closed else 0
+    count, width = len(length), min(NEAR, len(length) - 1) if closed else 0
     around = np.concatenate([length[count - width :], length, length[:width]])
     total, place = np.append(0, np.cumsum(around)), np.arange(count) + width
     means = []
-    for first, last in ((place - NEAREST, place), (place + 1, place + 1 + NEAREST)):
+    for first, last in ((place - NEAR, place), (place + 1, place + 1 + NEAR)):
         first, last = (np.clip(end, 0, len(around)) for end in (first, last))
         means.append((total[last] - total[first]) / np.maximum(last - first, 1))
     return np.maximum(*means)

@@ -23,12 +23,12 @@ from torchlb.cloud.surface import CloudSurface
 from torchlb.geometry.admission import admissible_neighbors
 from torchlb.geometry.complex import Faces, edges_of, pieces_of
 from torchlb.geometry.frames import complete_frames
-from torchlb.geometry.thresholds import AROUND, FACTOR, LEVEL, NEAREST
+from torchlb.geometry.thresholds import AROUND, FACTOR, LEVEL, NEAREST, OBTUSE
 from torchlb.geometry.vectors import inner, largest, lengths
-from torchlb.linalg.precision import NEGLIGIBLE, ROOT_EPS, SMALL
+from torchlb.linalg.precision import DENSE, NEGLIGIBLE, ROOT_EPS, SMALL
 
-COARSE, PAIRS = 800, 11
-"""Dimension of the space in which modes are computed, at most; and number of the modes, the constant among them."""
+PAIRS = 11
+"""Number of modes, the constant among them."""
 
 
 def _surrounded(
@@ -42,7 +42,7 @@ def _surrounded(
     after = torch.cat([angle[:, 1:], torch.full_like(angle[:, :1], torch.inf)], 1)
     after = torch.where(after.isinf(), angle[:, :1] + 2 * torch.pi, after)
     gap = (after - angle).masked_fill(angle.isinf(), 0.0).amax(1)
-    return np.asarray(good.any(1) & (gap < 2 / 3 * np.pi))
+    return np.asarray(good.any(1) & (gap < OBTUSE))
 
 
 def in_doubt(surface: CloudSurface, faces: Faces) -> Bool[np.ndarray, " F"]:
@@ -55,6 +55,7 @@ def in_doubt(surface: CloudSurface, faces: Faces) -> Bool[np.ndarray, " F"]:
     length = lengths(edge)
     spacing, narrow = (spacing_at(points, near, number) for number in (AROUND, AROUND // 2))
     small, large = np.minimum(spacing[i], spacing[j]), np.maximum(spacing[i], spacing[j])
+    # over the larger spacing of their ends, and any over the smaller one
     found = length > np.minimum(REACH * large, FACTOR * small)
     steep_i, steep_j = (np.abs(inner(edge, normals[k])) > LEVEL * length for k in (i, j))
     steep = steep_i | steep_j
@@ -113,7 +114,7 @@ def _coarse_space(sound: sparse.csr_matrix) -> Any:
         symmetry="symmetric",
         smooth=("jacobi", {"weighting": "local"}),
         improve_candidates=None,
-        max_coarse=COARSE,
+        max_coarse=DENSE,
         coarse_solver="splu",
     )
     basis = sparse.identity(len(sound.diagonal()), format="csr")

@@ -47,7 +47,7 @@ def denoised(
     if use.double().mean() < 0.5:
         return points, 0.0
     ratio = (two - four) / (free[0] - free[1]) / (four / free[1])
-    if ratio[use].median() > FACTOR:
+    if ratio[use].median() > FACTOR:  # of clean clouds 15 and more, of pure noise 1
         return points, 0.0
     moved, squares = points.clone(), []
     for part in torch.arange(len(points)).split(AT_ONCE):

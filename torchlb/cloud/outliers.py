@@ -28,7 +28,10 @@ def spacing_at(
 def lone_points(
     points: Float[np.ndarray, "N 3"], near: Int[np.ndarray, "N K"]
 ) -> Bool[np.ndarray, " N"]:
-    """Which points are far from all others by the spacing of these, above their plane, and in none with their like."""
+    """Which points are far from all others by the spacing of these, above their plane, and in none with their like.
+
+    Where the density of a surface changes at once half a disc of twice the spacing has twelve others of a like spacing.
+    """
     lone = np.zeros(len(points), dtype=bool)
     spacing = spacing_at(points, near)
     usual = np.partition(spacing[near[:, 1:]], near.shape[1] // 4, axis=1)[:, near.shape[1] // 4]

@@ -118,8 +118,9 @@ class Poles:
         )
         side, tree = relations.vote(), relations.tree()
         wrong, by_tree = relations.contradicted(side), relations.contradicted(tree)
-        if FACTOR * by_tree < wrong:
+        if FACTOR * by_tree < wrong:  # 8 times and more on open surfaces, else 1.4
             side, wrong = tree, by_tree
+        # 0.13 and more on bands with one side, else 0.04
         two_sided = wrong <= LOW * float(relations.weight[relations.against].sum())
         around = side[first:].mean()
         if abs(around) < 2 * (1 - LOW) - 1:  # an open surface faces up

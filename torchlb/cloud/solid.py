@@ -22,7 +22,7 @@ from torchlb.geometry.thresholds import RING, WIDER
 from torchlb.geometry.vectors import lengths
 from torchlb.linalg.precision import NEGLIGIBLE, TINY
 
-NEAREST = 2 * RING
+NEAR = 2 * RING
 """Points by which the density around each is known."""
 SURE = 5.0
 """Of so many clouds as e to this power one has a wrong cavity by chance."""
@@ -44,7 +44,7 @@ def cloud_solid(points: Float[Tensor, "N 3"]) -> Complex:
         raise InputError(
             f"points: all {len(points)} lie in a plane, and fill no solid; a surface has dim=2"
         )
-    near = nearest_neighbors(points, min(NEAREST + 1, len(points))).numpy()
+    near = nearest_neighbors(points, min(NEAR + 1, len(points))).numpy()
     reach = lengths(places[near[:, -1]] - places)
     found = delaunay(places @ SHEAR)
     cells, beside = (x.astype(np.int64) for x in (found.simplices, found.neighbors))

@@ -51,7 +51,8 @@ def boundary_nodes(
     if nodes.dim == 1 or len(outer) == 0:
         return WithoutBoundary(len(nodes.shares))
     if nodes.dim == 2:
-        width = 2 * (nodes.degree // 2 + 2)  # of the curves, as many vertices on either side
+        # the curve through as many vertices on either side, two more than a polynomial of that degree needs
+        width = 2 * (nodes.degree // 2 + 2)
         return OnCurves(nodes, outer, rim_plan(points, nodes.edges[outer], width))
     faithful = tuple(degree for degree in degrees if degree > 2) or (3,)  # creases stay flat
     return OnSurface.of(points, nodes, faithful, held)

@@ -210,6 +210,7 @@ class FitSearch:
         vertices, good = block.vertices, regular
         new = torch.zeros_like(frame)
         if self.degrees:
+            # quadratics are the last resort
             good = regular & (fit.misfit(heights, graph) <= (ROUGH if fit.degree == 2 else SLIGHT))
             vacant = self.surface_degree[vertices] < fit.degree
             if fit.degree == self.highest:

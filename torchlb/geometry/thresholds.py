@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from math import cos, radians, sqrt
+from math import acos, cos, pi, radians, sqrt
 
 CREASE = cos(radians(60))
 """Cosine of the angle between two tangent planes, or two edges, that makes a crease, a fold or a corner."""
@@ -10,6 +10,8 @@ LEVEL = cos(radians(45))
 """Cosine, and sine, of the angle that tells level from steep."""
 KINK = cos(radians(20))
 """Cosine of the angle up to which what turns is taken for smooth."""
+OBTUSE = pi - acos(CREASE)
+"""What the angle of a crease leaves of a straight one, 120° in radians: a gap around a point, and a turn back."""
 HALF_CREASE = sqrt((1 - CREASE) / 2)
 """Sine of half the angle of a crease: slope of the chord of an arc that turns by so much, 0.5."""
 

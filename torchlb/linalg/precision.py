@@ -26,6 +26,8 @@ BYTES = 2**24
 """Size of the arrays that are worked on: smaller ones are mostly overhead, larger ones leave the processor's cache."""
 AT_ONCE = 2**13
 """Points, elements or rows of a matrix that are worked on together; 2¹¹ to 2¹⁸ take the same time."""
+DENSE = 600
+"""Unknowns up to which a dense eigensolver is as fast."""
 LARGEST_FACTORED = 100_000
 """Unknowns beyond which an iteration takes the place of sparse factors, whose memory grows faster than the points."""
 ROUNDS = 20

@@ -24,14 +24,23 @@ from torch import Tensor
 from torchlb.errors import EigenbasisError, warn
 from torchlb.geometry.thresholds import FACTOR
 from torchlb.linalg.lanczos import BLOCK, Inverse, lanczos_of_pair
-from torchlb.linalg.precision import EPS, LARGEST_FACTORED, ROOT_EPS, ROUNDING, ROUNDS, SMALL, TINY
+from torchlb.linalg.precision import (
+    DENSE,
+    EPS,
+    LARGEST_FACTORED,
+    ROOT_EPS,
+    ROUNDING,
+    ROUNDS,
+    SMALL,
+    TINY,
+)
 from torchlb.linalg.sparse import multiply, on_one_pattern
 from torchlb.linalg.two_levels import Matrix, absolute_row_sums, main_entries, two_levels
 from torchlb.spectral.components import constants, members
 from torchlb.spectral.eigenbasis import Eigenbasis
 
-DENSE, SHARE = 600, 6
-"""Up to this many points, or where a sixth of the spectrum is wanted, a dense solve is as fast."""
+SHARE = 6
+"""Where more than a sixth of the spectrum is wanted a dense solve is as fast."""
 SHIFT = 10.0
 """Shift of the factor times the size of a component: about half of its first eigenvalue, were it a disk."""
 START = 0.003
@@ -257,6 +266,7 @@ def _swept(
             return values[:keep], errors, u[:, :keep], mu[:, :keep]
         rough = errors[:k].max() > ASTRAY
         active = np.flatnonzero(errors > tolerance) if sweep else np.arange(keep)
+        # the last step takes off FACTOR times the energy that is left: from step to step it falls to a quarter or less
         enough = FACTOR * np.maximum(SMALL * errors, tolerance) / np.maximum(scale, TINY)
         small = (u.astype(np.float32), mu.astype(np.float32))
         right = (r, z, shifts.astype(np.float32), enough)

@@ -42,7 +42,7 @@ class Acceptance:
 
     @staticmethod
     def too_wide_at_boundary(candidate: Candidate) -> bool:
-        """Whether no stencil with boundary points may be as wide as that."""
+        """Whether a stencil with boundary points would be so wide that it is lopsided, and a lower order better."""
         return candidate.degree > 2 and candidate.factor > FACTOR
 
     def judge(
@@ -54,6 +54,7 @@ class Acceptance:
         """
         inside = reference(self.dim, candidate.degree, candidate.rule)
         edge = reference(self.dim, candidate.degree, one_sided=True) if touching.any() else inside
+        # at a boundary over the one-sided reference, or over what is accepted inside, since corners have more
         at_edge = FACTOR * max(edge.growth, FACTOR * inside.growth)
         max_growth = torch.where(touching, at_edge, FACTOR * inside.growth)
         max_ratio = FACTOR * torch.where(touching, edge.off_diagonal_ratio, 1.0)
@@ -77,8 +78,9 @@ class Acceptance:
     def _resolved(self, candidate: Candidate) -> tuple[float, float]:
         """Bounds on the residual of the heights: for this candidate, and for all of its degree.
 
-        On a cloud the noise of the heights may fall by as much as the widest stencil is wider than the first, and a
-        size that the user fixed cannot widen.
+        On a mesh they may leave the less the more points there are, from 3 a polynomial on: a fit to folds does not
+        become better over more of them. On a cloud the noise of the heights may fall by as much as the widest stencil
+        is wider than the first, and a size that the user fixed cannot widen.
         """
         growth = max(reference(self.dim, m).growth for m in (candidate.degree, RESOLVING_DEGREE))
         if self.on_mesh:
