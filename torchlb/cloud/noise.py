@@ -11,10 +11,12 @@ from torch import Tensor
 from torchlb.fits.polynomials import monomials, num_monomials
 from torchlb.geometry.admission import admissible_neighbors
 from torchlb.geometry.frames import complete_frames
-from torchlb.geometry.thresholds import FACTOR
 from torchlb.geometry.vectors import dot
 from torchlb.linalg.precision import AT_ONCE, LOW, NEGLIGIBLE, ROUNDING
 
+SMOOTH = 4.0
+"""From this F on what quadratics miss is taken for shape: of clean clouds F is 6 and more, with noise of a twentieth of
+the spacing 1.5 to 4, of pure noise 1."""
 SAMPLE = 2000
 """Points by which a cloud is judged."""
 PATCH = 40
@@ -47,7 +49,7 @@ def denoised(
     if use.double().mean() < 0.5:
         return points, 0.0
     ratio = (two - four) / (free[0] - free[1]) / (four / free[1])
-    if ratio[use].median() > FACTOR:  # of clean clouds 15 and more, of pure noise 1
+    if ratio[use].median() > SMOOTH:
         return points, 0.0
     moved, squares = points.clone(), []
     for part in torch.arange(len(points)).split(AT_ONCE):
