@@ -34,7 +34,7 @@ from torch import Tensor
 from tqdm import tqdm
 
 from torchlb import LaplaceBeltrami, clean_mesh
-from torchlb.linalg import krylov
+from torchlb.certified import krylov
 from torchlb.surfaces import Sphere, Torus
 
 DENSE = 3000

@@ -80,7 +80,7 @@ def test_every_centre_takes_the_first_candidate_that_passes(balls):
 
 def test_pieces_cover_all_centres_within_the_bound(balls, monkeypatch):
     entry = 8 * CANDIDATES[0].size * num_monomials(2, CANDIDATES[0].degree)
-    monkeypatch.setattr("torchlb.geometry.candidates.PIECE_BYTES", 100 * entry)
+    monkeypatch.setattr("torchlb.linalg.precision.BYTES", 100 * entry)
     pieces = list(Search(balls, torch.arange(300), CANDIDATES[:1]))
     assert torch.equal(torch.cat([rows for _, rows, _ in pieces]), torch.arange(300))
     assert [len(rows) for _, rows, _ in pieces] == [100, 100, 100]

@@ -17,6 +17,7 @@ from torchlb.certified.enforce import Schedule, certify
 from torchlb.certified.null_vector import left_null_vector, shared_outflow
 from torchlb.cloud.surface import cloud_surface
 from torchlb.errors import warn
+from torchlb.linalg.precision import ROOT_EPS
 from torchlb.stencils.assemble import Stencils, assemble
 from torchlb.stencils.shape import mesh_shape
 from torchlb.surfaces import Hemisphere, Sphere, StarShaped, ThreeSphere, Torus, smooth_function
@@ -239,8 +240,8 @@ def test_outflow_takes_the_place_of_the_null_vector():
 
 
 def test_what_has_no_null_vector_is_said():
-    """Inverse iteration shifts the diagonal by 1e-9 of itself: here onto the eigenvalue 1e-9."""
-    near = 1 - 1e-9
+    """Inverse iteration shifts the diagonal by √ε of itself: here onto the eigenvalue √ε."""
+    near = 1 - ROOT_EPS
     matrix = sparse.csr_array(np.array([[1.0, near], [near, 1.0]]))
     with pytest.raises(StabilityError, match="singular beyond its constants"):
         left_null_vector(matrix, torch.ones(2, dtype=torch.float64))

@@ -7,10 +7,12 @@ from scipy.spatial import ConvexHull
 
 from torchlb import LaplaceBeltrami
 from torchlb.fits.rules import WEIGHT_RULES
-from torchlb.fits.weights import MAX_RESIDUAL, least_squares_weights
-from torchlb.stencils.rows import STEEPEST, to_tangent_vectors
+from torchlb.fits.weights import least_squares_weights
+from torchlb.geometry.thresholds import SLIGHT
+from torchlb.linalg.precision import NEGLIGIBLE
+from torchlb.stencils.rows import to_tangent_vectors
 
-LONGEST = (1 + 2 * STEEPEST) ** 0.5  # of JJᵀ no entry is further from 1 where rows stay as they are
+LONGEST = (1 + 2 * SLIGHT) ** 0.5  # of JJᵀ no entry is further from 1 where rows stay as they are
 QUIET = pytest.mark.filterwarnings("ignore::UserWarning")
 
 
@@ -109,7 +111,7 @@ def test_data_do_not_hide_that_neighbours_lie_in_one_place():
     coords = torch.zeros(1, 12, 2, dtype=torch.float64)
     angle = torch.arange(13, dtype=torch.float64)
     flux = torch.stack([angle.cos(), angle.sin()], 1)[None]
-    assert not least_squares_weights(coords, 2, flux=flux).residual.item() <= MAX_RESIDUAL
+    assert not least_squares_weights(coords, 2, flux=flux).residual.item() <= NEGLIGIBLE
 
 
 def test_splines_through_coincident_points_are_refused():
@@ -119,5 +121,5 @@ def test_splines_through_coincident_points_are_refused():
     coords[:, -1] = coords[:, 0] * (1 + 3e-16)
     weights = WEIGHT_RULES["polyharmonic"](coords, 4)
     growth = weights.radius * weights.gradient.abs().sum(1).amax(1)
-    assert growth[weights.residual <= MAX_RESIDUAL].max() < 1e10
+    assert growth[weights.residual <= NEGLIGIBLE].max() < 1e10
     assert growth.nan_to_num().max() > 1e14

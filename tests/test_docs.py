@@ -2,6 +2,7 @@
 
 import ast
 import re
+import runpy
 import subprocess
 import sys
 import warnings
@@ -202,6 +203,14 @@ def test_a_quoted_message_is_one_that_comes(message, tmp_path, monkeypatch):
         with pytest.raises((ValueError, TypeError, RuntimeError, UserWarning)) as caught:
             triggers[0]()
     assert re.search(pattern, str(caught.value), re.DOTALL), str(caught.value)
+
+
+def test_the_table_of_numbers_is_that_of_the_source():
+    """As `python scripts/write_numbers.py` writes it, which fails for a number without a docstring."""
+    script = runpy.run_path(str(ROOT / "scripts" / "write_numbers.py"))
+    page = script["PAGE"].read_text("utf-8")
+    assert script["with_table"](page) == page
+    assert page.count("| `linalg.precision`: `LOW` | `0.1` |") == 1
 
 
 def test_every_public_name_is_in_the_reference():

@@ -318,10 +318,9 @@ def test_blocks_of_any_size_make_the_same_pair(monkeypatch):
     """Of a hemisphere of one block, and of many with a rest, in all that is done a few at a time."""
     vertices, faces = Hemisphere().mesh(500)
     whole = LaplaceBeltrami.from_mesh(vertices, faces)
-    for name in ("galerkin.forms.ROWS", "galerkin.curving.AT_ONCE", "stencils.shape.AT_ONCE"):
-        monkeypatch.setattr(f"torchlb.{name}", 70)
-    for module in ("assembly", "curving"):
-        monkeypatch.setattr(f"torchlb.galerkin.{module}.CHUNK", 70)
+    rooms = ("assembly", "curving", "forms")
+    for module in (*(f"galerkin.{room}" for room in rooms), "stencils.shape"):
+        monkeypatch.setattr(f"torchlb.{module}.AT_ONCE", 70)
     parts = LaplaceBeltrami.from_mesh(vertices, faces)
     assert whole.weak.col.equal(parts.weak.col)
     for one, two in zip(whole.weak.values, parts.weak.values, strict=True):

@@ -9,13 +9,14 @@ import pytest
 import torch
 from scipy import sparse
 
-from torchlb.cloud.cocone import FOLD, best_manifold, wings
+from torchlb.cloud.cocone import best_manifold, wings
 from torchlb.fits.least_squares import left_inverse
 from torchlb.fits.weights import scaled_system
 from torchlb.galerkin import forms
 from torchlb.galerkin.pair import Pattern
-from torchlb.geometry.admission import MAX_SLOPE, MIN_ALIGNMENT, admissible, normal_frames
+from torchlb.geometry.admission import admissible, normal_frames
 from torchlb.geometry.complex import components, edges_of, spanning_pairs, tree_sides
+from torchlb.geometry.thresholds import CREASE, HALF_CREASE
 from torchlb.linalg import kernels
 
 
@@ -74,7 +75,7 @@ def test_products_some_rows_at_a_time_are_those_of_the_whole(monkeypatch):
     matrix.data[::5] = 0.0
     shuffled = p[:, ::-1]
     shuffled.indices = 89 - shuffled.indices
-    monkeypatch.setattr(forms, "ROWS", 40)
+    monkeypatch.setattr(forms, "AT_ONCE", 40)
     found = forms.upper_congruence(shuffled.copy(), matrix)
     expected = sparse.triu(p.T @ matrix @ p)
     assert abs(found - expected).max() < 1e-14 * abs(expected).max()
@@ -112,7 +113,7 @@ def one_by_one(points, faces):
         ]
         there = [(tip, other, edge) for tip, edge in sides for other in tips.get(edge, [])]
         full = any(len(tips.get(edge, [])) > 1 for _, edge in sides)
-        if not full and all(way(x, e) @ way(y, e) <= FOLD for x, y, e in there):
+        if not full and all(way(x, e) @ way(y, e) <= CREASE for x, y, e in there):
             chosen.append([a, b, c])
             for tip, edge in sides:
                 tips.setdefault(edge, []).append(tip)
@@ -202,7 +203,7 @@ def test_graph_balls_are_what_walks_reach(n, dim):
     sides = sides + 2 * torch.eye(n, dtype=torch.float64)[0]
     shape = (x.contiguous().numpy() for x in (points, normal_frames(frames), sides))
     rows = graph.indptr.astype(np.int32), graph.indices.astype(np.int32)
-    bounds = 12, 18.0, 4, MAX_SLOPE, MIN_ALIGNMENT
+    bounds = 12, 18.0, 4, HALF_CREASE, CREASE
     index, count = kernels.graph_balls(*shape, *rows, np.arange(120), *bounds)
     for center in range(120):
         expected = grown(points, frames, sides, graph, center, 12, 18.0, 4)

@@ -160,8 +160,8 @@ def test_factors_step_in_where_krylov_methods_do_not_converge(monkeypatch):
     lb = certified(Sphere().random_points(400))
     expected = left_null_vector(lb.to_scipy(), lb.mass)[0]
     monkeypatch.setattr("torchlb.certified.krylov.LARGEST_FACTORED", 0)
-    monkeypatch.setattr("torchlb.certified.krylov.CYCLES", 1)
-    monkeypatch.setattr("torchlb.certified.krylov.MAX_ITERATIONS", 3)
+    monkeypatch.setattr("torchlb.certified.krylov.ROUNDS", 1)
+    monkeypatch.setattr("torchlb.certified.krylov.STEPS", 3)
     areas = lb.mass * torch.linspace(0.5, 1.5, 400)
     with pytest.warns(UserWarning, match="did not converge on 400 points.*certify=False"):
         mass, verdict, _ = check_certificate(lb.to_scipy(), areas)

@@ -7,7 +7,7 @@ from pathlib import Path
 
 PACKAGE = Path(__file__).parents[1] / "torchlb"
 # Lowest first. `import torchlb` counts as an import of __init__, which stands on all the rest.
-ORDER = ["errors", "version", "surfaces", "linalg", "fits", "geometry", "cloud"]
+ORDER = ["errors", "version", "linalg", "surfaces", "fits", "geometry", "cloud"]
 ORDER += ["baseline", "galerkin", "stencils", "certified", "spectral", "operator", "pde", "nn"]
 ORDER += ["io", "interop"]
 ORDER += ["plot", "__init__", "__main__"]

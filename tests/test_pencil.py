@@ -260,7 +260,7 @@ def test_factors_take_over_where_sweeps_stall(monkeypatch):
     """With a warning, and to the same eigenvalues; beyond the size that is factored an error says what to do."""
     lb = LaplaceBeltrami.from_mesh(*Ellipsoid().mesh(900))
     expected = lb.eigenbasis(10, tolerance=1e-10).eigenvalues
-    monkeypatch.setattr(pencil, "SWEEPS", 1)  # or a tolerance beyond rounding
+    monkeypatch.setattr(pencil, "ROUNDS", 1)  # or a tolerance beyond rounding
     fresh = LaplaceBeltrami.from_mesh(*Ellipsoid().mesh(900))
     with pytest.warns(UserWarning, match="after 1 sweeps some of 10 eigenvalues .* Factors of the"):
         found = fresh.eigenbasis(10, tolerance=1e-10)

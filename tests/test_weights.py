@@ -10,12 +10,12 @@ from torchlb.fits.polyharmonic import polyharmonic_weights
 from torchlb.fits.polynomials import monomials, num_monomials
 from torchlb.fits.rules import WEIGHT_RULES, reference
 from torchlb.fits.weights import (
-    MAX_RESIDUAL,
     Weights,
     least_squares_weights,
     positive_weights,
     window,
 )
+from torchlb.linalg.precision import NEGLIGIBLE
 
 CASES = [(1, 2), (1, 5), (2, 2), (2, 3), (2, 6), (3, 2), (3, 4), (4, 3)]
 RULES = {"least_squares": least_squares_weights, "polyharmonic": polyharmonic_weights}
@@ -53,7 +53,7 @@ def polynomial(dim, degree):
 def refused(weights):
     """Whether rank is missing, and acceptance sees it without a test of its own: by the moments, or by growth."""
     growth = weights.radius**2 * weights.laplacian.abs().sum(1)
-    missed = ~((weights.residual <= MAX_RESIDUAL) & (growth < 1e3))
+    missed = ~((weights.residual <= NEGLIGIBLE) & (growth < 1e3))
     return bool((missed & ~(weights.condition < 1e10)).all())
 
 
@@ -212,7 +212,7 @@ def test_positive_weights_are_positive_and_consistent(dim, degree):
     """w_j ≥ 0 for j ≠ i wherever a positive stencil is found, with all moments of degree ≤ m."""
     coords = cloud(dim, degree, batch=40, factor=6)
     weights = positive_weights(coords, degree)
-    good = weights.residual <= MAX_RESIDUAL
+    good = weights.residual <= NEGLIGIBLE
     assert good.double().mean() > 0.9
     w, others = weights.laplacian[good], weights.laplacian[good, 1:]
     assert (others >= -1e-12 * others.abs().amax(1, keepdim=True)).all()
@@ -228,7 +228,7 @@ def test_positive_weights_give_up_where_there_are_none():
     coords[..., 0] = coords[..., 0].abs() + 0.05
     weights = positive_weights(coords, 2)
     negative = (weights.laplacian[:, 1:] < -1e-10 * weights.laplacian.abs().amax()).any(1)
-    assert (negative | (weights.residual > MAX_RESIDUAL)).all()
+    assert (negative | (weights.residual > NEGLIGIBLE)).all()
 
 
 @pytest.mark.parametrize("rule", RULES)

@@ -14,15 +14,10 @@ from jaxtyping import Float
 from scipy import sparse
 from torch import Tensor
 
-from torchlb.certified.krylov import krylov_or_factors, negative_directions
+from torchlb.certified.krylov import RESTART, krylov_or_factors, negative_directions
 from torchlb.certified.null_vector import CONSERVED, left_null_vector, shared_outflow
 from torchlb.linalg.factor import factorized
-
-STRICTNESS = 1e-12
-"""S passes if it is negative up to this share of the size of each of its rows; a hundred times their rounding."""
-POSITIVE = 1e-10
-"""Share of its area that π must reach at every point; what is below has no inflow but rounding."""
-MAX_VECTORS = 128
+from torchlb.linalg.precision import ROOT_EPS, ROUNDING
 
 
 @dataclass(frozen=True)
@@ -86,7 +81,7 @@ def check_certificate(
     contracts, max_s, feed = False, np.nan, np.zeros((len(areas), 0))
     if smallest > 0 and error <= CONSERVED:
         contracts, max_s, feed = dissipation(matrix, mass)
-    holds = smallest > POSITIVE and contracts
+    holds = smallest > ROOT_EPS and contracts
     return mass, Certificate(holds, smallest, max_s, int(component.max()) + 1), feed
 
 
@@ -116,7 +111,7 @@ def dissipation(
     symmetric = (weighted + weighted.T) / 2
     size = (abs(weighted).sum(axis=0) + abs(weighted).sum(axis=1)) / 2
     size = np.where(size > 0, size, 1.0)
-    shifted = sparse.csr_array(STRICTNESS * sparse.diags_array(size) - symmetric)
+    shifted = sparse.csr_array(ROUNDING * sparse.diags_array(size) - symmetric)
     vectors = krylov_or_factors(
         len(size), lambda: negative_directions(shifted), lambda: _negative_pivots(shifted)
     )
@@ -126,9 +121,9 @@ def dissipation(
 
 
 def _negative_pivots(matrix: sparse.csr_array) -> Float[np.ndarray, "N k"]:
-    """For each negative pivot of the symmetric A = LDLᵀ, at most `MAX_VECTORS`, v = L^{-T}e_j."""
+    """For each negative pivot of the symmetric A = LDLᵀ, at most `RESTART`, v = L^{-T}e_j."""
     lu = factorized(sparse.csc_array(matrix), 0.0)
     pivots = lu.U.diagonal()
-    negative = np.flatnonzero(pivots < 0)[:MAX_VECTORS]
+    negative = np.flatnonzero(pivots < 0)[:RESTART]
     columns = (lu.L[:, negative] * pivots[negative]).toarray()
     return lu.solve(columns[lu.perm_r])

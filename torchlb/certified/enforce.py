@@ -20,15 +20,12 @@ from tqdm import tqdm
 from torchlb.certified.certificate import Certificate, check_certificate
 from torchlb.certified.krylov import prefers_krylov
 from torchlb.errors import StabilityWarning, as_given, warn
+from torchlb.linalg.precision import LOW
 from torchlb.linalg.sparse import to_scipy
 from torchlb.stencils.rows import Reason, Rows
 
 MARGIN = 0.02
 """A point of smaller weight, π below this share of its area, has the rows around it marked while they can change."""
-SHARE = 0.1
-"""Of the largest entry or contribution around, from which on a row is marked."""
-PEAK = 0.02
-"""Share of the largest contribution to a direction from which on a row can be a peak of its own."""
 Lower = Callable[[Int[Tensor, " J"], Int[Tensor, " J"]], Rows]
 
 
@@ -184,7 +181,7 @@ def _around_small_weights(
     worst = np.zeros(len(small))
     np.minimum.at(worst, col, inflow)
     marked = np.zeros(len(density), dtype=bool)
-    marked[row[(inflow < SHARE * worst[col]) & (inflow < 0)]] = True
+    marked[row[(inflow < LOW * worst[col]) & (inflow < 0)]] = True
     marked[small[density[small] > 0]] = True
     marked[matrix[small[~free[small]]].indices] = True
     return marked
@@ -197,12 +194,12 @@ def _feeding(
 
     Directions from Krylov methods are sums of many local ones, by chance with different weights.
     """
-    marked = (feed > SHARE * feed.max(axis=0)).any(axis=1)
+    marked = (feed > LOW * feed.max(axis=0)).any(axis=1)
     for own in feed.T[: feed.shape[1] * peaks]:
-        high = np.flatnonzero(own > PEAK * own.max())
+        high = np.flatnonzero(own > MARGIN * own.max())
         around = joined[high]
         largest = np.maximum.reduceat(own[around.indices], around.indptr[:-1])
-        marked[high[(own[high] >= SHARE * largest) & (around @ own > 0)]] = True
+        marked[high[(own[high] >= LOW * largest) & (around @ own > 0)]] = True
     return marked
 
 

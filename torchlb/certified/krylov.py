@@ -18,24 +18,22 @@ from scipy.sparse import csgraph
 from scipy.sparse.linalg import LinearOperator, gmres
 
 from torchlb.errors import warn
+from torchlb.linalg.precision import (
+    LARGEST_FACTORED,
+    NEGLIGIBLE,
+    ROOT_EPS,
+    ROUNDING,
+    ROUNDS,
+    SINGLE,
+    SMALL,
+    STEPS,
+)
 
 Result = TypeVar("Result")
-LARGEST_FACTORED = 100_000
-"""Beyond this many points Krylov methods come before the sparse factors, whose memory grows faster than the points."""
-SHIFT = 1e-9
-"""Share of each diagonal entry that W is shifted by, so that it is definite."""
 GROUND = 1e-4
-"""The same for the null vector itself, where B must not blow up the constants: 100 iterations instead of 1,000."""
-ROUGH, FINE = 1e-5, 1e-12
-"""Backward error of a null vector that is `NEGATIVE` somewhere, which is all that is asked then, and of any other."""
-NEGATIVE = -1e-3
-RESTART, CYCLES, STEP = 50, 20, 1e-6
-"""Iterations of GMRES between restarts, bound on the restarts, and what one of them asks for at most."""
-MISS = 1e-6
-"""Conjugate gradients end at this residual; it bounds the chance to miss a negative eigenvalue."""
-FURTHER = 60
-"""Iterations after the first negative curvature, which tell the negative directions from each other."""
-MAX_ITERATIONS = 500
+"""Share of each diagonal entry that B is shifted by for the null vector: 100 iterations instead of 1,000."""
+RESTART = 50
+"""Iterations between restarts, and after the first negative curvature, to tell negative directions from each other."""
 
 
 def prefers_krylov(size: int) -> bool:
@@ -76,7 +74,7 @@ class LowOrder:
         self.size, self.row, self.col, self.weight = len(symmetric.diagonal()), row, col, weight
         diagonal = np.bincount(row, weight, self.size) + np.bincount(col, weight, self.size)
         own = np.abs(symmetric.diagonal())
-        self.loss = np.maximum(loss, 0) + SHIFT * np.where(own > 0, own, 1.0)
+        self.loss = np.maximum(loss, 0) + ROOT_EPS * np.where(own > 0, own, 1.0)
         both = (np.concatenate([row, col]), np.concatenate([col, row]))
         weights = sparse.csr_array((np.tile(weight, 2), both), shape=symmetric.shape)
         self.matrix = sparse.csr_array(sparse.diags_array(diagonal + self.loss) - weights)
@@ -148,15 +146,15 @@ def null_density(
     loss = -area * (matrix.sum(axis=1) + GROUND * matrix.diagonal())
     low = LowOrder(sparse.csr_array((weighted + weighted.T) / 2), loss)
     density = np.ones(len(area))
-    for _ in range(CYCLES):
+    for _ in range(ROUNDS):
         density = rescaled(density, area, component, free)
         residual = -lost - weighted @ density
         error = backward_error(weighted, density, lost)
-        if error <= (ROUGH if density.min() < NEGATIVE else FINE):
+        if error <= (SINGLE if density.min() < -SMALL else ROUNDING):
             return density
         if not np.isfinite(error):
             break
-        wanted = max(STEP, 0.01 * FINE / error)
+        wanted = max(NEGLIGIBLE, 0.01 * ROUNDING / error)
         step = gmres(weighted, residual, M=-low.inverse, rtol=wanted, restart=RESTART, maxiter=1)
         density = density + step[0]
     return None
@@ -168,23 +166,23 @@ def negative_directions(matrix: sparse.csr_array) -> Float[np.ndarray, "N k"] | 
     Conjugate gradients on Ax = b, preconditioned by B, b Gaussian of covariance W ≈ B⁻¹. While every curvature is
     positive the residual is r(Â)b̂, Â = B^½AB^½ with the signs of A, b̂ = B^½b, and the polynomial r has r(0) = 1 and
     positive roots, the Ritz values. So |r(λ)| > 1 for λ < 0: the part of b̂ along a negative eigenvector never shrinks,
-    and it is a Gaussian number of deviation about one. Where the residual falls to `MISS` all the same, there is no
-    such eigenvector, but for a chance of about `MISS`. Once a curvature is negative, `FURTHER` iterations and a
-    Rayleigh-Ritz step on all of them tell the directions from each other.
+    and it is a Gaussian number of deviation about one. Where the residual falls to 1e-6 all the same, there is no such
+    eigenvector, but for a chance of about 1e-6. Once a curvature is negative, `RESTART` iterations and a Rayleigh-Ritz
+    step on all of them tell the directions from each other.
     """
     low = LowOrder(sparse.csr_array(-matrix), matrix.sum(axis=1))
     start = _without_constants(matrix, low.noise())
     basis: list[np.ndarray] = []
-    negative, left, residual = None, FURTHER, np.inf
+    negative, left, residual = None, RESTART, np.inf
     for z, p, curvature, residual in _conjugate_gradients(matrix, low.inverse, start):
-        if not residual > MISS or left == 0 or len(basis) == MAX_ITERATIONS:
+        if not residual > NEGLIGIBLE or left == 0 or len(basis) == STEPS:
             break
         basis.append(z / residual)
         if negative is None and curvature < 0:
             negative = p
         left -= negative is not None
     if negative is None:
-        return np.empty((low.size, 0)) if residual <= MISS else None
+        return np.empty((low.size, 0)) if residual <= NEGLIGIBLE else None
     block = np.stack(basis, axis=1)
     values, vectors = np.linalg.eigh(block.T @ (matrix @ block))
     found = block @ vectors[:, values < 0]
@@ -198,7 +196,7 @@ def _without_constants(
     _, component = csgraph.connected_components(matrix, directed=False)
     loss, whole = (np.bincount(component, v) for v in (matrix.sum(axis=1), matrix.diagonal()))
     mean = np.bincount(component, vector) / np.bincount(component)
-    return vector - np.where(loss <= SHIFT * whole, mean, 0.0)[component]
+    return vector - np.where(loss <= ROOT_EPS * whole, mean, 0.0)[component]
 
 
 def _conjugate_gradients(

@@ -12,13 +12,12 @@ from torch import Tensor
 from torchlb.certified.krylov import backward_error, krylov_or_factors, null_density, rescaled
 from torchlb.errors import StabilityError
 from torchlb.linalg.factor import factorized
+from torchlb.linalg.precision import ROOT_EPS
 
-ROW_SUM = 1e-9
-"""Share of its size from which on a row sum is not rounding."""
 CONSERVED = 1e-11
 """π is a null vector if what flows in and out of each point agrees to this share."""
-SHIFT, SOLVES = 1e-9, 8
-"""Share of each diagonal entry that inverse iteration is shifted by, and its number of steps."""
+SOLVES = 8
+"""Steps of inverse iteration."""
 
 
 def left_null_vector(
@@ -77,7 +76,7 @@ SINGULAR = (
 
 def has_outflow(matrix: sparse.csr_array, rounding: float = 0.0) -> Bool[np.ndarray, " N"]:
     """Rows whose sum is not zero, but for a relative `rounding` of their entries."""
-    return np.abs(matrix.sum(axis=1)) > max(ROW_SUM, 64 * rounding) * abs(matrix).sum(axis=1)
+    return np.abs(matrix.sum(axis=1)) > max(ROOT_EPS, 64 * rounding) * abs(matrix).sum(axis=1)
 
 
 def shared_outflow(matrix: sparse.csr_array, areas: Float[Tensor, " N"]) -> Float[np.ndarray, " N"]:
@@ -104,7 +103,7 @@ def _factored_density(
     """What `null_density` finds, by inverse iteration."""
     weighted = sparse.diags_array(area) @ matrix
     diagonal = np.abs(weighted.diagonal())
-    shift = SHIFT * np.where(diagonal > 0, diagonal, 1.0)
+    shift = ROOT_EPS * np.where(diagonal > 0, diagonal, 1.0)
     try:
         lu = factorized(sparse.csc_array((weighted - sparse.diags_array(shift)).T), 1e-2)
     except RuntimeError as error:

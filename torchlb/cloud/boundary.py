@@ -13,9 +13,7 @@ from torchlb.cloud.frames import cloud_frames
 from torchlb.cloud.voronoi import cell_volume, nearest_graph, unrolled
 from torchlb.geometry.boundary import BoundaryPlan
 from torchlb.geometry.neighbors import nearest_neighbors
-
-INSIDE = 4
-"""Nearest points off the boundary, on whose side the shape is."""
+from torchlb.geometry.thresholds import RING
 
 
 @dataclass(frozen=True)
@@ -59,7 +57,7 @@ def boundary_of_cloud(
         return None
     members = mask.nonzero()[:, 0]
     own, others = points[members], (~mask).nonzero()[:, 0] if not mask.all() else members
-    count = min(INSIDE, len(others))
+    count = min(RING, len(others))
     _, index = KDTree(points[others].numpy()).query(own.numpy(), k=count)
     inside = others[torch.from_numpy(index.reshape(len(members), count))]
     near = nearest_neighbors(own, min(max(8 * (dim - 1), 1), len(own)))

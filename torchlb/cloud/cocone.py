@@ -16,27 +16,17 @@ from jaxtyping import Bool, Float, Int
 
 from torchlb.cloud.manifold import face_vectors
 from torchlb.geometry.complex import Faces, circumcenters, delaunay, edges_of
-from torchlb.geometry.vectors import TINY, inner, largest, lengths, smallest
+from torchlb.geometry.thresholds import CREASE, LEVEL, WIDER
+from torchlb.geometry.vectors import inner, largest, lengths, smallest
+from torchlb.linalg.precision import LOW, NEGLIGIBLE, ROUNDING, SINGLE, TINY
 
-COCONE = np.sin(np.pi / 8)
-"""Sine of the half-angle between a tangent plane and the double cone that a dual edge has to leave."""
-FOLD = 0.5
-"""Cosine of the least angle between two triangles at an edge."""
+COCONE = np.sqrt((1 - LEVEL) / 2)
+"""Sine of the half-angle, 22.5°, between a tangent plane and the double cone that a dual edge has to leave."""
 REACH = 2.0
-"""The reach of a point is so many times the distance to a certain neighbour."""
-STEP, LEVEL = 1.5, 0.7
-"""Of reaches, one over that by all neighbours of another point: where the density changes at once; and the least cosine
-between the normal of a triangle across that and those of its corners."""
-TILTED = 0.1
-"""Least cosine between the normal of a triangle and those of its corners: walls between two rims have none."""
-FAR = 1e6
-"""Extents of the cloud at which its outer Voronoi cells end."""
-MOVED = 1e-5
-"""Of points before they are triangulated, in units of the spacing: far above rounding."""
+"""The reach of a point is so many times the distance to its eighth neighbour; so wide a loop is closed."""
 RAISED = 1e-2
-"""Of that, along the normals: points on a circle then have one layer of triangles, not several that mix."""
-FLAT = 1e-10
-"""Tetrahedra of less volume, over the cube of their longest side, have no circumcentre to speak of; triangles alike."""
+"""Points are moved at random before they are triangulated, and along the normals by this share of it: those on a circle
+then have one layer of triangles, not several that mix."""
 
 
 @dataclass(frozen=True)
@@ -70,7 +60,7 @@ class Cloud:
         one, two, three = map(lengths, sides)
         normal = np.cross(sides[0], -sides[2])
         longest = reduce(np.maximum, (one, two, three))
-        twice = np.maximum(lengths(normal), FLAT * longest**2)
+        twice = np.maximum(lengths(normal), ROUNDING * longest**2)
         return one * two * three / (2 * twice), normal / twice[:, None]
 
     def limits(self, faces: Faces) -> Float[np.ndarray, " F"]:
@@ -80,7 +70,7 @@ class Cloud:
         """
         reach = self.reach.take(faces)
         limit, widest = smallest(reach), largest(reach)
-        across = np.flatnonzero(widest > STEP * smallest(self.around.take(faces)))
+        across = np.flatnonzero(widest > WIDER * smallest(self.around.take(faces)))
         level = self.alignment(self.circles(faces[across])[1], faces[across]) > LEVEL
         across = across[level]
         limit[across] = widest[across]
@@ -140,7 +130,7 @@ class Tetrahedra:
         """
         random = np.random.default_rng(0).standard_normal(points.shape)
         random -= (1 - RAISED) * inner(random, normals)[:, None] * normals
-        moved = points + MOVED * spacing[:, None] * random
+        moved = points + SINGLE * spacing[:, None] * random
         found = delaunay(moved)
         cells, beyond = (x.astype(np.int64) for x in (found.simplices, found.neighbors))
         del found
@@ -163,7 +153,7 @@ class Tetrahedra:
         normal /= np.maximum(lengths(normal), TINY)[:, None]
         inside = a - moved[np.concatenate(apex)[hull]]
         away = np.sign(inner(inside, normal))[:, None] * normal
-        far = centers[first[hull]] + FAR * np.ptp(points, axis=0).max() * away
+        far = centers[first[hull]] + np.ptp(points, axis=0).max() / NEGLIGIBLE * away
         second[hull] = len(cells) + np.arange(hull.sum())
         centers = np.concatenate([centers, far])
         return cls(points, cells, centers, triangles, (first, second), hull)
@@ -180,7 +170,7 @@ class Tetrahedra:
         triangles, radius, normal = self.triangles[kept], radius[kept], normal[kept]
         ends = self.ends(kept)
         alignment = cloud.alignment(normal, triangles)
-        tangent = alignment > TILTED
+        tangent = alignment > LOW  # walls between two rims have none
         for corner in triangles.T:
             left = np.flatnonzero(tangent)
             apex, axis = (x.take(corner[left], 0) for x in (cloud.points, cloud.normals))
@@ -192,7 +182,7 @@ class Tetrahedra:
         vector *= np.sign(inner(out, vector))[:, None]
         outward = np.zeros_like(cloud.points)
         np.add.at(outward, triangles[parting], vector[:, None])
-        cost = radius / np.maximum(alignment, TILTED) ** 2
+        cost = radius / np.maximum(alignment, LOW) ** 2
         found = np.flatnonzero(tangent | parting)
         found = found[np.argsort(cost[found], kind="stable")]
         return Candidates(triangles, triangles[found], tangent[found], parting[found], outward)
@@ -228,11 +218,11 @@ class Candidates:
 
 
 def _bounded_centers(points: np.ndarray, cells: Int[np.ndarray, "T 4"]) -> Float[np.ndarray, "T 3"]:
-    """Circumcentres, those of next to no volume not farther away than `FAR`."""
+    """Circumcentres, those of next to no volume not farther away than 1e6 extents of the cloud."""
     total, volume = circumcenters(points, cells)
     with np.errstate(all="ignore"):
         center = total / volume[:, None]
-    most = FAR * np.ptp(points, axis=0).max()
+    most = np.ptp(points, axis=0).max() / NEGLIGIBLE
     return points.take(cells[:, 0], 0) + np.clip(
         np.nan_to_num(center, posinf=most, neginf=-most), -most, most
     )
@@ -274,7 +264,7 @@ def best_manifold(points: Float[np.ndarray, "N 3"], faces: Faces) -> Faces:
     wing = wings(points, tail, head, faces).reshape(-1, 3)
     one, two = edges.twins
     contested = edges.uses > 2
-    contested[edges.of[one[inner(wing[one], wing[two]) > FOLD]]] = True
+    contested[edges.of[one[inner(wing[one], wing[two]) > CREASE]]] = True
     rows = np.flatnonzero(contested[edges.of].reshape(-1, 3).any(1))
     taken, halves = np.ones(len(faces), dtype=bool), np.arange(3 * len(faces)).reshape(-1, 3)[rows]
     parts = (*wing.T, edges.of, contested[edges.of])
@@ -284,7 +274,9 @@ def best_manifold(points: Float[np.ndarray, "N 3"], faces: Faces) -> Faces:
         mine = [half for half in range(3 * number, 3 * number + 3) if doubtful[half]]
         for a in mine:
             b = first[of[a]]
-            if uses[of[a]] > 1 or (uses[of[a]] and x[a] * x[b] + y[a] * y[b] + z[a] * z[b] > FOLD):
+            if uses[of[a]] > 1 or (
+                uses[of[a]] and x[a] * x[b] + y[a] * y[b] + z[a] * z[b] > CREASE
+            ):
                 taken[face] = False
                 break
         else:

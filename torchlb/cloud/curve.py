@@ -21,28 +21,16 @@ from torchlb.cloud.noise import denoised
 from torchlb.cloud.orientation import settled_normals
 from torchlb.cloud.places import in_words, places_of
 from torchlb.errors import InputError, first_few, warn
-from torchlb.geometry.admission import MAX_SLOPE
 from torchlb.geometry.neighbors import nearest_neighbors
-from torchlb.geometry.vectors import TINY, inner, lengths
+from torchlb.geometry.thresholds import CREASE, FACTOR, HALF_CREASE, OBTUSE, RING, ROUGH, WIDER
+from torchlb.geometry.vectors import inner, lengths
+from torchlb.linalg.precision import TINY
 
-NEAREST = 16
+NEAR = 2 * RING
 """Nearest points among which those beside a point are; and segments on either side that tell how long one is."""
-LOOSE = 8
-"""Nearest loose points that one of them is held against."""
-BESIDE = 0.5
-"""Largest cosine of the angle between the two segments of a point: corners are of 60° and more."""
-NOISY = 0.35
-"""Noise over the spacing, from which on it is none, but another part of the curve beside."""
-STRAY = 4.0
-"""Times the noise that the points beside another may lie off its tangent."""
-GAP, RANDOM = 3.0, 2.0
-"""A segment is a gap that is GAP + v (ln N + RANDOM) times as long as those around, with v = 0 of points at even steps
+RANDOM = 2.0
+"""A segment is a gap that is 3 + v (ln N + RANDOM) times as long as those around, with v = 0 of points at even steps
 and 1 of random ones: of exponential gaps one in N e⁵ is, then, so that one curve in 150 is cut."""
-BACK, TURN = 1.5, np.radians(120)
-"""Or so many times as long, where the curve would turn by so much at its two ends together."""
-CLOSE, STEPS = 1.5, 4.0
-"""Points are close to another part of the curve that are so many times as far apart as those around, and in doubt; and
-how much farther along the curve that part is."""
 
 Links = Int[np.ndarray, "N 2"]
 
@@ -67,14 +55,14 @@ def cloud_curve(
     InputError
         For points that are far from all others.
     """
-    size = min(NEAREST + 1, len(points))
+    size = min(NEAR + 1, len(points))
     near, oriented = nearest_neighbors(points, size), False
     if normals is not None:
         normals, oriented = settled_normals(points, normals, near)
     single = np.zeros(len(points), dtype=bool) if boundary is None else boundary.numpy()
     moved, noise = denoised(points, cloud_frames(points, near, 1), near)
     usual = 2 * float((points[near[:, -1]] - points).norm(dim=1).median()) / (size - 1)
-    noise = noise if noise < NOISY * usual else 0.0
+    noise = noise if noise < ROUGH * usual else 0.0
     if noise:
         points, near = moved, nearest_neighbors(moved, size)
     tangents = cloud_frames(points, near, 1)[..., 0].numpy() if noise else None
@@ -127,11 +115,11 @@ def _links(
         along = inner(offset, tangents[:, None])
         across = np.sqrt(np.maximum(distance**2 - along**2, 0))
         offset, distance = along[..., None] * tangents[:, None], np.abs(along)
-        distance[across > np.maximum(STRAY * noise, MAX_SLOPE * distance)] = np.inf
+        distance[across > np.maximum(FACTOR * noise, HALF_CREASE * distance)] = np.inf
     first = distance.argmin(1)
     cosine = inner(offset, offset[rows, first][:, None])
     cosine /= np.maximum(lengths(offset) * lengths(offset[rows, first])[:, None], TINY)
-    distance[(cosine >= BESIDE) | single[:, None]] = np.inf
+    distance[(cosine >= CREASE) | single[:, None]] = np.inf
     distance *= (2 + cosine) ** 2  # straight on before sideways
     second = distance.argmin(1)
     some = np.isfinite(distance[rows, second])
@@ -155,7 +143,7 @@ def _joined(
     loose = np.flatnonzero(free > 0)
     if len(loose) < 2:
         return links
-    size = min(LOOSE + 1, len(loose))
+    size = min(RING + 1, len(loose))
     near = np.asarray(KDTree(points[loose]).query(points[loose], k=size)[1])
     i, j = loose.repeat(size), loose[near].ravel()
     i, j = i[i < j], j[i < j]
@@ -166,7 +154,7 @@ def _joined(
         if other < 0 or free[here] == 0:
             return free[here]
         back, onward = points[[other, there]] - points[here]
-        return back @ onward <= 0 or min(back @ back, onward @ onward) < (STRAY * noise) ** 2
+        return back @ onward <= 0 or min(back @ back, onward @ onward) < (FACTOR * noise) ** 2
 
     for one, two in zip(i[order].tolist(), j[order].tolist(), strict=True):
         if two not in links[one] and open_to(one, two) and open_to(two, one):
@@ -223,7 +211,7 @@ def _cut(
         uneven.append(np.abs(np.diff(length)) / np.maximum(length[1:] + length[:-1], TINY))
     spread = np.concatenate(uneven)
     random = min(1.0, 2 * float(np.median(spread))) if len(spread) else 0.0
-    limit = GAP + random * (np.log(len(points)) + RANDOM)
+    limit = FACTOR + random * (np.log(len(points)) + RANDOM)
     doubtful: list[int] = []
     for (chain, closed), step in zip(chains, steps, strict=True):
         length = lengths(step)
@@ -232,9 +220,10 @@ def _cut(
         turn = np.arccos(np.clip(cosine, -1, 1))
         if not closed:
             turn[:1] = 0
-        back = turn + np.append(turn[1:], turn[:1] if closed else 0) > TURN
+        # half as long again is a gap, too, where the curve would turn back at its two ends together
+        back = turn + np.append(turn[1:], turn[:1] if closed else 0) > OBTUSE
         back &= noise == 0  # whose short segments have any direction
-        share = length / np.maximum(np.where(back, BACK, limit) * usual, TINY)
+        share = length / np.maximum(np.where(back, WIDER, limit) * usual, TINY)
         gap = np.flatnonzero(share > 1)
         for k in gap[(share[gap] < 2) & ~back[gap]].tolist():
             doubtful += [int(chain[k]), int(chain[(k + 1) % len(chain)])]
@@ -250,11 +239,11 @@ def _cut(
 
 def _usual(length: Float[np.ndarray, " S"], closed: bool) -> Float[np.ndarray, " S"]:
     """The mean of the segments before each, or of those after it, whichever is larger: density may change at once."""
-    count, width = len(length), min(NEAREST, len(length) - 1) if closed else 0
+    count, width = len(length), min(NEAR, len(length) - 1) if closed else 0
     around = np.concatenate([length[count - width :], length, length[:width]])
     total, place = np.append(0, np.cumsum(around)), np.arange(count) + width
     means = []
-    for first, last in ((place - NEAREST, place), (place + 1, place + 1 + NEAREST)):
+    for first, last in ((place - NEAR, place), (place + 1, place + 1 + NEAR)):
         first, last = (np.clip(end, 0, len(around)) for end in (first, last))
         means.append((total[last] - total[first]) / np.maximum(last - first, 1))
     return np.maximum(*means)
@@ -289,9 +278,9 @@ def _warn(
         size[chain.points] = steps.sum() if chain.closed else np.inf
     way = np.abs(place[near] - place[:, None])
     way = np.minimum(way, np.abs(size[:, None] - way))
-    other = (way > STEPS * spacing[:, None]) | (number[near] != number[:, None])
+    other = (way > FACTOR * spacing[:, None]) | (number[near] != number[:, None])
     apart = lengths(points[near] - points[:, None])
-    close = (other & (apart < CLOSE * spacing[:, None])).any(1)
+    close = (other & (apart < WIDER * spacing[:, None])).any(1)
 
     def where(marked: np.ndarray) -> str:
         return in_words(places_of(points, near, marked))

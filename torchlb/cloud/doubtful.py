@@ -16,43 +16,33 @@ from scipy import sparse
 from scipy.linalg import eigh
 from torch import Tensor
 
+from torchlb.cloud.cocone import REACH
 from torchlb.cloud.manifold import face_vectors
-from torchlb.cloud.outliers import RING, spacing_at
+from torchlb.cloud.outliers import spacing_at
 from torchlb.cloud.surface import CloudSurface
 from torchlb.geometry.admission import admissible_neighbors
 from torchlb.geometry.complex import Faces, edges_of, pieces_of
 from torchlb.geometry.frames import complete_frames
+from torchlb.geometry.thresholds import AROUND, FACTOR, LEVEL, NEAREST, OBTUSE
 from torchlb.geometry.vectors import inner, largest, lengths
+from torchlb.linalg.precision import DENSE, NEGLIGIBLE, ROOT_EPS, SMALL
 
-AROUND, GAP = 12, 2 * np.pi / 3
-"""Nearest admissible neighbours that surround a point, and the widest gap between their directions if they do."""
-STEEP = 0.7
-"""Sine of the angle to the tangent plane from which on an edge leaves it."""
-STEEP_EDGE, LONG_EDGE, LONGEST = 1.2, 2.2, 3.5
-"""Lengths from which on edges are in doubt: steep ones and others over the larger spacing of their ends, and any over
-the smaller one."""
-PIECE = 24
-"""Pieces of fewer points that only triangles in doubt join to others are in doubt themselves."""
-FAINT = 1e-3
-"""What triangles in doubt are weighed by where aggregates are made: they hardly conduct, and no diagonal is 0."""
-COARSE, PAIRS = 800, 11
-"""Size of the space in which modes are computed; how many, the constant among them."""
-WEAK = 1e-3
-"""Entries, over √(d_i d_j), that no aggregate of that space reaches across."""
+PAIRS = 11
+"""Number of modes, the constant among them."""
 
 
 def _surrounded(
     points: Float[Tensor, "N 3"], normals: Float[Tensor, "N 3"], near: Int[Tensor, "B K"]
 ) -> Bool[np.ndarray, " B"]:
-    """Which first points of the rows have their own sheet all round, in the tangent plane without a gap of `GAP`."""
+    """Which first points of the rows have their own sheet all round, in the tangent plane without a gap of 120°."""
     good = admissible_neighbors(points, normals, near)[:, 1:]
-    good &= good.cumsum(1) <= AROUND
+    good &= good.cumsum(1) <= NEAREST
     flat = (points[near[:, 1:]] - points[near[:, :1]]) @ complete_frames(normals[near[:, 0]])
     angle = torch.atan2(*flat.unbind(-1)).masked_fill(~good, torch.inf).sort(1).values
     after = torch.cat([angle[:, 1:], torch.full_like(angle[:, :1], torch.inf)], 1)
     after = torch.where(after.isinf(), angle[:, :1] + 2 * torch.pi, after)
     gap = (after - angle).masked_fill(angle.isinf(), 0.0).amax(1)
-    return np.asarray(good.any(1) & (gap < GAP))
+    return np.asarray(good.any(1) & (gap < OBTUSE))
 
 
 def in_doubt(surface: CloudSurface, faces: Faces) -> Bool[np.ndarray, " F"]:
@@ -63,10 +53,11 @@ def in_doubt(surface: CloudSurface, faces: Faces) -> Bool[np.ndarray, " F"]:
     i, j = edges.keys // count, edges.keys % count
     edge = points[j] - points[i]
     length = lengths(edge)
-    spacing, narrow = (spacing_at(points, near, number) for number in (RING, RING // 2))
+    spacing, narrow = (spacing_at(points, near, number) for number in (AROUND, AROUND // 2))
     small, large = np.minimum(spacing[i], spacing[j]), np.maximum(spacing[i], spacing[j])
-    found = length > np.minimum(LONG_EDGE * large, LONGEST * small)
-    steep_i, steep_j = (np.abs(inner(edge, normals[k])) > STEEP * length for k in (i, j))
+    # over the larger spacing of their ends, and any over the smaller one
+    found = length > np.minimum(REACH * large, FACTOR * small)
+    steep_i, steep_j = (np.abs(inner(edge, normals[k])) > LEVEL * length for k in (i, j))
     steep = steep_i | steep_j
     if steep.any():
         amid, ends = np.zeros(count, dtype=bool), np.unique([i[steep], j[steep]])
@@ -77,11 +68,11 @@ def in_doubt(surface: CloudSurface, faces: Faces) -> Bool[np.ndarray, " F"]:
         beside = close[i] | close[j]
         close[i[beside]] = close[j[beside]] = True
         own = np.where(amid, spacing, narrow)
-        found |= steep & (close[i] & close[j] | (length > STEEP_EDGE * np.maximum(own[i], own[j])))
+        found |= steep & (close[i] & close[j] | (length > np.maximum(own[i], own[j])))
     doubtful = found[edges.of].reshape(-1, 3).any(1)
     if doubtful.any():
         piece = pieces_of(faces[~doubtful], count)
-        doubtful |= (np.bincount(piece) < PIECE)[piece][faces].any(1)
+        doubtful |= (np.bincount(piece) < NEAREST)[piece][faces].any(1)
     return np.asarray(doubtful)
 
 
@@ -99,7 +90,7 @@ def spectral_change(surface: CloudSurface) -> tuple[float, Bool[np.ndarray, " N"
         return 0.0, marked
     marked[faces[doubtful]] = True
     stiffness, mass = _elements(points, faces, weight)
-    sound, _ = _elements(points, faces, np.where(doubtful, FAINT, 1.0) * weight)
+    sound, _ = _elements(points, faces, np.where(doubtful, SMALL, 1.0) * weight)
     used = mass > 0  # in no face at all are none
     stiffness, sound = (sparse.csr_matrix(part[used][:, used]) for part in (stiffness, sound))
     basis = _coarse_space(sound)
@@ -107,7 +98,7 @@ def spectral_change(surface: CloudSurface) -> tuple[float, Bool[np.ndarray, " N"
         (basis.T @ part @ basis).toarray() for part in (stiffness, sound, sparse.diags(mass[used]))
     )
     values, modes = eigh(whole, mass, subset_by_index=[0, min(PAIRS, len(whole)) - 1])
-    moving = values > 1e-9 * values.max()
+    moving = values > ROOT_EPS * values.max()
     values, modes = values[moving], modes[:, moving]
     rest = (modes * (sound @ modes)).sum(0) / values
     return float(1 - rest.min() / rest.max()) if len(rest) else 0.0, marked
@@ -118,12 +109,12 @@ def _coarse_space(sound: sparse.csr_matrix) -> Any:
     import pyamg
 
     hierarchy = pyamg.smoothed_aggregation_solver(
-        sound + sparse.diags(1e-6 * sound.diagonal()),
-        strength=("symmetric", {"theta": WEAK}),  # pyright: ignore[reportArgumentType]
+        sound + sparse.diags(NEGLIGIBLE * sound.diagonal()),
+        strength=("symmetric", {"theta": SMALL}),  # pyright: ignore[reportArgumentType]
         symmetry="symmetric",
         smooth=("jacobi", {"weighting": "local"}),
         improve_candidates=None,
-        max_coarse=COARSE,
+        max_coarse=DENSE,
         coarse_solver="splu",
     )
     basis = sparse.identity(len(sound.diagonal()), format="csr")
@@ -141,7 +132,7 @@ def _elements(
     count = len(points)
     side = points[np.roll(faces, -2, 1)] - points[np.roll(faces, -1, 1)]
     longest = largest(lengths(side.reshape(-1, 3)).reshape(-1, 3))
-    area = np.maximum(lengths(face_vectors(points, faces)), 1e-6 * longest**2)
+    area = np.maximum(lengths(face_vectors(points, faces)), NEGLIGIBLE * longest**2)
     entry = np.einsum("fkx,flx->fkl", side, side) * (weight / (4 * area))[:, None, None]
     row, col = faces.repeat(3, axis=1).ravel(), np.tile(faces, 3).ravel()
     stiffness = sparse.coo_array((entry.ravel(), (row, col)), shape=(count, count)).tocsr()

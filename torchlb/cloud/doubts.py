@@ -16,25 +16,11 @@ from torchlb.errors import first_few, warn
 from torchlb.geometry.boundary import boundary_faces
 from torchlb.geometry.fit_search import REASONS
 from torchlb.geometry.local_fits import FitPlan
+from torchlb.geometry.thresholds import RING, ROUGH, SLIGHT
+from torchlb.linalg.precision import LOW, NEGLIGIBLE, SMALL
 
-CLOSE, CROWD, CLUSTER = 8, 256, 1e-2
-"""Neighbour whose distance that to the nearest is compared with; the same where so many crowd into one place that those
-are all within a hundredth of what is usual."""
-EXCESS, CHANCE = 10, 1e-6
-"""Near-duplicates are told where points are so many times as many as at random, which happens by such a chance."""
-LAYERED = 0.1
-"""Share of a cloud in two layers from which on a warning names it: 0.4 and more on plates, 0.001 on noisy shapes."""
-DOUBTFUL = 0.1
-"""Share of the points that do not resolve the surface of a cloud, or of the area that those without a fit hold, from
-which on a warning names them."""
-NOISY = 0.3
-"""The first of these shares where the cloud is noisy, and was smoothed: 0.1 to 0.15 at a fifth of the spacing, which
-leaves eigenvalues within a few per cent; 0.66 at half of it."""
-CHANGE = 0.075
-"""What triangles in doubt raise one of the first eigenvalues by over another, from which on a warning says where they
-are. Of 56 clouds with eigenvalues that are off by a tenth and more 49 are warned of, of 79 others 9."""
-ASTRAY = 0.02
-"""Of the points of a declared boundary: how many may lie inside."""
+CROWD = 256
+"""Neighbour whose distance that to the nearest is compared with where more than the nearest crowd into one place."""
 
 
 def warn_of_doubts(surface: CloudSurface, plan: FitPlan, mass: Float[Tensor, " N"]) -> None:
@@ -42,9 +28,10 @@ def warn_of_doubts(surface: CloudSurface, plan: FitPlan, mass: Float[Tensor, " N
     apart = ~torch.isin(torch.arange(len(surface.points)), surface.cells)
     doubtful = (plan.reason == REASONS.index("points do not resolve the surface")) | apart
     flat = (plan.degree == 0) | apart
-    large = float(mass[flat].sum() / mass.sum()) >= DOUBTFUL
+    large = float(mass[flat].sum() / mass.sum()) >= LOW
     doubtful |= flat & large
-    most = NOISY if surface.summary.noise else DOUBTFUL
+    # of a smoothed cloud 0.1 to 0.15 do not at a fifth of the spacing, which leaves eigenvalues within a few per cent
+    most = ROUGH if surface.summary.noise else LOW
     if large or float(doubtful.double().mean()) >= most:
         index = doubtful.nonzero()[:, 0]
         warn(
@@ -57,7 +44,7 @@ def warn_of_joins(surface: CloudSurface) -> None:
     """A warning where triangles may join what is apart, or close what is open."""
     points = surface.points
     change, marked = spectral_change(surface)
-    if change > CHANGE:
+    if change > LOW:
         places = in_words(places_of(points.numpy(), surface.neighbors.numpy(), marked))
         warn(
             "points: triangles that are steep to the surface or long for its spacing raise "
@@ -76,7 +63,7 @@ def warn_of_buried(cells: Int[Tensor, "F corners"], boundary: Bool[Tensor, " N"]
     """A warning where points of a declared boundary lie inside."""
     within = torch.isin(torch.arange(len(boundary)), cells) & ~on_rim(cells, len(boundary))
     inside = (boundary & within).nonzero()[:, 0]
-    if len(inside) > ASTRAY * int(boundary.sum()):
+    if len(inside) > SLIGHT * int(boundary.sum()):
         warn(
             f"boundary: {len(inside)} of its points ({first_few(inside)}) lie inside the shape through the cloud, as "
             "around a hole that was closed because it is hardly wider than the spacing; add points around it, or give "
@@ -92,11 +79,11 @@ def warn_of_near_duplicates(
     Of points at random the nearest is closer than t times the distance to the one of number m with the probability
     1 − (1 − t^d)^(m − 1), about (m − 1)t^d, whatever their density.
     """
-    last = min(CLOSE, neighbors.shape[1] - 1)
+    last = min(RING, neighbors.shape[1] - 1)
     distance = (points[neighbors[:, 1:]] - points[:, None]).norm(dim=-1)
     nearest, wide = distance.amin(1), distance.amax(1)
     share = (last - 1) * (nearest / distance[:, last - 1]).pow(dim)
-    tight = (wide < CLUSTER * wide.median()).nonzero()[:, 0]
+    tight = (wide < SMALL * wide.median()).nonzero()[:, 0]
     if len(tight):  # more than K in one place
         far = min(CROWD, len(points) - 1)
         reach, _ = KDTree(points.numpy()).query(points[tight].numpy(), k=far + 1)
@@ -105,8 +92,8 @@ def warn_of_near_duplicates(
     number = torch.arange(1, len(points) + 1)
     expected = len(points) * ordered
     chance = pdtrc((number // 2 - 1).clamp_min(0).numpy(), expected.numpy() / 2)
-    excess = number - EXCESS * expected
-    excess[(number < 2) | torch.from_numpy(chance > CHANCE)] = 0
+    excess = number - expected / LOW
+    excess[(number < 2) | torch.from_numpy(chance > NEGLIGIBLE)] = 0
     if excess.max() > 0:
         close = order[: int(excess.argmax()) + 1]
         width = float(f"{1.01 * float(nearest[close].max()):.2e}")
@@ -120,7 +107,7 @@ def warn_of_near_duplicates(
 def warn_of_layers(points: Float[Tensor, "N 3"]) -> None:
     """A warning where much of a cloud is two layers so close that they may be taken for one sheet with noise."""
     layered, looked_at = in_two_layers(points.numpy())
-    if len(layered) > LAYERED * looked_at:
+    if len(layered) > LOW * looked_at:  # 0.4 and more on plates, 0.001 on noisy shapes
         warn(
             f"points: around {len(layered) / looked_at:.0%} of them ({first_few(torch.from_numpy(layered))}) they lie "
             "in two layers about a spacing apart or closer, as on a thin plate sampled on both sides; the surface may "

@@ -9,12 +9,10 @@ from torch.nn.functional import normalize
 
 from torchlb.fits.polynomials import monomials
 from torchlb.fits.weights import window
-from torchlb.geometry.admission import PAIRS_AT_ONCE, admissible_neighbors, planes_of
+from torchlb.geometry.admission import admissible_neighbors, planes_of
 from torchlb.geometry.frames import complete_frames
-from torchlb.geometry.neighbors import AT_ONCE
-from torchlb.geometry.vectors import TINY, dot
-
-RIDGE = 1e-13
+from torchlb.geometry.vectors import dot
+from torchlb.linalg.precision import AT_ONCE, ROUNDING, TINY
 
 
 def cloud_frames(
@@ -71,7 +69,7 @@ def refined_normals(
     The quadratics need not go through the point itself, which lessens what noise does to the slope.
     """
     centers = torch.arange(len(points)) if centers is None else centers
-    parts = centers.split(max(PAIRS_AT_ONCE // candidates.shape[1], 1))
+    parts = centers.split(AT_ONCE)
     for _ in range(rounds):
         found = [_slopes_removed(points, normals, candidates[part]) for part in parts]
         normals = normals.index_put((centers,), torch.cat(found))
@@ -95,7 +93,7 @@ def _slopes_removed(
     heights = weight * dot(offset, own[:, None]) / reach
     square = terms @ terms.mT
     trace = square.diagonal(dim1=-2, dim2=-1).sum(-1)
-    square += RIDGE * trace[:, None, None] * torch.eye(6, dtype=points.dtype)
+    square += ROUNDING * trace[:, None, None] * torch.eye(6, dtype=points.dtype)
     slope = torch.linalg.solve(square, terms @ heights[..., None])[:, 1:3]
     sound = (good.sum(1) > 7) & (slope[..., 0].norm(dim=1) < 1)
     return torch.where(sound[:, None], normalize(own - (frames @ slope)[..., 0]), own)

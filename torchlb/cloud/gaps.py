@@ -8,19 +8,12 @@ from __future__ import annotations
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from torchlb.cloud.cocone import FOLD, TILTED, Cloud, wings
+from torchlb.cloud.cocone import REACH, Cloud, wings
 from torchlb.cloud.manifold import boundary_loops
 from torchlb.geometry.complex import Edges, Faces, edges_of
-from torchlb.geometry.vectors import TINY, inner, largest, lengths, smallest
-
-ALIGNED = 0.3
-"""Least cosine between the normal of a triangle in a gap and those of its corners."""
-OVERLAP = 0.05
-"""Sine of the angle by which triangles at a point may overlap, seen along its normal."""
-WIDTH = 2.0
-"""Loops no wider than this many reaches are closed."""
-BESIDE = 13
-"""Nearest points at whose faces a point that was left out looks for one to stand on."""
+from torchlb.geometry.thresholds import CREASE, NEAREST, ROUGH, SLIGHT
+from torchlb.geometry.vectors import inner, largest, lengths, smallest
+from torchlb.linalg.precision import LOW, TINY
 
 
 def filled(
@@ -52,7 +45,7 @@ def filled(
         pool = pool[free[pool].all(1)]
         ears = _ears(edges, half)
         candidates = np.concatenate([pool, ears[~cloud.rim[ears].all(1)]])
-        new = _proposals(cloud, edges, half, candidates, oriented, ALIGNED if strict else TILTED)
+        new = _proposals(cloud, edges, half, candidates, oriented, ROUGH if strict else LOW)
         new = new[~overlapping(cloud, new, around)] if strict else new
         if len(new) == 0:
             return (
@@ -102,7 +95,7 @@ def _proposals(
         alignment = smallest(np.abs(cosine))
     wing = np.zeros((len(edges.keys), 3))
     wing[of] = wings(cloud.points, starts, stops, edges.faces.ravel()[half])
-    folds = inner(wing.take(edge, 0), wings(cloud.points, tail, head, faces)) > FOLD
+    folds = inner(wing.take(edge, 0), wings(cloud.points, tail, head, faces)) > CREASE
     ok = alignment > least
     ok &= radius <= cloud.limits(faces)
     ok &= ~((uses == 1) & folds).any(1)
@@ -159,8 +152,8 @@ def _meet(one: Float[np.ndarray, "P 4 3"], two: Float[np.ndarray, "P 4 3"]) -> n
     """Whether a side or the middle of wedge one lies inside of wedge two."""
     first, second, turn = two[:, None, 0], two[:, None, 1], two[:, None, 3]
     rays = one[:, :3]
-    after = inner(np.cross(first, rays), turn) > OVERLAP
-    before = inner(np.cross(rays, second), turn) > OVERLAP
+    after = inner(np.cross(first, rays), turn) > SLIGHT
+    before = inner(np.cross(rays, second), turn) > SLIGHT
     return np.any(after & before, axis=1)
 
 
@@ -178,7 +171,7 @@ def closed(
     reach = cloud.reach.copy()
     np.maximum.at(reach, faces, cloud.limits(faces)[:, None])
     for loop in boundary_loops(faces, count):
-        wide = WIDTH * reach[loop].mean()
+        wide = REACH * reach[loop].mean()
         places = cloud.points[loop]
         declared = cloud.rim[loop] & cloud.rim[np.roll(loop, 1)]
         if declared.any() or kept[loop].any() or np.ptp(places, axis=0).max() > wide:
@@ -201,7 +194,7 @@ def _clipped(cloud: Cloud, loop: list[int], known: set[int]) -> list[list[int]] 
         turn = np.array([[loop[k - 1], loop[k], loop[(k + 1) % size]] for k in range(size)])
         radius, normal = cloud.circles(turn)
         alignment = np.abs(inner(normal[:, None], cloud.normals[turn])).mean(1)
-        cost = radius / np.maximum(alignment, OVERLAP) ** 2
+        cost = radius / np.maximum(alignment, SLIGHT) ** 2
         a, c = turn[:, 0], turn[:, 2]
         keys = np.minimum(a, c) * count + np.maximum(a, c)
         cost[[key in known or key in own for key in keys.tolist()]] = np.inf
@@ -225,7 +218,7 @@ def with_left_points(cloud: Cloud, faces: Faces) -> Faces:
         corner = np.argsort(faces.ravel(), kind="stable")
         number = np.bincount(faces.ravel(), minlength=count)
         start = np.cumsum(number) - number
-        near = cloud.neighbors[left, 1:BESIDE]
+        near = cloud.neighbors[left, 1:NEAREST]
         uses = number[near]
         row = np.arange(len(left)).repeat(uses.sum(1))
         under = corner[_ranges(uses.ravel()) + start[near].ravel().repeat(uses.ravel())] // 3
@@ -234,7 +227,7 @@ def with_left_points(cloud: Cloud, faces: Faces) -> Faces:
         corners = cloud.points[triangle] - cloud.points[points, None]
         height = np.abs(inner(corners[:, 0], normal))
         shares = [inner(np.cross(corners[:, k - 2], corners[:, k - 1]), normal) for k in range(3)]
-        aligned = np.abs(inner(normal, cloud.normals[points])) > ALIGNED
+        aligned = np.abs(inner(normal, cloud.normals[points])) > ROUGH
         over = np.flatnonzero((np.min(shares, axis=0) > 0) & aligned & (height < radius))
         over = over[np.argsort(height[over], kind="stable")]
         over = over[np.unique(points[over], return_index=True)[1]]

@@ -6,22 +6,14 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from torchlb.geometry.complex import Faces, components, edges_of, tree_sides
-from torchlb.geometry.vectors import TINY, inner, lengths
-
-CLOSED = 1000
-"""A closed fan comes before an open one of up to so many triangles."""
+from torchlb.geometry.vectors import inner, lengths
+from torchlb.linalg.precision import TINY
 
 
 def patches(faces: Faces, count: int) -> Int[np.ndarray, " F"]:
     """Number of the patch of each face: faces that hang together by edges of two faces."""
     one, two = edges_of(faces, count).twins
     return components(one // 3, two // 3, len(faces))
-
-
-def without_specks(faces: Faces, count: int, least: int) -> Faces:
-    """The faces of patches that have at least so many."""
-    patch = patches(faces, count)
-    return faces[np.bincount(patch)[patch] >= least] if len(faces) else faces
 
 
 def with_single_fans(faces: Faces, count: int) -> Faces:
@@ -47,7 +39,7 @@ def with_single_fans(faces: Faces, count: int) -> Faces:
         closed = np.bincount(fan[joined], minlength=len(size)) == size
         point = np.zeros_like(size)
         point[fan] = corner
-        order = np.lexsort((size + CLOSED * closed, point))
+        order = np.lexsort((size, closed, point))
         best = ~looked_at[point]
         best[order[np.append(np.diff(point[order]) > 0, True)]] = True
         lost = ~best[fan].reshape(-1, 3).all(1)

@@ -11,21 +11,19 @@ from torch import Tensor
 from torchlb.fits.polynomials import monomials, num_monomials
 from torchlb.geometry.admission import admissible_neighbors
 from torchlb.geometry.frames import complete_frames
-from torchlb.geometry.neighbors import AT_ONCE
 from torchlb.geometry.vectors import dot
+from torchlb.linalg.precision import AT_ONCE, LOW, NEGLIGIBLE, ROUNDING
 
 SMOOTH = 4.0
-"""From this F on what quadratics miss is taken for shape: of clean clouds F is 15 and more, of pure noise it is 1."""
+"""From this F on what quadratics miss is taken for shape: of clean clouds F is 6 and more, with noise of a twentieth of
+the spacing 1.5 to 4, of pure noise 1."""
 SAMPLE = 2000
 """Points by which a cloud is judged."""
-ROUNDING = 1e-6
-"""Residuals below this share of a neighbourhood's radius are none."""
-RIDGE = 1e-12
 PATCH = 40
 """Points around each whose heights are looked at for two layers."""
-UNIMODAL, LAYERS = 1.6, 0.1
+UNIMODAL = 1.6
 """Kurtosis of the residuals of quadratics below which they are of two layers: it is 1 for two values, 9/5 and more for
-whatever has one mode and is symmetric, 3 for a normal law; and their least size, over the spacing."""
+whatever has one mode and is symmetric, 3 for a normal law."""
 
 
 def denoised(
@@ -47,7 +45,7 @@ def denoised(
     radius, counts, two, _ = _residuals(points, planes, candidates, some, 2)
     _, _, four, _ = _residuals(points, planes, candidates, some, 4)
     free = counts - terms[0], counts - terms[1]
-    use = (free[1] > 2) & (two > free[0] * (ROUNDING * radius) ** 2)
+    use = (free[1] > 2) & (two > free[0] * (NEGLIGIBLE * radius) ** 2)
     if use.double().mean() < 0.5:
         return points, 0.0
     ratio = (two - four) / (free[0] - free[1]) / (four / free[1])
@@ -80,7 +78,7 @@ def in_two_layers(points: Float[np.ndarray, "N 3"]) -> tuple[Int[np.ndarray, " M
     height -= (basis @ (basis.transpose(0, 2, 1) @ height[..., None]))[..., 0]
     square = np.square(height).mean(1)
     layered = (height**4).mean(1) < UNIMODAL * square**2
-    return some[layered & (square > LAYERS**2 * np.pi / PATCH)], len(some)
+    return some[layered & (square > LOW**2 * np.pi / PATCH)], len(some)
 
 
 def _residuals(
@@ -107,7 +105,7 @@ def _residuals(
     terms = monomials(coords / scale, degree).mT
     terms = torch.cat([torch.ones_like(terms[:, :1]), terms], 1) * good[:, None]
     square = terms @ terms.mT
-    square += RIDGE * good.sum(1)[:, None, None] * torch.eye(square.shape[-1]).to(square)
+    square += ROUNDING * good.sum(1)[:, None, None] * torch.eye(square.shape[-1]).to(square)
     coefficients = torch.linalg.solve(square, terms @ heights)
     left = heights - terms.mT @ coefficients
     middle = coefficients[:, 0] * plane if planes.ndim == 2 else coefficients[:, 0]

@@ -13,20 +13,13 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from torchlb.errors import first_few, warn
-from torchlb.geometry.admission import MIN_ALIGNMENT
 from torchlb.geometry.complex import components, tree_sides
+from torchlb.geometry.thresholds import CREASE, KINK, RING
 from torchlb.geometry.vectors import at, dot
+from torchlb.linalg.precision import LOW
 
-SMOOTH = 0.97
-"""An edge whose ends' normals mirror each other better than this (within 14°) and that lies flat is trusted first."""
-FLAT = 0.35
-"""Largest share of an edge's length that may be height over the tangent plane at either end of such an edge."""
-
-JUDGES = 8
-"""Nearest points that judge the sign of a given normal."""
-CONTRADICTED, ASTRAY = 1 / 8, 3 / 4
-"""Shares of them that contradict: on the whole, up to which a field is consistent (2 % on thin or coarse shapes, 50 %
-of random signs); and at one point, from which on that is turned, if the field is; a half, if not."""
+ASTRAY = 3 / 4
+"""Share of the nearest that contradict at a point, from which on it is turned; a half in a field without a side."""
 
 
 def nearest_pairs(candidates: Int[Tensor, "N K"]) -> tuple[Int[Tensor, " P"], Int[Tensor, " P"]]:
@@ -50,8 +43,8 @@ def _across(
     normals: Float[Tensor, "N n"],
     i: Int[Tensor, " P"],
     j: Int[Tensor, " P"],
-) -> tuple[Float[Tensor, " P"], Float[Tensor, " P"], Bool[Tensor, " P"]]:
-    """(cosine of n_j to the mirror image of n_i; larger slope of the edge over the planes at its ends; if on an arc).
+) -> tuple[Float[Tensor, " P"], Bool[Tensor, " P"]]:
+    """(cosine of n_j to the mirror image of n_i; if on an arc).
 
     Along an arc that the edge spans it falls under one plane and rises to the other, if the normals agree. Where it
     does not, the ends may lie on the two sides of a thin sheet.
@@ -60,7 +53,7 @@ def _across(
     edge = edge / edge.norm(dim=1, keepdim=True)
     rise_i, rise_j = (dot(edge, end) for end in ends)
     cosine = dot(*ends) - 2 * rise_i * rise_j
-    return cosine, torch.maximum(rise_i.abs(), rise_j.abs()), cosine * rise_i * rise_j <= 0
+    return cosine, cosine * rise_i * rise_j <= 0
 
 
 def _carried(
@@ -73,9 +66,8 @@ def _carried(
     The root is the extreme point of a component (largest last coordinate); the surest edges of the tree come first.
     """
     pairs = nearest_pairs(candidates)
-    cosine, slope, _ = _across(points, normals, *pairs)
-    smooth = (cosine.abs() >= SMOOTH) & (slope <= FLAT)
-    order = (1 - cosine.abs() + ~smooth).argsort(stable=True)
+    cosine, _ = _across(points, normals, *pairs)
+    order = (1 - cosine.abs()).argsort(stable=True)
     i, j = (end[order].numpy() for end in pairs)
     turned = tree_sides(i, j, (cosine[order] < 0).numpy(), len(points))
     component = components(i, j, len(points))
@@ -86,20 +78,6 @@ def _carried(
     return torch.from_numpy(sign).to(points), torch.from_numpy(root)
 
 
-def orient_normals(
-    points: Float[Tensor, "N n"],
-    normals: Float[Tensor, "N n"],
-    candidates: Int[Tensor, "N K"],
-) -> Float[Tensor, "N n"]:
-    """Signs of the normals made consistent along a spanning tree of the nearest points, the surest edges first.
-
-    Every component is then turned so that the normal at its extreme point (largest last coordinate) points outward.
-    On a surface with one side only there is a seam.
-    """
-    sign, root = _carried(points, normals, candidates)
-    return normals * torch.where(normals[root, -1] < 0, -sign, sign)[:, None]
-
-
 def mended_normals(
     points: Float[Tensor, "N n"],
     normals: Float[Tensor, "N n"],
@@ -107,14 +85,13 @@ def mended_normals(
 ) -> tuple[Float[Tensor, "N n"], Bool[Tensor, " N"]]:
     """Normals of a user with the signs that those around them have, and where these have no side.
 
-    Points are turned that most around them contradict, again and again; or signs are carried as by `orient_normals`, to
-    the side that most of a component have, if fewer neighbours contradict each other then, also on smooth edges alone.
+    Points are turned that most around them contradict, again and again; or signs are carried along a spanning tree, to
+    the side that most of a component have, if fewer neighbours contradict each other then, also of those within 20°.
     Where many do, and the two sides are as even as chance makes them (three deviations), the component faces out.
     """
-    i, j = nearest_pairs(candidates[:, : JUDGES + 1])
-    cosine, slope, arc = _across(points, normals, i, j)
-    told = (arc & (cosine.abs() >= MIN_ALIGNMENT)).to(points)
-    sure = told * (cosine.abs() >= SMOOTH) * (slope <= FLAT)
+    i, j = nearest_pairs(candidates[:, : RING + 1])
+    cosine, arc = _across(points, normals, i, j)
+    told = (arc & (cosine.abs() >= CREASE)).to(points)
     if not (told * (cosine < 0)).any():
         return normals, torch.zeros(len(points), dtype=torch.bool)
     sign, root = _carried(points, normals, candidates)
@@ -130,12 +107,12 @@ def mended_normals(
         return (total[0] / total[1].clamp_min(1))[group]
 
     side, own = torch.ones_like(sign), torch.arange(len(points))
-    many = contradicted(told, side, root) > CONTRADICTED
-    for _ in range(JUDGES):
+    many = contradicted(told, side, root) > LOW
+    for _ in range(RING):
         astray = contradicted(told, side, own) > torch.where(many, 0.5, ASTRAY)
         side = torch.where(astray, -side, side)
     better = torch.ones_like(many)
-    for pairs in (told, sure):
+    for pairs in (told, told * (cosine.abs() >= KINK)):
         better &= contradicted(pairs, sign, root) < contradicted(pairs, side, root)
     votes, number = torch.zeros(2, len(points), dtype=points.dtype).index_add(
         1, root, torch.stack([sign, torch.ones_like(sign)])

@@ -9,22 +9,17 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy.spatial import KDTree
 
+from torchlb.geometry.thresholds import AROUND, RING, ROUGH
 from torchlb.geometry.vectors import inner, lengths
 
-RING = 6
-"""The spacing of a point is the distance to its neighbour of this number."""
 LONE = 2.5
-"""Of a lone point, its spacing over the lower quartile of its neighbours'."""
-MATES = 8
-"""So many others of such a spacing has a point within twice its own, in a plane with it, where the density of a surface
-changes at once: half a disc has twelve."""
-FLAT, HIGH = 0.3, 0.2
-"""Points lie in a plane where the least of their singular values is so much of the middle one; and what a lone point
-stands above the plane of its neighbours, over its distance from their midst."""
+"""Spacing of a lone point over the lower quartile of its neighbours', at least."""
+HIGH = 0.2
+"""Sine of the angle at which a lone point stands above the plane of its neighbours, seen from their midst, at least."""
 
 
 def spacing_at(
-    points: Float[np.ndarray, "N 3"], near: Int[np.ndarray, "N K"], number: int = RING
+    points: Float[np.ndarray, "N 3"], near: Int[np.ndarray, "N K"], number: int = AROUND
 ) -> Float[np.ndarray, " N"]:
     """How far the points around each are apart: the distance to its neighbour of this number, ℓ."""
     return lengths(points[near[:, min(number, near.shape[1] - 1)]] - points)
@@ -33,7 +28,10 @@ def spacing_at(
 def lone_points(
     points: Float[np.ndarray, "N 3"], near: Int[np.ndarray, "N K"]
 ) -> Bool[np.ndarray, " N"]:
-    """Which points are far from all others by the spacing of these, above their plane, and in none with their like."""
+    """Which points are far from all others by the spacing of these, above their plane, and in none with their like.
+
+    Where the density of a surface changes at once half a disc of twice the spacing has twelve others of a like spacing.
+    """
     lone = np.zeros(len(points), dtype=bool)
     spacing = spacing_at(points, near)
     usual = np.partition(spacing[near[:, 1:]], near.shape[1] // 4, axis=1)[:, near.shape[1] // 4]
@@ -48,9 +46,9 @@ def lone_points(
     octave = np.floor(np.log2(spacing[far]))
     for scale in np.unique(octave):
         alike = points[spacing >= 2.0 ** (scale - 1)]
-        if len(alike) > MATES:
+        if len(alike) > RING:
             own = far[octave == scale]
-            found = KDTree(alike).query(points[own], k=MATES + 1)
+            found = KDTree(alike).query(points[own], k=RING + 1)
             distance, mates = (np.asarray(part) for part in found)
             flat = _in_a_plane(alike[mates[:, 1:]] - points[own, None])
             lone[own] &= ~(flat & (distance[:, -1] <= 2 * spacing[own]))
@@ -62,7 +60,7 @@ def _in_a_plane(offset: Float[np.ndarray, "B K 3"]) -> Bool[np.ndarray, " B"]:
     offset = np.concatenate([0 * offset[:, :1], offset], 1)
     offset -= offset.mean(1, keepdims=True)
     _, middle, least = np.linalg.svd(offset, compute_uv=False).T
-    return least < FLAT * middle
+    return least < ROUGH * middle
 
 
 def put_beside(
@@ -72,7 +70,7 @@ def put_beside(
     moved, others = points.copy(), np.flatnonzero(~lone)
     tree = KDTree(points[others])
     host = np.asarray(tree.query(points[lone])[1])
-    ring = np.asarray(tree.query(points[others[host]], k=min(RING + 1, len(others)))[1])
+    ring = np.asarray(tree.query(points[others[host]], k=min(AROUND + 1, len(others)))[1])
     order = np.argsort(host, kind="stable")
     turn = np.empty_like(host)  # the number of a lone point among those of its host
     first = np.searchsorted(host[order], host[order])

@@ -7,10 +7,11 @@ from jaxtyping import Bool, Float, Int
 
 from torchlb.geometry.complex import components
 from torchlb.geometry.vectors import lengths
+from torchlb.linalg.precision import LOW
 
 Places = tuple[tuple[float, ...], ...]
-PLACES, PLACE = 8, 0.1
-"""Places that are named where something is in doubt; and how large one is, over the width of the cloud."""
+PLACES = 8
+"""Places that are named where something is in doubt."""
 
 
 def in_words(places: Places) -> str:
@@ -29,7 +30,7 @@ def places_of(
     means: list[np.ndarray] = []
     while number.any() and len(means) < PLACES:
         first = group == group[number.argmax()]
-        around = first | (lengths(points - points[first].mean(0)) < PLACE * width)
+        around = first | (lengths(points - points[first].mean(0)) < LOW * width)
         means.append(points[around & (number > 0)].mean(0))
         number[around] = 0
     digits = 3 - int(np.floor(np.log10(width)))

@@ -17,21 +17,17 @@ from scipy import sparse
 from scipy.sparse.linalg import cg
 from torch import Tensor
 
-from torchlb.cloud.cocone import FLAT, Tetrahedra
+from torchlb.cloud.cocone import Tetrahedra
 from torchlb.cloud.frames import refined_normals
 from torchlb.geometry.complex import edges_of, tree_sides
-from torchlb.geometry.vectors import TINY, at, dot, inner, lengths
+from torchlb.geometry.thresholds import FACTOR
+from torchlb.geometry.vectors import at, dot, inner, lengths
+from torchlb.linalg.precision import LOW, ROUNDING, STEPS, TINY
 
 LONG = 1.4
-"""A Voronoi cell that reaches so many times as far as along the normal has another one."""
-ENCLOSED = 0.9
-"""Share of the convex hull that lies on one side of a surface, from which on that is its outside."""
-OPEN = 3.0
-"""How many times more than a tree a vote contradicts where the convex hull is not all outside: 8 and more, else 1.4."""
-ONE_SIDED = 0.1
-"""Of the weight of opposed poles: sides that contradict more are none, 0.13 and more on bands with one, else 0.04."""
-SHARP, RESIDUAL, STEPS = 16.0, 1e-2, 1000
-"""Of a vote on two sides: relations weigh exp(16 (cosine − 1)); relative residual, and bound on the steps to it."""
+"""A Voronoi cell that reaches so many times as far as along the normal has another normal."""
+SHARP, RESIDUAL = 16.0, 0.01
+"""In a vote on two sides relations weigh exp(SHARP (cosine − 1)); it is solved to this relative residual."""
 
 
 @dataclass(frozen=True)
@@ -60,7 +56,7 @@ class Poles:
         first = points.take(cells[:, 0], 0)
         u, v, w = (points.take(cells[:, k], 0) - first for k in (1, 2, 3))
         longest = reduce(np.maximum, map(lengths, (u, v, w)))
-        solid = np.flatnonzero(np.abs(inner(u, np.cross(v, w))) > FLAT * longest**3)
+        solid = np.flatnonzero(np.abs(inner(u, np.cross(v, w))) > ROUNDING * longest**3)
         outer = tetrahedra.triangles[hull]
         point = np.concatenate([cells[solid].ravel(), outer.ravel()])
         ball = np.concatenate([solid.repeat(4), tetrahedra.sides[1][hull].repeat(3)])
@@ -122,11 +118,12 @@ class Poles:
         )
         side, tree = relations.vote(), relations.tree()
         wrong, by_tree = relations.contradicted(side), relations.contradicted(tree)
-        if OPEN * by_tree < wrong:
+        if FACTOR * by_tree < wrong:  # 8 times and more on open surfaces, else 1.4
             side, wrong = tree, by_tree
-        two_sided = wrong <= ONE_SIDED * float(relations.weight[relations.against].sum())
+        # 0.13 and more on bands with one side, else 0.04
+        two_sided = wrong <= LOW * float(relations.weight[relations.against].sum())
         around = side[first:].mean()
-        if abs(around) < 2 * ENCLOSED - 1:  # an open surface faces up
+        if abs(around) < 2 * (1 - LOW) - 1:  # an open surface faces up
             upward = normals[:, -1].numpy()
             around = ((side[ends[0]] - side[ends[1]]) * upward).sum()
         return side if around >= 0 else -side, two_sided

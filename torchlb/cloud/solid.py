@@ -18,21 +18,16 @@ from torchlb.cloud.complexes import Complex
 from torchlb.errors import InputError, first_few
 from torchlb.geometry.complex import circumcenters, components, delaunay
 from torchlb.geometry.neighbors import nearest_neighbors
-from torchlb.geometry.vectors import TINY, lengths
+from torchlb.geometry.thresholds import RING, WIDER
+from torchlb.geometry.vectors import lengths
+from torchlb.linalg.precision import NEGLIGIBLE, TINY
 
-NEAREST = 16
+NEAR = 2 * RING
 """Points by which the density around each is known."""
-CELLS, SURE = 7, 5.0
-"""Tetrahedra a point, nearly; and e to which power as many clouds have a wrong cavity by chance."""
-NO_VOLUME = 1e-6
-"""Volume over the cube of the longest edge, below which a tetrahedron is a sliver that goes if it is outermost."""
+SURE = 5.0
+"""Of so many clouds as e to this power one has a wrong cavity by chance."""
 SHEAR = np.eye(3) + 1e-3 * np.array([[0, 0.9, 0.7], [0, 0, 0.8], [0, 0, 0]])
 """By which points are mapped before they are triangulated: the cells of a grid are then all cut alike."""
-EVEN = 1.5
-"""Of k times the ball to the nearest point over that to number k, which is 1 for random points and 5 for a grid: the
-empty spheres are smaller by what is more."""
-DENT = 8
-"""Cavities and dents of fewer tetrahedra are none."""
 
 
 def cloud_solid(points: Float[Tensor, "N 3"]) -> Complex:
@@ -45,18 +40,19 @@ def cloud_solid(points: Float[Tensor, "N 3"]) -> Complex:
     """
     places = points.numpy()
     spread = np.linalg.svd(places - places.mean(0), compute_uv=False)
-    if spread[2] <= NO_VOLUME * spread[0]:
+    if spread[2] <= NEGLIGIBLE * spread[0]:
         raise InputError(
             f"points: all {len(points)} lie in a plane, and fill no solid; a surface has dim=2"
         )
-    near = nearest_neighbors(points, min(NEAREST + 1, len(points))).numpy()
+    near = nearest_neighbors(points, min(NEAR + 1, len(points))).numpy()
     reach = lengths(places[near[:, -1]] - places)
     found = delaunay(places @ SHEAR)
     cells, beside = (x.astype(np.int64) for x in (found.simplices, found.neighbors))
     radius, flat = _spheres(places, cells)
     count = near.shape[1] - 1
     even = count * np.mean((lengths(places[near[:, 1]] - places) / reach) ** 3)
-    chance = (np.log(CELLS * len(points)) + SURE) / count / max(1.0, even / EVEN)
+    # random points have 24π²/35 Delaunay tetrahedra each (Meijering 1953)
+    chance = (np.log(24 / 35 * np.pi**2 * len(points)) + SURE) / count / max(1.0, even / WIDER)
     kept = ~_outside(flat | (radius <= chance ** (1 / 3) * np.sort(reach[cells], 1)[:, 2]), beside)
     beyond = np.append(kept, False)  # of the last, which −1 is, nothing is kept
     while (peeled := kept & flat & ~beyond[beside].all(1)).any():
@@ -80,7 +76,7 @@ def _spheres(
     edges = [
         lengths(points[cells[:, i]] - points[cells[:, j]]) for i, j in combinations(range(4), 2)
     ]
-    return radius, np.abs(six) / 6 <= NO_VOLUME * np.max(edges, axis=0) ** 3
+    return radius, np.abs(six) / 6 <= NEGLIGIBLE * np.max(edges, axis=0) ** 3
 
 
 def _outside(
@@ -90,4 +86,4 @@ def _outside(
     i, j = np.arange(len(kept)).repeat(4), beside.ravel()
     both = (j >= 0) & ~kept[i] & ~kept[j]
     piece = components(i[both], j[both], len(kept))
-    return ~kept & (np.bincount(piece)[piece] >= DENT)
+    return ~kept & (np.bincount(piece)[piece] >= RING)

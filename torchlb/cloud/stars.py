@@ -10,9 +10,10 @@ import torch
 from jaxtyping import Int
 
 from torchlb.cloud.cocone import Cloud
-from torchlb.cloud.gaps import ALIGNED, overlapping
+from torchlb.cloud.gaps import overlapping
 from torchlb.cloud.voronoi import natural_neighbors, star_of, unrolled
 from torchlb.geometry.complex import Faces, edges_of, pieces_of, spanning_pairs
+from torchlb.geometry.thresholds import ROUGH
 
 
 def local_stars(cloud: Cloud, centers: Int[np.ndarray, " B"]) -> Faces:
@@ -23,7 +24,7 @@ def local_stars(cloud: Cloud, centers: Int[np.ndarray, " B"]) -> Faces:
     near = torch.from_numpy(cloud.neighbors[centers])
     points, normals = torch.from_numpy(cloud.points), torch.from_numpy(cloud.normals)
     offset, normal = points[near[:, 1:]] - points[near[:, :1]], normals[near[:, :1]]
-    valid = (normals[near[:, 1:]] * normal).sum(-1).abs() > ALIGNED
+    valid = (normals[near[:, 1:]] * normal).sum(-1).abs() > ROUGH
     frame = torch.linalg.qr(normal.mT, mode="complete")[0][..., 1:]
     coords = unrolled(offset, frame)
     angle, order, following, real = star_of(coords, natural_neighbors(coords, valid))

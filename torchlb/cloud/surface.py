@@ -20,7 +20,6 @@ from torchlb.cloud.manifold import (
     boundary_loops,
     facing_out,
     with_single_fans,
-    without_specks,
     wound_alike,
 )
 from torchlb.cloud.noise import denoised
@@ -34,22 +33,9 @@ from torchlb.geometry.admission import mutually_admissible
 from torchlb.geometry.complex import Faces, components, delaunay, pieces_of
 from torchlb.geometry.frames import vertex_normals
 from torchlb.geometry.neighbors import mesh_graph, nearest_neighbors
+from torchlb.geometry.thresholds import LEVEL, NEAREST, RING
 from torchlb.geometry.vectors import lengths
-
-NEAREST = 24
-"""Nearest points from which normals, stars and neighbourhoods are made."""
-SPACING = 8
-"""The reach of a point is twice the distance to its neighbour of this number."""
-IN_ROW = 0.2
-"""Spread across over that along it, below which points lie in a row."""
-ASKEW = 0.7
-"""Cosine with the normal of the faces below which another one is none: those of points in a row are any across it."""
-SPECK = 4
-"""Patches of fewer triangles are left out."""
-ON_LINE = 1e-9
-"""Spread of a cloud across its longest direction over that along it, below which it is a line."""
-FLAT = 1e-6
-"""Thickness over width of a cloud that lies in a plane."""
+from torchlb.linalg.precision import LOW, NEGLIGIBLE, ROOT_EPS
 
 
 @dataclass(frozen=True)
@@ -154,7 +140,7 @@ def cloud_surface(
     outward = given.numpy() if given is not None and oriented else found.outward
     pairs = _kin(cloud)
     every, seam = wound_alike(places, _chosen(cloud, found, start.two_sided, pairs))
-    faces = _clean(every[~seam], count) if seam.any() else every
+    faces = with_single_fans(every[~seam], count) if seam.any() else every
     faces, done = _completed(cloud, faces, found.small, pairs, outward)
     if _single_seams(every, seam, count) and wound_alike(places, faces)[1].any():
         faces, done = _completed(cloud, every, found.small, pairs, outward)
@@ -233,14 +219,14 @@ def _start(
 def _reaches(
     points: Float[np.ndarray, "N 3"], near: Int[np.ndarray, "N K"]
 ) -> Float[np.ndarray, " N"]:
-    """The largest circumradius of a triangle at each point, by the `SPACING` nearest; by all where these lie in a row.
+    """The largest circumradius of a triangle at each point, by the `RING` nearest; by all where these lie in a row.
 
     Rings of a scan may be many times farther apart than the points along them.
     """
-    few = near[:, : SPACING + 1]
+    few = near[:, : RING + 1]
     offset = points[few] - points[few].mean(1, keepdims=True)
     length = np.linalg.eigvalsh(offset.transpose(0, 2, 1) @ offset)
-    in_row = length[:, 1] < IN_ROW**2 * length[:, 2]
+    in_row = length[:, 1] < LOW**2 * length[:, 2]
     far = np.where(in_row, near[:, -1], few[:, -1])
     return REACH * np.linalg.norm(points[far] - points, axis=1)
 
@@ -264,7 +250,7 @@ def _chosen(
     """
     points, (i, j) = cloud.points, pairs
     first = found.parting if two_sided else found.tangent
-    faces = _clean(found.best(points, first), len(points))
+    faces = with_single_fans(found.best(points, first), len(points))
     piece = pieces_of(faces, len(points))
     across = piece[i] != piece[j]
     if not across.any():
@@ -276,7 +262,7 @@ def _chosen(
     torn = np.zeros(len(points), dtype=bool)
     torn[i[across]] = torn[j[across]] = True
     first = np.where(torn[found.triangles].any(1), found.tangent, first)
-    return _clean(found.best(points, first), len(points)) if torn.any() else faces
+    return with_single_fans(found.best(points, first), len(points)) if torn.any() else faces
 
 
 def _completed(
@@ -310,9 +296,9 @@ def _without_gaps(cloud: Cloud, faces: Faces, pool: Faces) -> Faces:
     count, more = len(cloud.points), faces
     for oriented in (True, False):  # a surface with one side only is closed in the second round
         more = filled(cloud, more, pool, oriented=oriented, strict=True)
-    faces = faces if more is faces else _clean(more, count)
+    faces = faces if more is faces else with_single_fans(more, count)
     more = filled(cloud, faces, pool, oriented=True, strict=False)
-    return faces if more is faces else _clean(more, count)
+    return faces if more is faces else with_single_fans(more, count)
 
 
 def _at_gaps(
@@ -325,10 +311,6 @@ def _at_gaps(
     for end in gaps_between(faces, (pairs[0][both], pairs[1][both]), count):
         result[end] = True
     return result
-
-
-def _clean(faces: Faces, count: int) -> Faces:
-    return without_specks(with_single_fans(faces, count), count, SPECK)
 
 
 def _oriented(cloud: Cloud, faces: Faces) -> Cloud:
@@ -348,7 +330,7 @@ def _righted(cloud: Cloud, faces: Faces) -> Cloud:
     points, triangles = torch.from_numpy(cloud.points), torch.from_numpy(faces)
     of_faces = vertex_normals(points, triangles).numpy()
     cosine = (cloud.normals * of_faces).sum(1)
-    askew = (np.abs(cosine) < ASKEW) & of_faces.any(1)
+    askew = (np.abs(cosine) < LEVEL) & of_faces.any(1)
     righted = of_faces * np.where(cosine < 0, -1.0, 1.0)[:, None]
     return replace(cloud, normals=np.where(askew[:, None], righted, cloud.normals))
 
@@ -359,7 +341,7 @@ def _planar_triangles(
     """Delaunay triangles of a cloud in a plane and the plane's normal; None if it is in none."""
     centered = points - points.mean(0)
     _, spread, axes = np.linalg.svd(centered, full_matrices=False)
-    if spread[2] > FLAT * spread[0]:
+    if spread[2] > NEGLIGIBLE * spread[0]:
         return None
     return delaunay(centered @ axes[:2].T).simplices.astype(np.int64), axes[2]
 
@@ -382,18 +364,18 @@ def _kin(cloud: Cloud) -> tuple[np.ndarray, np.ndarray]:
     """Pairs of points that belong together: each and its nearest admissible ones; all its nearest in a small piece."""
     points, normals = torch.from_numpy(cloud.points), torch.from_numpy(cloud.normals)
     i, j, good = mutually_admissible(points, normals, torch.from_numpy(cloud.neighbors))
-    near = (good & (good.cumsum(1) <= SPACING)).view(-1).numpy()
+    near = (good & (good.cumsum(1) <= RING)).view(-1).numpy()
     i, j = i.numpy(), j.numpy()
     piece = components(i[near], j[near], len(points))
     lone = (np.bincount(piece) < NEAREST)[piece]
-    near |= (lone[:, None] & (np.arange(good.shape[1]) < SPACING)).ravel()
+    near |= (lone[:, None] & (np.arange(good.shape[1]) < RING)).ravel()
     return i[near], j[near]
 
 
 def check_spread(points: Float[Tensor, "N n"]) -> None:
     """InputError for points of a surface that lie on a line."""
     spread = torch.linalg.svdvals(points - points.mean(0))
-    if spread[1] <= ON_LINE * spread[0]:
+    if spread[1] <= ROOT_EPS * spread[0]:
         raise InputError(
             f"points: all {len(points)} lie on a line, and no surface goes through them; a curve has dim=1"
         )

@@ -26,18 +26,14 @@ from torchlb.errors import InputError, first_few
 from torchlb.geometry.admission import mutually_admissible, planes_of
 from torchlb.geometry.complex import Faces, delaunay, edges_of
 from torchlb.geometry.neighbors import nearest_neighbors
+from torchlb.geometry.thresholds import AROUND, FACTOR, SLIGHT
 from torchlb.geometry.vectors import lengths
+from torchlb.linalg.precision import NEGLIGIBLE
 
 CANDIDATES = {2: 24, 3: 64}
 """Nearest points among which those of a star are, by dimension."""
-REACH, NEAR = 3.0, 6
-"""Largest circumradius of a simplex of a star, over the distance of its point to the neighbour of this number."""
-OVERLAP = 0.05
-"""Angle by which triangles may overlap around a point."""
 LOOP = 12
 """Edges of the largest loop that is closed."""
-FLAT = 1e-6
-"""Volume of a simplex over the product of its edges at a corner, below which it is none."""
 
 
 def cloud_stars(points: Float[Tensor, "N n"], dim: int) -> Complex:
@@ -74,7 +70,7 @@ def delaunay_stars(
     _, _, good = mutually_admissible(points, planes_of(frames), candidates)
     offset = points[candidates[:, 1:]] - points[:, None]
     coords, near = (offset @ frames).numpy(), candidates.numpy()
-    reach = REACH * offset.norm(dim=2)[:, min(NEAR, offset.shape[1]) - 1].numpy()
+    reach = FACTOR * offset.norm(dim=2)[:, min(AROUND, offset.shape[1]) - 1].numpy()
     for point, mask in enumerate(good.numpy()):
         others = near[point, 1:][mask]
         if len(others) <= dim:
@@ -87,7 +83,7 @@ def delaunay_stars(
         cells = cells[(cells == 0).any(1)]
         cells = cells[cells != 0].reshape(-1, dim)
         corners = places[cells]
-        sound = np.abs(np.linalg.det(corners)) > FLAT * lengths(corners).prod(1)
+        sound = np.abs(np.linalg.det(corners)) > NEGLIGIBLE * lengths(corners).prod(1)
         cells, corners = cells[sound], corners[sound]
         square = (corners**2).sum(2)[..., None] / 2
         radius = np.linalg.norm(np.linalg.solve(corners, square)[..., 0], axis=1)
@@ -122,7 +118,7 @@ def voronoi_shares(corners: Float[np.ndarray, "S corners n"]) -> Float[np.ndarra
     edges = corners[:, 1:] - corners[:, :1]
     places = np.linalg.qr(edges.transpose(0, 2, 1))[1].transpose(0, 2, 1)  # in its own space
     whole = np.linalg.det(places)
-    total, sound = np.zeros(len(places)), np.abs(whole) > FLAT * lengths(places).prod(1)
+    total, sound = np.zeros(len(places)), np.abs(whole) > NEGLIGIBLE * lengths(places).prod(1)
     places, whole = places[sound], whole[sound]
     for order in permutations(range(dim)):
         chain = places[:, list(order)]
@@ -178,7 +174,7 @@ class _Fans:
         for point, start, width in self._wedges_of(face):
             for other, theirs in self.wedges.get(point, ()):
                 ahead, behind = (start - other) % (2 * np.pi), (other - start) % (2 * np.pi)
-                if ahead < theirs - OVERLAP or behind < width - OVERLAP:
+                if ahead < theirs - SLIGHT or behind < width - SLIGHT:
                     return False
         for key in keys:
             self.uses[key] = self.uses.get(key, 0) + 1

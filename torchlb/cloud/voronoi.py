@@ -18,12 +18,8 @@ from torch import Tensor
 
 from torchlb.geometry.admission import mutually_admissible, planes_of
 from torchlb.geometry.neighbors import adjacency
-
-VOID = 1.5
-"""A natural neighbour on a surface or beyond may be this many times farther than the nearest ones; at an open end all
-else would be. A curve has two, and one at its end."""
-AHEAD = 0.5
-"""Least cosine between a neighbour and a direction in which it lies."""
+from torchlb.geometry.thresholds import CREASE, WIDER
+from torchlb.linalg.precision import rows_at_once
 
 
 @cache
@@ -38,11 +34,6 @@ def unit_directions(dim: int) -> Float[Tensor, "u d"]:
     uniform = torch.quasirandom.SobolEngine(dim, scramble=True, seed=0).draw(1024).double()
     normal = torch.special.ndtri(uniform)
     return normal / normal.norm(dim=1, keepdim=True)
-
-
-def rows_at_once(size: int, dim: int) -> int:
-    """Points whose cells among `size` neighbours are looked at together: (points, neighbours, directions) in 0.1 GB."""
-    return max(1, 2**24 // (size * len(unit_directions(dim))))
 
 
 def _directions(
@@ -107,7 +98,7 @@ def cell_volume(
     farthest = distance.amax(1, keepdim=True).clamp_min(torch.finfo(coords.dtype).tiny)
     directions = _directions(coords, valid)
     inverse = _inverse_radius(coords, valid, directions)
-    ahead = (inverse * distance[..., None] / 2).amax(1) > AHEAD
+    ahead = (inverse * distance[..., None] / 2).amax(1) > CREASE
     volume = inverse.amax(1).maximum(2 / farthest).pow(-dim) * ahead
     unit_ball = pi ** (dim / 2) / gamma(dim / 2 + 1)
     return unit_ball * volume.mean(1)
@@ -162,12 +153,12 @@ def nearest_graph(
         return sparse.csr_array((num_rows, num_rows), dtype=np.float32)
     centers, flat, good = mutually_admissible(points, planes_of(frames), candidates)
     chosen = good & (good.cumsum(1) <= wanted)
-    for rows in torch.arange(num_rows).split(rows_at_once(size, dim)):
+    for rows in torch.arange(num_rows).split(rows_at_once(size * len(unit_directions(dim)))):
         offset = points[others[rows]] - points[rows, None]
         distance = offset.norm(dim=-1)
         near = good[rows]
         if dim > 1:
-            reach = VOID * (distance * chosen[rows]).amax(1, keepdim=True)
+            reach = WIDER * (distance * chosen[rows]).amax(1, keepdim=True)
             near &= distance <= reach
         chosen[rows] |= natural_neighbors(offset @ frames[rows], near)
     pick = chosen.reshape(-1).numpy()

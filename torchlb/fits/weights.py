@@ -20,12 +20,7 @@ from torchlb.fits.polynomials import (
     monomials,
     num_monomials,
 )
-
-ON_LINE = 1e-5
-"""Spread of points across over that along their longest direction, below which they lie on a line, or in a plane."""
-MAX_RESIDUAL = 1e-6
-"""Moment equations are met if nothing larger is left; what a system without full rank leaves is. Rounding leaves about
-1e-16 times the square of the condition, which is below 1e3 in what is accepted."""
+from torchlb.linalg.precision import NEGLIGIBLE, ROUNDING, SINGLE
 
 
 @dataclass(frozen=True)
@@ -283,7 +278,7 @@ def least_squares_weights(
     if flux is not None:
         # What the data add would hide that points on a line, or in one place, say nothing of what is across.
         spread = torch.linalg.svdvals(scaled.nan_to_num())
-        residual = torch.where(spread[:, -1] <= ON_LINE * spread[:, 0], torch.inf, residual)
+        residual = torch.where(spread[:, -1] <= SINGLE * spread[:, 0], torch.inf, residual)
     center = -(constant[..., None] * rows.mT).sum(1, keepdim=True)
     weights = torch.cat([center, rows.mT[:, : coords.shape[1]]], dim=1)
     left = torch.zeros_like(radius)
@@ -338,8 +333,8 @@ def positive_weights(
     for _ in range(coords.shape[1]):
         last = weights[rows]
         others = last.laplacian[:, 1:]
-        rounding = 1e-12 * others.abs().amax(1, keepdim=True)
-        negative = keep[rows] & (others < -rounding) & (last.residual <= MAX_RESIDUAL)[:, None]
+        rounding = ROUNDING * others.abs().amax(1, keepdim=True)
+        negative = keep[rows] & (others < -rounding) & (last.residual <= NEGLIGIBLE)[:, None]
         some = negative.any(1)
         if not some.any():
             break

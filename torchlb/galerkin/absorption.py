@@ -8,7 +8,8 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from torchlb.galerkin.pair import SMALLEST, SparsePair, WeakPair
+from torchlb.galerkin.pair import SparsePair, WeakPair
+from torchlb.linalg.precision import LOW
 
 
 def absorbing(pair: WeakPair, a: Float[Tensor, " N"], rim: Bool[Tensor, " N"]) -> WeakPair:
@@ -28,7 +29,7 @@ def absorbing(pair: WeakPair, a: Float[Tensor, " N"], rim: Bool[Tensor, " N"]) -
     values = [*whole.values, boundary * (a[row] * a[whole.col]).sqrt()]
     if near is not None:
         row = _rows(near)
-        lumped = torch.where(row == near.col, sums.maximum(SMALLEST * sizes)[row], 0.0)
+        lumped = torch.where(row == near.col, sums.maximum(LOW * sizes)[row], 0.0)
         near = replace(near, values=torch.stack([*near.values, lumped, lumped * a[row]]))
     return replace(pair, matrices=replace(whole, values=torch.stack(values)), linear=near)
 

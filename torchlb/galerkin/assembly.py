@@ -13,9 +13,7 @@ from scipy import sparse
 from torch import Tensor
 
 from torchlb.galerkin.elements import Element, simplex, subsets
-
-CHUNK = 2**14
-"""Elements at a time: some 100 MB."""
+from torchlb.linalg.precision import AT_ONCE
 
 
 def metric(
@@ -103,8 +101,8 @@ def element_matrices(
     gradients = torch.stack(products, 1).flatten(0, 1).flatten(1)
     squares = _squares(shape)
     blocks = torch.empty(len(g), squares.shape[1], dtype=torch.complex128)
-    for first in range(0, len(g), CHUNK):
-        part = slice(first, first + CHUNK)
+    for first in range(0, len(g), AT_ONCE):
+        part = slice(first, first + AT_ONCE)
         root = area_element(g[part])
         inverse = cofactors(g[part]) * (shape.weights / root)[..., None]
         if conductivity is not None:

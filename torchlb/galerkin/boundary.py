@@ -30,9 +30,6 @@ from torchlb.geometry.frames import mesh_frames
 from torchlb.geometry.local_fits import FitPlan, LocalFits
 from torchlb.geometry.neighbors import GraphBalls, mesh_graph
 
-WIDTH = {2: 6, 3: 6, 4: 8}
-"""Vertices that a curve along the boundary goes through, by the degree of the elements."""
-
 
 def boundary_nodes(
     points: Float[Tensor, "N n"],
@@ -54,7 +51,9 @@ def boundary_nodes(
     if nodes.dim == 1 or len(outer) == 0:
         return WithoutBoundary(len(nodes.shares))
     if nodes.dim == 2:
-        return OnCurves(nodes, outer, rim_plan(points, nodes.edges[outer], WIDTH[nodes.degree]))
+        # the curve through as many vertices on either side, two more than a polynomial of that degree needs
+        width = 2 * (nodes.degree // 2 + 2)
+        return OnCurves(nodes, outer, rim_plan(points, nodes.edges[outer], width))
     faithful = tuple(degree for degree in degrees if degree > 2) or (3,)  # creases stay flat
     return OnSurface.of(points, nodes, faithful, held)
 

@@ -2,31 +2,19 @@
 
 from __future__ import annotations
 
-from math import cos, radians
-
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float, Int, Shaped
 from torch import Tensor
 
 from torchlb.galerkin.delaunay import EDGES, Cover
 from torchlb.galerkin.nodes import Nodes
-from torchlb.galerkin.rim import KINK
 from torchlb.geometry.complex import edges_of
 from torchlb.geometry.fit_search import IN_ROWS
 from torchlb.geometry.local_fits import FitPlan
+from torchlb.geometry.thresholds import CREASE, FACTOR, KINK
 from torchlb.geometry.vectors import at
-
-LYING = cos(radians(120))
-"""Cosine of the angle across from a boundary edge, below which its triangle lies along the boundary."""
-CREASED = cos(radians(60))
-"""Cosine between the normals of two triangles, below which their edge is one of the shape's; `KINK` where fits fail."""
-SPARSE = 3
-"""Vertices on edges of the shape, or without a fit, for each other one, over which there is nothing inside."""
-NO_AREA = 1e-5
-"""Height over the longest edge, below which a triangle at the boundary is one of rounding."""
-AT_ONCE = 2**8
-"""Vertices that are held against all boundary edges at a time."""
+from torchlb.linalg.precision import SINGLE, rows_at_once
 
 
 def with_area(points: Float[Tensor, "N n"], faces: Int[Tensor, "F 3"]) -> Bool[Tensor, " F"]:
@@ -36,7 +24,7 @@ def with_area(points: Float[Tensor, "N n"], faces: Int[Tensor, "F 3"]) -> Bool[T
     sides = (corners.roll(-1, 1) - corners.roll(-2, 1)).norm(dim=2)  # across from the corners
     longest, place = sides.max(1)
     spare = sides.sum(1) - 2 * longest
-    low = spare < 2 * NO_AREA**2 * longest  # the height is at most √(spare · longest / 2)
+    low = spare < 2 * SINGLE**2 * longest  # the height is at most √(spare · longest / 2)
     while low.any():
         found = edges_of(faces[kept].numpy(), count)
         rim = torch.zeros(len(faces), 3, dtype=torch.bool)
@@ -67,7 +55,7 @@ def lying_triangles(
     corners = at(points, nodes.cells)
     apex = corners.roll(-2, 1)  # across from the sides of `EDGES`
     one, other = corners - apex, corners.roll(-1, 1) - apex
-    obtuse = (one * other).sum(2) < LYING * one.norm(dim=2) * other.norm(dim=2)
+    obtuse = (one * other).sum(2) < -CREASE * one.norm(dim=2) * other.norm(dim=2)
     met, lying = free.clone(), torch.zeros(len(nodes.cells), dtype=torch.bool)
     while True:
         new = (met[nodes.edge] & obtuse).any(1) & ~lying
@@ -83,14 +71,14 @@ def _without_inside(points: Tensor, nodes: Nodes, fits: FitPlan) -> Bool[Tensor,
     bound = lone.clone()
     if points.shape[1] == 3:
         turn, pairs = _cosines(points, nodes), nodes.edges
-        bound[pairs[turn < CREASED].flatten()] = True
+        bound[pairs[turn < CREASE].flatten()] = True
         kinked = torch.zeros_like(bound)
         kinked[pairs[turn < KINK].flatten()] = True
         bound |= kinked & (fits.reason == IN_ROWS)
     rim = torch.zeros_like(bound)
     rim[nodes.edges[nodes.sides[2].uses != 2].flatten()] = True
     bound |= rim & (_around(nodes, (~bound & ~rim).long()) == 0)
-    around = _around(nodes, torch.where(bound, 1, -SPARSE))
+    around = _around(nodes, torch.where(bound, 1, -FACTOR))
     return (around > 0)[nodes.cells].all(1) | lone[nodes.cells].all(1)
 
 
@@ -105,7 +93,7 @@ def _cosines(points: Float[Tensor, "N 3"], nodes: Nodes) -> Float[Tensor, " E"]:
     return torch.where(nodes.sides[2].uses == 2, total.square().sum(1) / 2 - 1, 1.0)
 
 
-def _around(nodes: Nodes, values: Int[Tensor, " N"]) -> Int[Tensor, " N"]:
+def _around(nodes: Nodes, values: Shaped[Tensor, " N"]) -> Shaped[Tensor, " N"]:
     """Sums over each vertex and its neighbours."""
     total = values.clone()
     for one, other in nodes.edges.T, nodes.edges.T.flip(0):
@@ -127,7 +115,8 @@ def boundary_shares(
     vertex, half = cover.faces[own], cover.lengths[own] / 2
     edge = [torch.arange(len(ends)).repeat(2)]
     where, who = [torch.cat([0 * square, 0 * square + 1])], [ends.T.flatten()]
-    crossing = list(zip(vertex.split(AT_ONCE), half.split(AT_ONCE), strict=True))
+    few = rows_at_once(ends.numel() * points.shape[1])
+    crossing = list(zip(vertex.split(few), half.split(few), strict=True))
     for x, distance in crossing if len(ends) else []:
         offset = points[x, None] - start
         share = ((offset * along).sum(2) / square).clamp(0, 1)

@@ -14,25 +14,21 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from torchlb.fits.polynomials import monomials
-from torchlb.galerkin.assembly import CHUNK, area_element, flat_metric, metric
+from torchlb.galerkin.assembly import area_element, flat_metric, metric
 from torchlb.galerkin.coarse import coarse_triangles
 from torchlb.galerkin.delaunay import Cover, delaunay_cover, sound_lengths
 from torchlb.galerkin.elements import simplex
 from torchlb.galerkin.nodes import Nodes
 from torchlb.geometry.frames import vertex_normals
 from torchlb.geometry.local_fits import FitPlan, LocalFits
+from torchlb.geometry.thresholds import FACTOR, ROUGH
 from torchlb.geometry.vectors import at
+from torchlb.linalg.precision import AT_ONCE, SMALL
 
-AT_ONCE = 2**11
-"""Vertices whose nodes are looked at together: some 10 MB at degree 4."""
 ROUNDS = 2
-"""Of moving the nodes to the graphs of their vertices."""
-AGREE, STEEP = 0.075, 0.3
-"""Of an edge's length: how far a graph may be from the mean of a node's, and the node from the edge."""
-FLAT = 1e-3
-"""Height of a triangle over its longest edge, below which it is flat."""
-STRETCH = 3.0
-"""Largest ratio of the curved area element and the flat one, or of the flat one and the curved one."""
+"""Rounds in which nodes move to the graphs of their vertices."""
+AGREE = 0.075
+"""How far the graphs of an edge's two ends may be apart at a node, over its length."""
 
 
 @dataclass(frozen=True)
@@ -124,7 +120,7 @@ class CurvingPlan:
         )
         shape = simplex(nodes.dim, nodes.degree)
         g = flat_metric(lengths)[:, None].repeat(1, len(shape.weights), 1)
-        for part in some.nonzero()[:, 0].split(CHUNK):
+        for part in some.nonzero()[:, 0].split(AT_ONCE):
             g[part] = metric(places, nodes.elements[part], shape)
         cover = self.cover(lengths, self.flips)
         return CurvedMesh(places, g, lengths, cover, boundary, ends)
@@ -184,7 +180,7 @@ def curve(
     start = _start(flat, boundary)
     standing, sound = _moved(points, plan, fits, nodes, ends, start, boundary)
     ratio = (start - flat).norm(dim=1) / _sizes(points, nodes)
-    curved, *whole = nodes.by_side(sound & (ratio <= STEEP))
+    curved, *whole = nodes.by_side(sound & (ratio <= ROUGH))
     uses = nodes.sides[2].uses
     coarse, fixed = torch.zeros(len(nodes.cells), dtype=torch.bool), uses == 1
     if nodes.dim == 2:
@@ -257,7 +253,7 @@ def _moved(
         mean = torch.zeros_like(start).index_add_(0, ends.node, ends.share[:, None] * moves)
         place, apart = place + mean, (moves - at(mean, ends.node)).norm(dim=1)
     bad = (apart > AGREE * at(size, ends.node)) | (plan.degree[ends.vertex] == 0)
-    sound = (place - start).norm(dim=1) <= STEEP * size
+    sound = (place - start).norm(dim=1) <= ROUGH * size
     sound[ends.node[bad]] = False
     if nodes.dim == 2:
         place = place.index_copy(0, boundary.nodes, start[boundary.nodes])
@@ -291,7 +287,7 @@ def _flattened(
     plane, shape = flat_metric(lengths), simplex(nodes.dim, nodes.degree)
     area = area_element(plane)
     curved = curved.clone()
-    curved[nodes.edge[area < FLAT * sides.amax(1) ** nodes.dim].flatten()] = False
+    curved[nodes.edge[area < SMALL * sides.amax(1) ** nodes.dim].flatten()] = False
     g = plane[:, None].repeat(1, len(shape.weights), 1)
     new = torch.ones(len(nodes.cells), dtype=torch.bool)  # cells whose nodes have moved
     while True:
@@ -301,10 +297,10 @@ def _flattened(
         some = curved[nodes.edge].any(1)
         g[new & ~some] = plane[new & ~some, None]
         before, curved = curved, curved.clone()
-        for part in (new & some).nonzero()[:, 0].split(CHUNK):
+        for part in (new & some).nonzero()[:, 0].split(AT_ONCE):
             g[part] = metric(places, nodes.elements[part], shape)
             stretch = area_element(g[part]) / area[part, None]
-            bad = ((stretch < 1 / STRETCH) | (stretch > STRETCH)).any(1)
+            bad = ((stretch < 1 / FACTOR) | (stretch > FACTOR)).any(1)
             curved[nodes.edge[part[bad]].flatten()] = False
         if torch.equal(before, curved):
             return places, curved, bent, g, lengths

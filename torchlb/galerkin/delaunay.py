@@ -16,19 +16,10 @@ from torch import Tensor
 
 from torchlb.galerkin.assembly import area_element, flat_metric
 from torchlb.geometry.complex import pieces_of
+from torchlb.linalg.precision import EPS, NEGLIGIBLE, SINGLE
 
-EDGES = ((0, 1), (1, 2), (2, 0))
+EDGES = tuple((i, (i + 1) % 3) for i in range(3))
 """Ends of the sides of a triangle, in turn, in the order of `subsets`."""
-DELAUNAY = 1e-6
-"""How far the cotangents across from an edge may sum to less than zero, so that rounding flips nothing."""
-
-
-SLACK = 1e-5
-"""Of the mean length: what two edges of a triangle are to be longer than the third, by mollification."""
-
-NO_VOLUME, POINT = 1e-6, 1e-30
-"""Volume of a tetrahedron over the cube of its longest edge, that rounding may make of none; and the size that it has
-then, over that edge."""
 
 
 class Cover(NamedTuple):
@@ -68,14 +59,17 @@ class Cover(NamedTuple):
 
 
 def mollified(sides: Float[Tensor, "F 3"], faces: Int[Tensor, "F 3"]) -> Float[Tensor, "F 3"]:
-    """Lengths of edges, all of a component longer by so much that none of its triangles is without area."""
+    """Lengths of edges, all of a component longer by so much that none of its triangles is without area.
+
+    Two of a triangle are then longer than the third by 1e-5 of the mean; with a tenth of it flips may not end.
+    """
     spare = sides.sum(1) - 2 * sides.amax(1)
-    if bool((spare >= SLACK * sides.amax()).all()):
+    if bool((spare >= SINGLE * sides.amax()).all()):
         return sides
     piece = torch.from_numpy(pieces_of(faces.numpy(), int(faces.max()) + 1))[faces[:, 0]]
     number = torch.bincount(piece).clamp_min(1)
     mean = torch.zeros(len(number), dtype=sides.dtype).index_add_(0, piece, sides.mean(1)) / number
-    lack = torch.zeros_like(mean).scatter_reduce_(0, piece, SLACK * mean[piece] - spare, "amax")
+    lack = torch.zeros_like(mean).scatter_reduce_(0, piece, SINGLE * mean[piece] - spare, "amax")
     return sides + lack[piece, None]
 
 
@@ -85,8 +79,8 @@ def shrunk(sides: Float[Tensor, "F 6"]) -> Float[Tensor, "F 6"]:
     Delaunay tetrahedra of a grid have such slivers, four points of a square; what is around them fills the solid.
     """
     longest = sides.amax(1)
-    none = area_element(flat_metric(sides)) <= NO_VOLUME * longest**3
-    return torch.where(none[:, None], POINT * longest[:, None], sides)
+    none = area_element(flat_metric(sides)) <= NEGLIGIBLE * longest**3
+    return torch.where(none[:, None], EPS**2 * longest[:, None], sides)
 
 
 def sound_lengths(
@@ -125,7 +119,7 @@ def _lacking(sheets: Tensor, sides: Tensor, twin: Tensor) -> Iterator[Int[Tensor
     while True:
         active = active[(twin[active] > active) & (active // 3 != twin[active] // 3)]
         weight = _cotangents(sides, active) + _cotangents(sides, twin[active])
-        lacking = weight < -DELAUNAY
+        lacking = weight < -NEGLIGIBLE
         chosen = _apart(active[lacking], twin[active[lacking]], weight[lacking], len(sheets))
         if len(chosen) == 0:
             return

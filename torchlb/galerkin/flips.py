@@ -6,20 +6,16 @@ flips that only lessen a fold: a crease of the surface itself has such triangles
 
 from __future__ import annotations
 
-from math import cos, radians
-
 import torch
 from torch import Tensor
 
 from torchlb.geometry.frames import vertex_normals
+from torchlb.geometry.thresholds import CREASE
 from torchlb.geometry.vectors import dot
+from torchlb.linalg.precision import LOW, ROOT_EPS
 
-ALIGNED = 0.5
-"""Least cosine between a triangle's normal and those of its vertices."""
-GOOD = 0.1
-"""Least quality 4√3 area/Σℓ² of a triangle; 1 if it is equilateral."""
-FAIR, LEVEL = 0.5, cos(radians(0.01))
-"""The same where the surface is a plane; and the cosine of normals there."""
+FAIR = 0.5
+"""Least quality of a triangle where the surface is a plane."""
 
 
 def flipped(vertices: Tensor, faces: Tensor) -> Tensor:
@@ -32,17 +28,17 @@ def flipped(vertices: Tensor, faces: Tensor) -> Tensor:
     alignment, quality = _scores(vertices, normals, faces)
     gone, size = faces.new_zeros(0), len(vertices)
     while True:
-        poor = (alignment < ALIGNED) | (quality < GOOD)
-        bad = (poor | ((quality < FAIR) & (alignment > LEVEL))).nonzero()[:, 0]
+        poor = (alignment < CREASE) | (quality < LOW)
+        bad = (poor | ((quality < FAIR) & (alignment > 1 - ROOT_EPS))).nonzero()[:, 0]
         pairs = _flips(faces, bad, gone, size) if len(bad) else None
         if pairs is None:
             return faces
         left, right, after = pairs
         before = torch.stack([faces[left], faces[right]], dim=1)
         gain = _value(vertices, normals, after) - _value(vertices, normals, before)
-        even = torch.minimum(alignment[left], alignment[right]) > LEVEL
+        even = torch.minimum(alignment[left], alignment[right]) > 1 - ROOT_EPS
         gain[~(poor[left] | even)] = -1.0
-        gain[_scores(vertices, normals, after)[0].amin(1) < ALIGNED] = -1.0
+        gain[_scores(vertices, normals, after)[0].amin(1) < CREASE] = -1.0
         chosen = _independent(gain, left, right, after, len(faces))
         if len(chosen) == 0:
             return faces
@@ -80,7 +76,7 @@ def _scores(vertices: Tensor, normals: Tensor, faces: Tensor) -> tuple[Tensor, T
 def _value(vertices: Tensor, normals: Tensor, pairs: Tensor) -> Tensor:
     """What a flip is to raise: the lesser alignment of the two, as far as it lacks, then the lesser quality."""
     alignment, quality = _scores(vertices, normals, pairs)
-    return 1e3 * alignment.amin(1).clamp_max(ALIGNED) + quality.amin(1)
+    return 1e3 * alignment.amin(1).clamp_max(CREASE) + quality.amin(1)
 
 
 def _flips(

@@ -13,7 +13,6 @@ from scipy import sparse
 from torch import Tensor
 
 from torchlb.galerkin.assembly import (
-    CHUNK,
     area_element,
     cofactors,
     element_matrices,
@@ -28,9 +27,7 @@ from torchlb.galerkin.prolongation import prolongation
 from torchlb.geometry.local_fits import FitPlan, LocalFits
 from torchlb.geometry.numbering import Numbering
 from torchlb.linalg.once import once_differentiable
-
-ROWS = 2**15
-"""Rows of a product at a time, so that not all of AP is held."""
+from torchlb.linalg.precision import AT_ONCE
 
 
 class FlatCells(NamedTuple):
@@ -224,16 +221,16 @@ def edge_lengths(
 def upper_congruence(p: Any, matrix: sparse.csr_array) -> sparse.csr_array:
     """The upper triangle of the symmetric PᵀAP, some rows at a time."""
     left, parts, count = sparse.csr_array(p.T), [], p.shape[1]
-    for first in range(0, count, ROWS):
-        part: Any = left[first : first + ROWS] @ matrix @ p
+    for first in range(0, count, AT_ONCE):
+        part: Any = left[first : first + AT_ONCE] @ matrix @ p
         row = np.arange(first, first + part.shape[0], dtype=np.int32).repeat(np.diff(part.indptr))
         upper = np.flatnonzero(part.indices >= row)
         length = np.bincount(row[upper] - first, minlength=part.shape[0])
         parts.append((length, part.indices.take(upper), part.data.take(upper)))
     indptr = np.concatenate([[0], *(length for length, *_ in parts)]).cumsum()
     indices, data = np.empty(indptr[-1], np.int32), np.empty(indptr[-1], parts[0][2].dtype)
-    for first in range(0, count, ROWS):
-        place = slice(indptr[first], indptr[min(first + ROWS, count)])
+    for first in range(0, count, AT_ONCE):
+        place = slice(indptr[first], indptr[min(first + AT_ONCE, count)])
         _, indices[place], data[place] = parts.pop(0)  # which frees it
     return sparse.csr_array((data, indices, indptr), shape=(count, count))
 
@@ -251,7 +248,7 @@ def _slopes(
 ) -> Float[Tensor, "T Q"]:
     """Weights times Σ_c ∇w_c·∇u_c at the Gauss points."""
     found = []
-    for part in torch.arange(len(nodes)).split(max(CHUNK // values[0].shape[1], 1)):
+    for part in torch.arange(len(nodes)).split(max(AT_ONCE // values[0].shape[1], 1)):
         g = metric[part]
         one, two = (
             torch.einsum("qnd,tnc->dtqc", element.gradients, x[nodes[part]]) for x in values

@@ -21,9 +21,7 @@ from torchlb.galerkin.forms import Forms, upper_congruence
 from torchlb.galerkin.nodes import lagrange_nodes
 from torchlb.geometry.local_fits import FitPlan, LocalFits
 from torchlb.geometry.numbering import Numbering
-
-SMALLEST = 0.1
-"""Share of its linear mass that the mass of a vertex has at least."""
+from torchlb.linalg.precision import LOW
 
 
 @dataclass(frozen=True)
@@ -256,7 +254,7 @@ def positive_mass(
         shares = nodes.shares.numpy()[taking - count] * weights[taking, None]
         mass -= p[taking].T @ weights[taking]
         np.add.at(mass, nodes.corners.numpy()[taking - count], shares)
-        few = np.flatnonzero(mass < SMALLEST * linear)
+        few = np.flatnonzero(mass < LOW * linear)
         if len(few) == 0 or len(plan.lowered):
             break
         left = sparse.csr_array(p.T) if left is None else left

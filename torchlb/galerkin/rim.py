@@ -7,18 +7,13 @@ The same weights give the values of a function there, so that what vanishes at t
 from __future__ import annotations
 
 from dataclasses import dataclass
-from math import cos, radians
 
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from torchlb.geometry.fit_search import MAX_LEBESGUE
-
-SHARP = cos(radians(60))
-"""A boundary that turns by more at a vertex has a corner there."""
-KINK, OUTSTANDING = cos(radians(20)), 3.0
-"""And one that turns by more than this, and so many times more than at the vertices beside it."""
+from torchlb.geometry.thresholds import CREASE, FACTOR, KINK
 
 
 @dataclass(frozen=True)
@@ -123,8 +118,8 @@ def _mates(points: Float[Tensor, "N n"], rim: Int[Tensor, "G 2"]) -> Int[Tensor,
     angle = straight.clamp(-1, 1).acos()
     far = torch.cat([angle[count:], angle[:count]])  # at the other end of the same edge
     beside = torch.maximum(far, far[mate])
-    corner = straight < SHARP
-    corner |= (straight < KINK) & (angle > OUTSTANDING * beside)
+    corner = straight < CREASE
+    corner |= (straight < KINK) & (angle > FACTOR * beside)
     return torch.where(corner, -1, mate)
 
 

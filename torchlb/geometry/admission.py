@@ -6,15 +6,9 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from torchlb.geometry.thresholds import CREASE, HALF_CREASE
 from torchlb.geometry.vectors import at, dot
-
-MIN_ALIGNMENT = 0.5
-"""Smallest singular value of E_kᵀE_i, the cosine of the largest angle between two tangent planes."""
-MAX_SLOPE = 0.5
-"""Largest share of the distance |e| that may be height over the centre's tangent plane. On a sphere the
-two bounds meet, at 60°."""
-PAIRS_AT_ONCE = 2**16
-"""Pairs of points that are looked at together: of small arrays the memory is used again."""
+from torchlb.linalg.precision import AT_ONCE
 
 
 def _smallest_singular_value(
@@ -62,7 +56,7 @@ def admissible(
     below the centre's plane (height ≤ 0.5 of the distance). `planes` are frames E, or the unit normals of a
     hypersurface, which tell the same in less time: σ_min(E_kᵀE_i) = |n_k·n_i|. Orientation is irrelevant.
     """
-    parts = zip(centers.split(PAIRS_AT_ONCE), others.split(PAIRS_AT_ONCE), strict=True)
+    parts = zip(centers.split(AT_ONCE), others.split(AT_ONCE), strict=True)
     return torch.cat([_admissible_part(points, planes, *part) for part in parts])
 
 
@@ -77,7 +71,7 @@ def _admissible_part(points: Tensor, planes: Tensor, centers: Tensor, others: Te
     else:
         height = dot(offset, mine).square()
         cosine = dot(theirs, mine).abs()
-    return (height <= MAX_SLOPE**2 * total) & (cosine >= MIN_ALIGNMENT)
+    return (height <= HALF_CREASE**2 * total) & (cosine >= CREASE)
 
 
 def admissible_neighbors(
@@ -113,7 +107,7 @@ def thin_sides(
     i, j, good = mutually_admissible(points, oriented, candidates)
     refused = ~good.view(-1)
     both = torch.stack([i[refused], j[refused]])
-    alike = dot(at(oriented, both[0]), at(oriented, both[1])).abs() >= MIN_ALIGNMENT
+    alike = dot(at(oriented, both[0]), at(oriented, both[1])).abs() >= CREASE
     thin = torch.zeros(len(points), dtype=torch.bool)
     thin[both[:, alike]] = True
     beside = thin[i] | thin[j]

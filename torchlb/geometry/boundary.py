@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations
-from math import cos, factorial, radians
+from math import factorial
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -21,11 +21,7 @@ from torchlb.geometry.fit_search import FitSearch
 from torchlb.geometry.frames import mesh_frames, normals_of_frames
 from torchlb.geometry.local_fits import FitPlan, LocalFits
 from torchlb.geometry.neighbors import GraphBalls, mesh_graph
-
-SMOOTH = cos(radians(20))
-"""Where the mean of the outer normals around a boundary vertex is shorter there is a crease: two that are 40° apart."""
-SHARP = cos(radians(30))
-"""The same of two that are 60° apart, from where on the surface of a solid is flat along it."""
+from torchlb.geometry.thresholds import CREASE, KINK
 
 
 @dataclass(frozen=True)
@@ -170,7 +166,7 @@ def boundary_of_mesh(
     mask[sides.reshape(-1)] = True
     members = mask.nonzero()[:, 0]
     outward, size = outward_sums(vertices, sides, opposite)
-    crease = (outward.norm(dim=1) < SMOOTH * size)[members]
+    crease = (outward.norm(dim=1) < KINK * size)[members]
     plan = BoundaryPlan(mask, members, None, sides, opposite, crease)
     if sides.shape[1] == 1:
         return plan
@@ -183,7 +179,7 @@ def boundary_creases(
 ) -> Bool[Tensor, " N"]:
     """Vertices where the boundary of a mesh turns by 60° and more: at the edges and corners of a cube."""
     outward, size = outward_sums(vertices, *open_sides(cells))
-    return outward.norm(dim=1) < SHARP * size
+    return outward.square().sum(1) < (1 + CREASE) / 2 * size.square()
 
 
 def outward_sums(

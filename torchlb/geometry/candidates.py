@@ -13,9 +13,7 @@ from torch import Tensor
 from torchlb.fits.polynomials import num_monomials
 from torchlb.fits.rules import SIZE_FACTORS
 from torchlb.geometry.neighbors import GraphBalls
-
-PIECE_BYTES = 2**24
-"""Bound on one array of a piece: they stay near the processor, and glibc uses their memory again."""
+from torchlb.linalg.precision import rows_at_once
 
 
 class Candidate(NamedTuple):
@@ -96,7 +94,7 @@ class Search:
     """Every centre tries the candidates in turn, until one settles it.
 
     Iterating gives (number of the candidate, rows of `centers` that try it, their neighbourhoods (b, K)), so many rows
-    at a time that a (b, K, M) array stays below `PIECE_BYTES`; who has tried it is settled, or turned away from more
+    at a time that a (b, K, M) array stays below `BYTES`; who has tried it is settled, or turned away from more
     than this candidate, before the next.
 
     Parameters
@@ -142,7 +140,7 @@ class Search:
                 held = candidate.size if held == 0 else max(within)
                 index, count = self.balls(self.centers[pending], held)
             tried = (eligible & (count >= candidate.size)).nonzero()[:, 0]
-            entry = 8 * candidate.size * num_monomials(dim, candidate.degree)
-            for piece in tried.split(max(64, PIECE_BYTES // entry)):
+            entry = candidate.size * num_monomials(dim, candidate.degree)
+            for piece in tried.split(rows_at_once(entry)):
                 if len(piece):
                     yield number, pending[piece], index[piece, : candidate.size]

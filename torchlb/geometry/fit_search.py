@@ -9,40 +9,33 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from torchlb.fits.polynomials import num_monomials
-from torchlb.fits.weights import MAX_RESIDUAL, CenteredFit
-from torchlb.geometry.admission import MIN_ALIGNMENT
+from torchlb.fits.weights import CenteredFit
 from torchlb.geometry.candidates import Search, list_candidates
 from torchlb.geometry.local_fits import FitPlan, LocalFits, Neighborhoods, slope_of
-from torchlb.geometry.neighbors import AT_ONCE, GraphBalls
+from torchlb.geometry.neighbors import GraphBalls
+from torchlb.geometry.thresholds import CREASE, ROUGH, SLIGHT, WIDER
 from torchlb.geometry.vectors import at
+from torchlb.linalg.precision import AT_ONCE, NEGLIGIBLE, rows_at_once
 
 MAX_LEBESGUE = 10.0
-"""Of a fit in the middles of the edges of its point; where neighbours lie well around it has less than 2."""
-MAX_MISFIT = {2: 0.3}
-"""Of the heights of a quadratic, which is the last resort; all others have to follow them to `FAITHFUL`."""
-FAITHFUL = 0.05
+"""Largest Lebesgue constant of a fit in the middles of the edges of its point; below 2 of good ones."""
 REASONS = (
     "reached",
     "too few admissible neighbours",
     "neighbours too close to a line or conic",
     "points do not resolve the surface",
 )
-IN_ROWS = 2
-"""Place in `REASONS` of too few rows of neighbours."""
-LEAST = 1.5
-"""Neighbours per polynomial without which a fit is not tried."""
-ROOM = 2**18
-"""Fits in a pile, 0.7 GB at degree 4: pieces below 32 MB would stay with glibc, and scatter its memory."""
+IN_ROWS = REASONS.index("neighbours too close to a line or conic")
 
 
 class _Pile:
-    """Rows of several tensors, in pieces of `ROOM`, of which only what is filled takes memory.
+    """Rows of several tensors, in large pieces, of which only what is filled takes memory.
 
-    In large pieces: thousands of arrays that stay, between those that come and go, would scatter the memory.
+    Thousands of arrays that stay, between those that come and go, would scatter the memory.
     """
 
     def __init__(self, room: int) -> None:
-        self.room, self.filled = min(room, ROOM), 0
+        self.room, self.filled = min(room, rows_at_once(1)), 0
         self.pieces: list[list[Tensor]] = []
 
     def add(self, *rows: Tensor) -> None:
@@ -110,7 +103,7 @@ class FitSearch:
         """
         middles = self.balls.middles(centers)
         search = Search(self.balls, centers, self.candidates)
-        steepest = 1 / MIN_ALIGNMENT**2 - 1  # |∇H|² of a tilt of 60°, bounded by the Frobenius norm
+        steepest = 1 / CREASE**2 - 1  # |∇H|² of a tilt of 60°, bounded by the Frobenius norm
         for number, rows, index in search:
             block = _block(self.candidates[number].degree, centers[rows], index)
             fit, heights, graph = self.fits.fitted(block)
@@ -137,7 +130,7 @@ class FitSearch:
                 for _, rows, index in search:
                     search.settle(rows[self._try(_block(degree, vertices[rows], index))])
                 vertices = vertices[self.degree[vertices] == 0]
-                least, few = 1 + ceil(LEAST * (num_monomials(dim, degree) - 1)), sizes[0].size
+                least, few = 1 + ceil(WIDER * (num_monomials(dim, degree) - 1)), sizes[0].size
                 index, count = self.balls(vertices, few)
                 some = (count >= least) & (count < few)
                 keep = torch.arange(1, few) < count[some, None]
@@ -211,7 +204,8 @@ class FitSearch:
         vertices, good = block.vertices, regular
         new = torch.zeros_like(frame)
         if self.degrees:
-            good = regular & (fit.misfit(heights, graph) <= MAX_MISFIT.get(fit.degree, FAITHFUL))
+            # quadratics are the last resort
+            good = regular & (fit.misfit(heights, graph) <= (ROUGH if fit.degree == 2 else SLIGHT))
             vacant = self.surface_degree[vertices] < fit.degree
             if fit.degree == self.highest:
                 reason = torch.where(good, 0, torch.where(regular, 3, IN_ROWS))
@@ -252,5 +246,5 @@ def _kept(degree: int, columns: list[Tensor], rows: Bool[Tensor, " b"]) -> Neigh
 
 def is_regular(fit: CenteredFit, middles: Tensor, degree: int) -> Bool[Tensor, " B"]:
     """Whether neighbours determine a fit, and terms up to a degree well in the middles (B, E, d) of the edges, ℓ."""
-    exact = fit.residual(middles.shape[2]) <= MAX_RESIDUAL
+    exact = fit.residual(middles.shape[2]) <= NEGLIGIBLE
     return exact & (fit.lebesgue(middles, degree) <= MAX_LEBESGUE)

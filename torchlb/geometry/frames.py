@@ -14,9 +14,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from torchlb.geometry.vectors import at, dot
-
-NO_NORMAL = 1e-12
-"""A sum of normals below this share of the products of the edges is rounding."""
+from torchlb.linalg.precision import ROUNDING
 
 
 def mesh_frames(
@@ -146,4 +144,4 @@ def vertex_normals(
     for corner in faces.T:
         size.index_add_(0, corner, product)
     length = total.norm(dim=1)
-    return torch.where((length > NO_NORMAL * size)[:, None], total / length[:, None], 0.0)
+    return torch.where((length > ROUNDING * size)[:, None], total / length[:, None], 0.0)

@@ -16,9 +16,9 @@ from torch import Tensor
 
 from torchlb.fits.polynomials import num_monomials
 from torchlb.fits.weights import CenteredFit, centered_fit
-from torchlb.geometry.candidates import PIECE_BYTES
 from torchlb.geometry.frames import orthonormalized
 from torchlb.geometry.vectors import at
+from torchlb.linalg.precision import rows_at_once
 
 
 class Neighborhoods(NamedTuple):
@@ -47,8 +47,8 @@ class Neighborhoods(NamedTuple):
     surface: Bool[Tensor, " b"]
 
     def parts(self, dim: int) -> Iterator[tuple[slice, Neighborhoods]]:
-        """So many at a time that an array of all monomials stays below `PIECE_BYTES`."""
-        size = max(64, PIECE_BYTES // (8 * self.points.shape[1] * num_monomials(dim, self.degree)))
+        """So many at a time that an array of all monomials stays below `BYTES`."""
+        size = rows_at_once(self.points.shape[1] * num_monomials(dim, self.degree))
         for first in range(0, len(self.vertices), size):
             part = slice(first, first + size)
             yield part, Neighborhoods(self.degree, *(tensor[part] for tensor in self[1:]))

@@ -19,18 +19,10 @@ from scipy.spatial import KDTree
 from torch import Tensor
 
 from torchlb.geometry.admission import (
-    MAX_SLOPE,
-    MIN_ALIGNMENT,
     normal_frames,
 )
+from torchlb.geometry.thresholds import AROUND, CREASE, HALF_CREASE, WIDER
 from torchlb.geometry.vectors import at
-
-AT_ONCE = 2**13
-"""Points whose neighbours are looked at together: of small arrays the memory is used again."""
-EDGES = 6
-"""The longest edges of a point, in whose middles its fit is judged."""
-BALL_SURPLUS = 1.5
-"""A graph ball holds this many times the points asked for, so that its round core lies inside the ragged edge."""
 
 
 def nearest_neighbors(points: Float[Tensor, "N n"], size: int) -> Int[Tensor, "N K"]:
@@ -167,8 +159,8 @@ class GraphBalls:
 
     @cached_property
     def longest(self) -> Int[Tensor, "N edges"]:
-        """The other ends of the longest `EDGES` edges of every point, see `longest_edges`."""
-        return longest_edges(self.points, self.graph, EDGES)
+        """The other ends of the longest `AROUND` edges of every point, see `longest_edges`."""
+        return longest_edges(self.points, self.graph, AROUND)
 
     def middles(self, centers: Int[Tensor, " B"]) -> Float[Tensor, "B edges d"]:
         """The middles of those edges in the centre's tangent plane, in its frame, ℓ."""
@@ -206,14 +198,14 @@ class GraphBalls:
         """
         from torchlb.linalg import kernels
 
-        wanted = BALL_SURPLUS * size
+        wanted = WIDER * size
         index, count = kernels.graph_balls(
             **self._arrays,
             centers=centers.numpy(),
             size=size,
             wanted=wanted,
             rings=ceil(wanted ** (1 / self.dim)),
-            slope=MAX_SLOPE,
-            alignment=MIN_ALIGNMENT,
+            slope=HALF_CREASE,
+            alignment=CREASE,
         )
         return torch.from_numpy(index), torch.from_numpy(count)

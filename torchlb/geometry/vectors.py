@@ -8,8 +8,6 @@ import numpy as np
 from jaxtyping import Float, Int, Shaped
 from torch import Tensor
 
-TINY = np.finfo(float).tiny
-
 
 def dot(a: Float[Tensor, "*#batch n"], b: Float[Tensor, "*#batch n"]) -> Float[Tensor, "*batch"]:
     """a·b along the last axis, summed in order: the same to the bit on every processor, and in compiled loops.

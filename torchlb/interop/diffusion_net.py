@@ -42,9 +42,9 @@ from jaxtyping import Float
 from torch import Tensor
 
 from torchlb.cloud.orientation import settled_normals
-from torchlb.cloud.surface import NEAREST
 from torchlb.errors import InputError
 from torchlb.geometry.neighbors import nearest_neighbors
+from torchlb.geometry.thresholds import NEAREST
 from torchlb.io.cache import load_or_build
 from torchlb.operator.dispatch import Operator, build_operator
 from torchlb.operator.laplace_beltrami import LaplaceBeltrami

@@ -9,6 +9,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from torchlb.errors import DiffusionError
+from torchlb.linalg.precision import TINY
 
 Linear = Callable[[Tensor], Tensor]
 
@@ -54,7 +55,7 @@ def conjugate_gradients(
         z = precondition(r)
         before, square = square, (r * z).sum(0)
         p = torch.addcmul(z, torch.where(before > 0, square / before, 0.0), p)
-    left = float((square / enough.clamp_min(1e-300)).max()) ** 0.5 * tolerance
+    left = float((square / enough.clamp_min(TINY)).max()) ** 0.5 * tolerance
     raise DiffusionError(
         f"conjugate gradients: {left:.1e} of the residual is left after {max_steps} steps, not {tolerance:.0e}. "
         "Some triangles are too degenerate: merge vertices that nearly coincide, or raise `tolerance`"

@@ -28,18 +28,15 @@ from scipy.special import ive
 from torch import Tensor
 
 from torchlb.linalg.factor import Factor
+from torchlb.linalg.precision import AT_ONCE, NEGLIGIBLE, ROUNDS, TINY
 from torchlb.linalg.sparse import multiply
 
 PRODUCTS = 5_000
-"""Beyond this many a few factors are quicker."""
+"""Products beyond which a few factors are quicker."""
 SHORTEST = 5.0
 """t/γ of the shortest time that shares a pole γ, a power of ten; the longest is ten times longer."""
 POINTS = 256
-"""Of the interpolation that gives the coefficients of rational functions."""
-ROUNDS, FLOOR = 20, 1e-6
-"""Products with |K| towards its first eigenvector, which bring its bound to within 25 %; least share of an entry."""
-CACHED = 2**18
-"""Values of a vector that stays in a processor's cache from product to product."""
+"""Points of the interpolation that gives the coefficients of rational functions."""
 Term = tuple[tuple[slice, Any], Tensor, np.ndarray, np.ndarray]
 
 
@@ -57,7 +54,7 @@ def spectral_radius(stiffness: sparse.csr_array, mass: Float[np.ndarray, " N"]) 
         y = size @ x / mass
         radius = min(radius, float((y / x).max(initial=0.0)))
         x = np.sqrt(x) * np.sqrt(y)  # the mean keeps it from turning in circles
-        x = np.maximum(x / (x.max(initial=0.0) or 1.0), FLOOR)
+        x = np.maximum(x / (x.max(initial=0.0) or 1.0), NEGLIGIBLE)
     return radius
 
 
@@ -215,7 +212,7 @@ def _polynomial(
 ) -> Iterator[Term]:
     c, slope = chebyshev_coefficients(times * radius, tolerance)
     crow, col = pattern
-    scaled = values * (2 / max(radius, 1e-300))
+    scaled = values * (2 / max(radius, TINY))
     for rows, matrix in _blocks(crow, col, scaled, x, sizes):
 
         def shifted(v: Tensor, matrix: Any = matrix) -> Tensor:
@@ -241,7 +238,7 @@ def _blocks(
     crow: Tensor, col: Tensor, values: Tensor, x: Tensor, sizes: Sequence[int]
 ) -> Iterator[tuple[slice, tuple[Tensor, Tensor, Tensor]]]:
     """Diagonal blocks (rows, (crow, col, values)): on the CPU as many together as stay in its cache, else all."""
-    limit = CACHED // x.shape[1] if x.device.type == "cpu" else len(x)
+    limit = AT_ONCE if x.device.type == "cpu" else len(x)
     ends = list(accumulate(sizes))
     start = 0
     for end, following in zip(ends, [*ends[1:], inf], strict=True):

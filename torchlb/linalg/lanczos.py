@@ -12,17 +12,12 @@ from scipy import linalg, sparse
 
 from torchlb.errors import EigenbasisError
 from torchlb.linalg.factor import Factor
+from torchlb.linalg.precision import LOW, ROUNDS, SMALL
 
 BLOCK = 16
 """Vectors at a time, the largest multiplicity that is surely found; 8 to 32 take about the same time."""
 CHECK = 2
 """Blocks between two looks at the residuals."""
-LONGEST = 20
-"""Bound on the space, in multiples of what is asked for; it is 2.5 where things are well."""
-NARROW = 0.1
-"""Share of the shift that the last eigenvalue asked for has at least; else 1/(λ + shift) hardly tells them apart."""
-LOOSE = 1e-4
-"""Above this tolerance one pass of orthogonalisation is enough, and eigenvectors in float32."""
 
 Inverse = Callable[[Float[np.ndarray, "N C"]], Float[np.ndarray, "N C"]]
 Pairs = tuple[Float[np.ndarray, " k"], Float[np.ndarray, "N k"]]
@@ -88,8 +83,8 @@ def lanczos(
     tolerance
         Of the residuals in the M-norm, relative to 1/(λ + shift); eigenvalues are off by about its square.
 
-    Raises ShiftTooLarge if `NARROW` times the shift serves better, and `least` allows that; EigenbasisError if N
-    vectors do not suffice, or `LONGEST` times those asked for.
+    Raises ShiftTooLarge if `LOW` times the shift serves better, and `least` allows that; EigenbasisError if N
+    vectors do not suffice, or `ROUNDS` times those asked for.
     """
     size, count = len(mass_matrix.diagonal()), k + more
     generator, first = np.random.default_rng(0), int(null is not None)
@@ -98,8 +93,8 @@ def lanczos(
         basis[0], dual[0] = null, mass_matrix @ null
     h, end, look = np.zeros((first, first)), first, first + 2 * count
     z = generator.standard_normal((BLOCK, size))
-    while end + BLOCK <= min(size, LONGEST * (count + BLOCK)):
-        coupling = _orthogonalise(z, basis[:end], dual[:end], 1 if tolerance > LOOSE else 2)
+    while end + BLOCK <= min(size, ROUNDS * (count + BLOCK)):
+        coupling = _orthogonalise(z, basis[:end], dual[:end], 1 if tolerance > SMALL else 2)
         h[:, max(end - BLOCK, first) : end] = coupling.T if end > first else 0.0
         try:
             z, mz, r = _orthonormal(z, mass_matrix)
@@ -111,7 +106,7 @@ def lanczos(
         if end >= look:
             theta, y = linalg.eigh(np.triu(h[first:, first:]), lower=False)
             theta, y = theta[: -count - 1 : -1], y[:, : -count - 1 : -1]
-            if (bound := max(1 / theta[k - 1] - shift, least)) < NARROW * shift:
+            if (bound := max(1 / theta[k - 1] - shift, least)) < LOW * shift:
                 raise ShiftTooLarge(bound)
             if (np.linalg.norm(r @ y[-BLOCK:, :k], axis=0) <= tolerance * theta[:k]).all():
                 return 1 / theta - shift, _combined(basis[first:end], y, tolerance)
@@ -138,7 +133,7 @@ def _orthogonalise(z: np.ndarray, basis: np.ndarray, dual: np.ndarray, passes: i
 
 def _combined(basis: np.ndarray, y: np.ndarray, tolerance: float) -> np.ndarray:
     """Eigenvectors, from their coefficients."""
-    kind = np.float32 if tolerance > LOOSE else np.float64
+    kind = np.float32 if tolerance > SMALL else np.float64
     return basis.astype(kind, copy=False).T @ y.astype(kind, copy=False)
 
 

@@ -5,7 +5,7 @@ from contextlib import contextmanager
 
 import torch
 
-SMALL = 20_000
+FEW = 20_000
 """Points whose tensors are not worth a second thread: on a busy machine it is waited for at every product."""
 
 
@@ -21,7 +21,7 @@ def threads_for(num_points: int) -> Iterator[None]:
     True
     """
     threads = torch.get_num_threads()
-    if threads == 1 or num_points > SMALL:
+    if threads == 1 or num_points > FEW:
         yield
         return
     torch.set_num_threads(1)

@@ -8,13 +8,14 @@ from torch import Tensor
 from torch.nn.functional import pad
 
 from torchlb.linalg.conjugate_gradients import Linear
+from torchlb.linalg.precision import SMALL
 
 Matrix = tuple[Tensor, Tensor, Tensor]  # crow, col, values
-
-SMALL = 1e-3
-"""Entries that smoothing does without, over √(d_i d_j): no step more; ten times as large, a third more."""
-FIRST, SECOND = 160 / 41, -128 / 41
-"""Of the smoother D⁻¹(a + b AD⁻¹): with x in the spectrum of D⁻¹A, 1 − x(a + bx) is T₂((5 − 8x)/3) / T₂(5/3)."""
+LOWEST = 0.25
+"""Lower end of the spectrum of D⁻¹A that is smoothed; a quarter of it is left to the coarse solve."""
+SIZE = 2 * (1 + LOWEST) ** 2 - (1 - LOWEST) ** 2
+FIRST, SECOND = 8 * (1 + LOWEST) / SIZE, -8 / SIZE
+"""Of the smoother D⁻¹(a + b AD⁻¹): 1 − x(a + bx), x in the spectrum, is the Chebyshev polynomial T₂ there, 1 at 0."""
 
 
 def two_levels(product: Linear, sums: Float[Tensor, "N _"], coarse: Linear) -> Linear:

@@ -10,13 +10,14 @@ from torch import Tensor, nn
 from torch.nn.functional import softplus
 
 from torchlb.errors import InputError
+from torchlb.linalg.precision import ROOT_EPS
 from torchlb.nn.checks import check_features
 from torchlb.operator.laplace_beltrami import LaplaceBeltrami
 from torchlb.pde.checks import check_choice
-from torchlb.pde.heat import TOLERANCE, Method, flow
+from torchlb.pde.heat import Method, flow
 
 SHARPNESS = 100.0
-"""Of the softplus that keeps learned times positive: above 0.05 ℓ² it is the identity to 1 %."""
+"""β of the softplus that keeps learned times positive: above 0.05 ℓ² it is the identity to 1 %."""
 
 
 class LearnedTimes(nn.Module):
@@ -73,7 +74,7 @@ class Diffusion(LearnedTimes):
         method: Method = "deflated",
         k: int = 128,
         init_time: float = 0.01,
-        tolerance: float = TOLERANCE,
+        tolerance: float = ROOT_EPS,
     ) -> None:
         super().__init__(channels, init_time)
         check_choice("method", method, Method)

@@ -6,10 +6,11 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from torchlb.linalg.precision import SINGLE
 from torchlb.nn.checks import check_features
 from torchlb.nn.diffusion import LearnedTimes
 from torchlb.operator.laplace_beltrami import LaplaceBeltrami
-from torchlb.pde.solves import implicit_step
+from torchlb.pde.solves import TOLERANCE, implicit_step
 
 
 class ImplicitDiffusion(LearnedTimes):
@@ -54,7 +55,7 @@ class ImplicitDiffusion(LearnedTimes):
         with torch.autocast(x.device.type, enabled=False):
             tolerance = self.tolerance
             if tolerance is None:
-                tolerance = 1e-10 if dtype == torch.float64 else 1e-5
+                tolerance = TOLERANCE if dtype == torch.float64 else SINGLE
             y = implicit_step(lb, x.to(dtype), self.time.to(dtype), tolerance=tolerance)
         return y.to(x.dtype)
 

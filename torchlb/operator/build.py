@@ -19,6 +19,7 @@ from torchlb.galerkin.nodes import lagrange_nodes
 from torchlb.galerkin.pair import PairPlan, SparsePair, WeakPair, mesh_pair
 from torchlb.geometry.boundary import open_sides, outward_sums
 from torchlb.geometry.numbering import Numbering
+from torchlb.linalg.precision import LOW
 from torchlb.linalg.threads import threads_for
 from torchlb.operator.assembled import AssembledOperator
 from torchlb.operator.checks import (
@@ -36,8 +37,6 @@ from torchlb.stencils.low_order import MeshLowOrder
 from torchlb.stencils.rows import Reason, matrix_rows
 from torchlb.stencils.shape import Shape, mesh_shape
 
-LONG_BOUNDARY = 0.1
-"""Share of the boundary's length at long triangles from which on a warning names them."""
 MANY = 0.5
 """Share of low-order rows from which on a warning names them."""
 REMEDIES = {
@@ -184,7 +183,7 @@ def _warn_of_long_triangles(vertices: Float[Tensor, "N n"], faces: Int[Tensor, "
     of[nodes.edge[lying_triangles(vertices, nodes, rim)].flatten()] = True
     length = (vertices[nodes.edges[:, 0]] - vertices[nodes.edges[:, 1]]).norm(dim=1)
     long, whole = length[of & rim].sum(), length[rim].sum()
-    if long > LONG_BOUNDARY * whole:
+    if long > LOW * whole:
         ends = nodes.edges[of & rim].unique()
         warn(
             f"cotangent operator: {long / whole:.0%} of the boundary ({first_few(ends)}) has long triangles along it, "

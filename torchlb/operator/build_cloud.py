@@ -22,12 +22,13 @@ from torchlb.cloud.doubts import (
     warn_of_near_duplicates,
 )
 from torchlb.cloud.reconstruction import reconstruct
-from torchlb.cloud.surface import NEAREST, CloudSurface
+from torchlb.cloud.surface import CloudSurface
 from torchlb.errors import InputError, renumbered
 from torchlb.galerkin.flips import flipped
 from torchlb.galerkin.pair import mesh_pair
 from torchlb.geometry.neighbors import nearest_neighbors
 from torchlb.geometry.numbering import Numbering
+from torchlb.geometry.thresholds import NEAREST
 from torchlb.linalg.threads import threads_for
 from torchlb.operator.assembled import AssembledOperator
 from torchlb.operator.build import finished, on_cells, with_plan

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from torchlb.errors import InputError, first_few, warn
 from torchlb.fits.polynomials import num_monomials
-from torchlb.galerkin.delaunay import NO_VOLUME
+from torchlb.linalg.precision import NEGLIGIBLE, ROUNDING, SMALL
 from torchlb.operator.cleaning import (
     are_quads,
     coincident,
@@ -24,10 +24,6 @@ from torchlb.operator.inputs import ArrayLike, check_corners, check_points
 
 MAX_EXTENT = 1e30
 """Largest extent of the points, and the inverse of the smallest, with which all that is called keeps its digits."""
-COARSE = 1e-3
-"""Step of single precision over the spacing of the points above which Δ is rounding."""
-FLAT = 1e-14
-"""Squared sine of the angles of triangles that have no area."""
 
 
 def check_scale(points: Float[Tensor, "N n"]) -> None:
@@ -59,7 +55,7 @@ def _warn_of_rounding(points: Float[Tensor, "N n"], spacing: Float[Tensor, " N"]
     """UserWarning for single-precision positions so far from 0 that their rounding shows between neighbours."""
     step = torch.finfo(torch.float32).eps * float(points.abs().max())
     width = float(spacing.median())
-    if step > COARSE * width and bool((points.float() == points).all()):
+    if step > SMALL * width and bool((points.float() == points).all()):
         warn(
             f"points: neighbours are {width:.2g} apart, and float32 has steps of {step:.2g} so far from 0, which Δ "
             "will show; centre the points in float64 before they are rounded: (points − points.mean(0)).float()"
@@ -112,7 +108,7 @@ def mended_faces(vertices: Float[Tensor, "N n"], faces: Int[Tensor, "F v"]) -> I
     if faces.shape[1] == 3:
         a, b = (vertices[faces[:, i]] - vertices[faces[:, 0]] for i in (1, 2))
         lengths = a.square().sum(1) * b.square().sum(1)
-        if (lengths - (a * b).sum(1).square() <= FLAT * lengths).all():
+        if (lengths - (a * b).sum(1).square() <= ROUNDING * lengths).all():
             raise InputError(
                 f"faces: none of the {len(faces)} triangles has an area, since all have their corners on a line; pass "
                 "the vertices of a surface, or a curve by its edges, (F, 2)"
@@ -127,7 +123,7 @@ def mended_faces(vertices: Float[Tensor, "N n"], faces: Int[Tensor, "F v"]) -> I
     if faces.shape[1] == 4:
         edges = vertices[faces[:, 1:]] - vertices[faces[:, :1]]
         longest = (vertices[faces[:, None]] - vertices[faces[:, :, None]]).norm(dim=-1).amax((1, 2))
-        flat = torch.linalg.svdvals(edges)[:, :3].prod(1) <= NO_VOLUME * longest**3
+        flat = torch.linalg.svdvals(edges)[:, :3].prod(1) <= NEGLIGIBLE * longest**3
         if flat.any():
             none = flat.nonzero()[:, 0]
             warn(

@@ -13,10 +13,8 @@ from torch.nn.functional import pad
 
 from torchlb.errors import InputError
 from torchlb.geometry.complex import edges_of, two_orientations
+from torchlb.linalg.precision import ROUNDING
 from torchlb.operator.inputs import ArrayLike, as_tensor, check_corners, check_points
-
-COINCIDENT = 1e-12
-"""Points closer than this share of the largest coordinate are one point: their difference is rounding."""
 
 
 def coincident(
@@ -29,7 +27,7 @@ def coincident(
     nearest = torch.from_numpy(nearest).view(len(points), -1)
     index = torch.arange(len(points))
     other = torch.where(nearest[:, 0] == index, nearest[:, -1], nearest[:, 0])
-    close = (distance <= COINCIDENT * points.abs().max()) & (other != index)
+    close = (distance <= ROUNDING * points.abs().max()) & (other != index)
     return distance, other, close.nonzero()[:, 0]
 
 
@@ -111,7 +109,7 @@ def clean_mesh(
     if corners.shape[1] == 4 and are_quads(corners):
         corners = triangles_of(places, corners).flatten(0, 1)
     if merge:
-        corners = merged(places, COINCIDENT * float(places.abs().max()))[corners]
+        corners = merged(places, ROUNDING * float(places.abs().max()))[corners]
     corners = proper_faces(corners)
     corners = corners[first_of_each(corners)]
     corners = torch.where(turned_faces(corners)[:, None], corners.flip(1), corners)

@@ -20,10 +20,9 @@ from torch import Tensor
 from torchlb.errors import InputError
 from torchlb.geometry.neighbors import mesh_graph
 from torchlb.linalg.checks import check_operator
+from torchlb.linalg.precision import NEGLIGIBLE
 from torchlb.operator.laplace_beltrami import LaplaceBeltrami
 
-TOLERANCE = 1e-6
-"""Of the sweeps, in mean edge lengths."""
 FROM_MESH = ("mesh", "cotangent")
 """Sources of operators whose faces are all there is."""
 Side = Float[np.ndarray, " T"]
@@ -73,7 +72,7 @@ def geodesic_distance(
     )
     if lb.dim == 2 and len(row):
         foot = points[np.maximum(nearest, 0)]  # any, where no path leads to one
-        enough = TOLERANCE * float(length.mean())
+        enough = NEGLIGIBLE * float(length.mean())
         distance = _straightened(distance, foot, points, _triangles(lb), enough)
     return torch.from_numpy(distance).to(lb.mass)
 

@@ -16,6 +16,7 @@ from jaxtyping import Shaped
 from torch import Tensor
 
 from torchlb.linalg.exponential import heat
+from torchlb.linalg.precision import ROOT_EPS
 from torchlb.linalg.sparse import compute_dtype
 from torchlb.operator.checks import check_tolerance
 from torchlb.operator.laplace_beltrami import LaplaceBeltrami
@@ -25,7 +26,6 @@ from torchlb.pde.pair_flow import pair_flow
 from torchlb.spectral.eigenbasis import Eigenbasis
 
 Method = Literal["deflated", "spectral", "rational"]
-TOLERANCE = 1e-7
 
 
 def heat_flow(
@@ -35,7 +35,7 @@ def heat_flow(
     *,
     method: Method = "rational",
     k: int = 128,
-    tolerance: float = TOLERANCE,
+    tolerance: float = ROOT_EPS,
 ) -> Tensor:
     """e^{tΔ}f: what f becomes when it diffuses over the surface for a time t; differentiable in f and t.
 

@@ -25,6 +25,7 @@ from torch import Tensor
 
 from torchlb.linalg.conjugate_gradients import Linear, conjugate_gradients
 from torchlb.linalg.factor import Factor
+from torchlb.linalg.precision import LOW, NEGLIGIBLE, SINGLE, TINY
 from torchlb.linalg.sparse import multiply, to_scipy
 from torchlb.linalg.two_levels import Matrix, absolute_row_sums, main_entries, two_levels
 from torchlb.operator.batching import shapes_of
@@ -33,17 +34,8 @@ from torchlb.pde.conduction import Conducting
 
 KEPT = 8
 """Factors that are kept for each operator."""
-SINGULAR = 1e-6
-"""Share of M₁ over the squared size that makes K₁ definite; constants, which it moves alone, are split off."""
 SPACING = 4.0
-"""Between the times of shared factors: M + tK and its factor's matrix then differ by its root at most."""
-SHORT, LONG = 0.1, 10.0
-"""Of t|K| over |M|: times below the first, on the mean, count as one; above the second, in every row, smoothing leaves
-M out."""
-SINGLE, STIFFEST = 1e-5, 1e5
-"""A tolerance from which on steps are taken in float32, unless the entries of M + tK sum to more than so many times the
-area: what is rounded there would show."""
-TINY = 1e-300
+"""Ratio of the times that have factors: M + tK and the matrix of its factor then differ by its root at most."""
 Operator = LaplaceBeltrami | Conducting
 
 
@@ -165,7 +157,7 @@ class PairSystem:
         Columns of several times go together: a product takes hardly longer for thirty than for one.
         """
         unit, shares = self._shares(time)
-        soft = time is not None and 1 + float(time[-1]) * self.stiff <= STIFFEST
+        soft = time is not None and 1 + float(time[-1]) * self.stiff <= 1 / SINGLE
         dtype = torch.float32 if soft and tolerance >= SINGLE else torch.float64
         wide = torch.promote_types(self.mass.dtype, dtype)
         values = [(v.to(wide) / of).to(dtype) for v, of in zip(self.parts, self.units, strict=True)]
@@ -212,7 +204,7 @@ class PairSystem:
         shares = [share.float() for share in shares]
         sums = [share * s for share, (_, s) in zip(shares, self._rough, strict=False)]
         terms = [(share, matrix) for share, (matrix, _) in zip(shares, self._rough, strict=False)]
-        if len(sums) == 2 and bool((sums[0][:, 0] > LONG * sums[1][:, 0]).all()):
+        if len(sums) == 2 and bool((sums[0][:, 0] > sums[1][:, 0] / LOW).all()):
             terms = terms[:1]
         return two_levels(partial(self._product, terms), sum(sums[1:], sums[0]), coarse)
 
@@ -229,7 +221,7 @@ class PairSystem:
         """
         if time is None or len(time) == 1:
             return [(None if time is None else float(time), columns)]
-        power = time.clamp_min(SHORT / self.stiff).log() / math.log(SPACING)
+        power = time.clamp_min(LOW / self.stiff).log() / math.log(SPACING)
         every = max(math.ceil(float(power[-1] - power[0]) / (KEPT - 1)), 1)
         level = SPACING ** (every * (power / every).round())
         level, count = level.unique_consecutive(return_counts=True)
@@ -248,7 +240,7 @@ class PairSystem:
     def _factored(self, t: float | None) -> Factor:
         first, second = self.linear
         if t is None:
-            scale = (SINGULAR * self.area ** (-2 / self.dim)).sqrt().expand_as(self.one)[:, 0]
+            scale = (NEGLIGIBLE * self.area ** (-2 / self.dim)).sqrt().expand_as(self.one)[:, 0]
             scale = sparse.diags_array(scale.cpu().numpy())
             matrix = first + scale @ second @ scale
         else:

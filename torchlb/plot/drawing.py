@@ -18,6 +18,7 @@ Eye = tuple[float, float]
 Views = Eye | Sequence[Eye]
 
 VIEW: Eye = (25.0, -55.0)
+"""From where a surface is seen: elevation and azimuth, °."""
 LIGHT = (-0.35, 0.45, 0.82)
 """Direction of the light as the picture has it: right, up, towards the eye."""
 MISSING = "0.6"

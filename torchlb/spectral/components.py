@@ -6,9 +6,6 @@ import numpy as np
 from jaxtyping import Float
 from scipy import linalg
 
-GAP = 1e-7
-"""Eigenvalues closer than this, relatively, are not separated: exact multiplicities stay whole."""
-
 
 def members(component: np.ndarray) -> list[np.ndarray]:
     """The points of every component, ascending, of the component of each point.

@@ -22,34 +22,36 @@ from scipy.sparse import csgraph
 from torch import Tensor
 
 from torchlb.errors import EigenbasisError, warn
-from torchlb.linalg.lanczos import Inverse, lanczos_of_pair
+from torchlb.geometry.thresholds import FACTOR
+from torchlb.linalg.lanczos import BLOCK, Inverse, lanczos_of_pair
+from torchlb.linalg.precision import (
+    DENSE,
+    EPS,
+    LARGEST_FACTORED,
+    ROOT_EPS,
+    ROUNDING,
+    ROUNDS,
+    SMALL,
+    TINY,
+)
 from torchlb.linalg.sparse import multiply, on_one_pattern
 from torchlb.linalg.two_levels import Matrix, absolute_row_sums, main_entries, two_levels
-from torchlb.spectral.components import GAP, constants, members
+from torchlb.spectral.components import constants, members
 from torchlb.spectral.eigenbasis import Eigenbasis
 
-TOLERANCE, LOOSEST = 1.5e-8, 1e-3
-"""Times k², since errors of quadratic elements grow with λ², and at most: one sweep, in general, or one and a half."""
-DENSE, SHARE = 600, 6
-"""Up to this many points, or where a sixth of the spectrum is wanted, a dense solve is as fast."""
-GUARD = 16
-"""Vectors carried beyond those wanted: they keep λ away from the rest of the spectrum."""
+SHARE = 6
+"""Where more than a sixth of the spectrum is wanted a dense solve is as fast."""
 SHIFT = 10.0
-"""Of the factor, over the size of a component: about half of its first eigenvalue, were it a disk, and the whole."""
-START, EXACT = 3e-3, 1e-8
-"""Residuals of Lanczos for the linear pair, whose distance from (K, M) is of that order, and for a pair alone."""
-REDUCTION, STEPS, SWEEPS = 1e-3, 24, 20
-"""What a sweep leaves of the error of an eigenvalue at least; bounds on its steps and on the sweeps."""
-LAST = 3.0
-"""Energy that the last step takes off, over that of what is left: from step to step it falls to a quarter or less."""
-ROUGH = 0.5
+"""Shift of the factor times the size of a component: about half of its first eigenvalue, were it a disk."""
+START = 0.003
+"""Relative residual of the eigenpairs of the linear pair, whose distance from (K, M) is of that order."""
+LONGEST = 24
+"""Steps of conjugate gradients in a sweep at most."""
+ASTRAY = 0.5
 """Estimated error above which vectors are no start for more than one step, and are kept beside what it gives."""
 SAFETY = 4.0
-"""On the estimated errors, which the preconditioner makes too small where K is softer than it takes it for."""
+"""Factor on the estimated errors, which are too small where K is softer than the preconditioner takes it for."""
 
-LARGEST_FACTORED = 100_000
-"""Points up to which the pair itself is factored where there is no linear one."""
-TINY, DEPENDENT = 1e-300, 1e-12
 
 Sparse = sparse.csr_array
 Pair = tuple[Sparse, Sparse]
@@ -119,9 +121,9 @@ def pencil_eigenbasis(
     areas[component[losing]] = 0.0
     zeros = min(int((areas > 0).sum()), k)
     if linear is None:
-        tolerance = EXACT**2
+        tolerance = EPS
     elif tolerance is None:
-        tolerance = min(TOLERANCE * k**2, LOOSEST)
+        tolerance = min(ROOT_EPS * k**2, SMALL)
     parts = _parts(whole, near, fixed, component, pattern, areas) if zeros < k else []
     found = [_pairs(part, k, tolerance) for part in parts]
     null = constants(component, areas, zeros)
@@ -192,7 +194,7 @@ def _joined(one: Sparse, other: Sparse) -> Sparse:
 def _pairs(part: _Part, k: int, tolerance: float) -> tuple[np.ndarray, ...]:
     """The k smallest eigenvalues of a component, or all, with groups whole, their relative errors, U, and MU; not 0."""
     size, zero = len(part.points), int(part.conserving)
-    count = min(k + GUARD, size)
+    count = min(k + BLOCK, size)
     if size <= max(DENSE, SHARE * count):
         dense = (part.stiffness.toarray(), part.mass_matrix.toarray())
         values, u = linalg.eigh(*dense, subset_by_index=(0, count - 1))
@@ -200,8 +202,8 @@ def _pairs(part: _Part, k: int, tolerance: float) -> tuple[np.ndarray, ...]:
     else:
         k1, m1 = part.linear or (part.stiffness, part.mass_matrix)
         null = np.full(size, float(m1.sum()) ** -0.5) if zero else None
-        accuracy = EXACT if part.linear is None else START
-        settings = {"tolerance": accuracy, "more": GUARD, "null": null}
+        accuracy = ROOT_EPS if part.linear is None else START
+        settings = {"tolerance": accuracy, "more": BLOCK, "null": null}
         solve, (values, u) = lanczos_of_pair(k1, m1, k - zero, SHIFT / float(m1.sum()), **settings)
         if null is not None:
             values, u = np.append(0.0, values), np.column_stack([null.astype(u.dtype), u])
@@ -211,11 +213,11 @@ def _pairs(part: _Part, k: int, tolerance: float) -> tuple[np.ndarray, ...]:
             swept = _swept(part, u, k, solve, tolerance)
             if swept is None:
                 warn(
-                    f"eigenbasis: after {SWEEPS} sweeps some of {k} eigenvalues are not accurate to {tolerance:.1g}, "
+                    f"eigenbasis: after {ROUNDS} sweeps some of {k} eigenvalues are not accurate to {tolerance:.1g}, "
                     "as where spacings change abruptly. Factors of the whole pair take over, at many times the memory "
                     "and time; a larger `tolerance` does without"
                 )
-                return _pairs(part._replace(linear=None), k, EXACT**2)
+                return _pairs(part._replace(linear=None), k, EPS)
             values, errors, u, mu = swept
     if zero:
         values[0] = 0.0
@@ -230,7 +232,7 @@ def _pairs(part: _Part, k: int, tolerance: float) -> tuple[np.ndarray, ...]:
 
 def _closed(values: np.ndarray, k: int, tolerance: float) -> int:
     """The least number of pairs, k or more, that splits no group of equal eigenvalues; all if there is none."""
-    gaps = np.append(np.diff(values) > max(GAP, tolerance) * values[1:], True)
+    gaps = np.append(np.diff(values) > max(ROOT_EPS, tolerance) * values[1:], True)
     gaps[: min(k, len(values)) - 1] = False
     return int(gaps.argmax()) + 1
 
@@ -250,7 +252,7 @@ def _swept(
     count, zero = u.shape[1], int(part.conserving)
     u = np.ascontiguousarray(u, dtype=np.float32)
     values, known = _ritz((u, *(on(u) for on in single)), count)
-    for sweep in range(SWEEPS + 1):
+    for sweep in range(ROUNDS + 1):
         keep = _closed(values, k, tolerance) if sweep else count
         (u, ku, mu), shifts = known, values[:keep].astype(known[0].dtype)
         residual = ku[:, :keep] - mu[:, :keep] * shifts
@@ -262,13 +264,14 @@ def _swept(
         errors[:zero] = 0.0
         if sweep and errors.max() <= tolerance:
             return values[:keep], errors, u[:, :keep], mu[:, :keep]
-        rough = errors[:k].max() > ROUGH
+        rough = errors[:k].max() > ASTRAY
         active = np.flatnonzero(errors > tolerance) if sweep else np.arange(keep)
-        enough = LAST * np.maximum(REDUCTION * errors, tolerance) / np.maximum(scale, TINY)
+        # the last step takes off FACTOR times the energy that is left: from step to step it falls to a quarter or less
+        enough = FACTOR * np.maximum(SMALL * errors, tolerance) / np.maximum(scale, TINY)
         small = (u.astype(np.float32), mu.astype(np.float32))
         right = (r, z, shifts.astype(np.float32), enough)
         right = tuple(x.take(active, -1) for x in right)
-        w = _correction(shifted, cycle, small, right, 1 if rough else STEPS).astype(np.float64)
+        w = _correction(shifted, cycle, small, right, 1 if rough else LONGEST).astype(np.float64)
         if sweep:
             w -= u @ (mu.T @ w)
         elif rough:
@@ -281,7 +284,7 @@ def _swept(
         values, known = _ritz(new, count)
     if len(part.points) > LARGEST_FACTORED:
         raise EigenbasisError(
-            f"eigenbasis: after {SWEEPS} sweeps the estimated relative error of some of {k} eigenvalues is above "
+            f"eigenbasis: after {ROUNDS} sweeps the estimated relative error of some of {k} eigenvalues is above "
             f"{tolerance:.1g}; ask for a larger tolerance"
         )
     return None
@@ -354,7 +357,7 @@ def _ritz(space: Blocks, count: int) -> tuple[np.ndarray, Blocks]:
     a, b = ((space[0].T @ x).astype(np.float64) for x in space[1:])
     scale = np.where(b.diagonal() > 0, b.diagonal(), np.inf) ** -0.5  # what has no mass has no part
     squares, q = linalg.eigh(b * scale * scale[:, None])
-    q = (scale[:, None] * q / np.sqrt(np.maximum(squares, TINY)))[:, squares > DEPENDENT]
+    q = (scale[:, None] * q / np.sqrt(np.maximum(squares, TINY)))[:, squares > ROUNDING]
     values, y = linalg.eigh(q.T @ a @ q)  # all of them, in less time than a part
     y = (q @ y[:, :count]).astype(space[0].dtype)
     u, ku, mu = (x @ y for x in space)

@@ -9,25 +9,17 @@ from jaxtyping import Bool, Int
 from torch import Tensor
 
 from torchlb.fits.rules import SIZE_FACTORS, reference
-from torchlb.fits.weights import MAX_RESIDUAL, Weights
+from torchlb.fits.weights import Weights
 from torchlb.geometry.candidates import Candidate
+from torchlb.geometry.thresholds import FACTOR
+from torchlb.linalg.precision import NEGLIGIBLE
 from torchlb.stencils.rows import Reason
 
-FACTOR, FACTOR_AT_BOUNDARY = 3.0, 4.0
-"""Growth may be this many times that of the reference stencil. At a boundary that is the one-sided one, or what is
-accepted inside if that is larger, since corners have more. FACTOR also bounds the off-diagonal ratio: over that of an
-M-matrix row, 1, and at a boundary over that of the reference."""
-RESOLVED_ON_MESH = {"tangent": 1.776, "normal": 0.888}
-RESOLVED_ON_CLOUD = 4.14
+RESOLVED_ON_MESH, RESOLVED_ON_CLOUD = 1.8, 4.1
 """Heights may leave this much of a fit, over the growth g∞ that turns it into an error of Δ. Triangles know more of a
-surface that its points do not resolve than a fit, points alone do not; along normals errors are larger on a mesh."""
+surface that its points do not resolve than a fit, points alone do not; on a mesh along normals half of it."""
 RESOLVING_DEGREE = 4
 """Up to it the bound stays the same: what a low degree leaves of the heights is not worth the fall to the next rows."""
-WIDE = 3.0
-"""Points per polynomial from which on, on a mesh, heights may leave the less the more points there are: a fit to folds
-does not become better over more of them, while uneven points of a surface that is well resolved need them."""
-WIDEST_AT_BOUNDARY = 2.5
-"""Points per polynomial: wider stencils with boundary points are balanced but lopsided, and a lower order is better."""
 
 
 @dataclass(frozen=True)
@@ -50,8 +42,8 @@ class Acceptance:
 
     @staticmethod
     def too_wide_at_boundary(candidate: Candidate) -> bool:
-        """Whether no stencil with boundary points may be as wide as that."""
-        return candidate.degree > 2 and candidate.factor > WIDEST_AT_BOUNDARY
+        """Whether a stencil with boundary points would be so wide that it is lopsided, and a lower order better."""
+        return candidate.degree > 2 and candidate.factor > FACTOR
 
     def judge(
         self, weights: Weights, candidate: Candidate, touching: Bool[Tensor, " B"]
@@ -62,12 +54,13 @@ class Acceptance:
         """
         inside = reference(self.dim, candidate.degree, candidate.rule)
         edge = reference(self.dim, candidate.degree, one_sided=True) if touching.any() else inside
-        at_edge = FACTOR_AT_BOUNDARY * max(edge.growth, FACTOR * inside.growth)
+        # at a boundary over the one-sided reference, or over what is accepted inside, since corners have more
+        at_edge = FACTOR * max(edge.growth, FACTOR * inside.growth)
         max_growth = torch.where(touching, at_edge, FACTOR * inside.growth)
         max_ratio = FACTOR * torch.where(touching, edge.off_diagonal_ratio, 1.0)
         resolved, resolvable = self._resolved(candidate)
         center, others = weights.laplacian[:, 0], weights.laplacian[:, 1:].abs().sum(1)
-        determined = weights.residual <= MAX_RESIDUAL  # false for NaN
+        determined = weights.residual <= NEGLIGIBLE  # false for NaN
         failure = torch.zeros(len(center), dtype=torch.int64)
         for reason, passed in (
             (Reason.MOMENTS, determined),
@@ -85,13 +78,14 @@ class Acceptance:
     def _resolved(self, candidate: Candidate) -> tuple[float, float]:
         """Bounds on the residual of the heights: for this candidate, and for all of its degree.
 
-        On a cloud the noise of the heights may fall by as much as the widest stencil is wider than the first, and a
-        size that the user fixed cannot widen.
+        On a mesh they may leave the less the more points there are, from 3 a polynomial on: a fit to folds does not
+        become better over more of them. On a cloud the noise of the heights may fall by as much as the widest stencil
+        is wider than the first, and a size that the user fixed cannot widen.
         """
         growth = max(reference(self.dim, m).growth for m in (candidate.degree, RESOLVING_DEGREE))
         if self.on_mesh:
-            bound = RESOLVED_ON_MESH[self.projection] / growth
-            return bound * WIDE / max(candidate.factor, WIDE), bound
+            bound = RESOLVED_ON_MESH / (1 + (self.projection == "normal")) / growth
+            return bound * FACTOR / max(candidate.factor, FACTOR), bound
         bound = RESOLVED_ON_CLOUD / growth
         factors = SIZE_FACTORS["least_squares"]
         widest = bound * (factors[-1] / factors[0]) ** (1 / self.dim)

@@ -19,18 +19,18 @@ from tqdm import tqdm
 from torchlb.errors import StencilError, first_few
 from torchlb.fits.polynomials import num_monomials
 from torchlb.fits.rules import WEIGHT_RULES
-from torchlb.fits.weights import MAX_RESIDUAL, Weights, least_squares_weights, positive_weights
+from torchlb.fits.weights import Weights, least_squares_weights, positive_weights
 from torchlb.geometry.candidates import (
-    PIECE_BYTES,
     Candidate,
     Search,
     list_candidates,
     stencil_candidates,
 )
 from torchlb.geometry.frames import local_heights, local_offsets
-from torchlb.geometry.neighbors import AT_ONCE
+from torchlb.geometry.thresholds import FACTOR
 from torchlb.geometry.vectors import at
-from torchlb.stencils.acceptance import WIDEST_AT_BOUNDARY, Acceptance
+from torchlb.linalg.precision import AT_ONCE, NEGLIGIBLE, rows_at_once
+from torchlb.stencils.acceptance import Acceptance
 from torchlb.stencils.low_order import MeshLowOrder
 from torchlb.stencils.rows import (
     Reason,
@@ -44,7 +44,7 @@ from torchlb.stencils.shape import Shape
 
 RULES = list(WEIGHT_RULES)
 GRADIENT_GROWTH = 30.0
-"""ρ Σ|w| of a first derivative beside a boundary; where points lie well it has 5 to 15."""
+"""Largest ρ Σ|w| of a first derivative beside a boundary; where points lie well it is 5 to 15."""
 
 
 class Stencils:
@@ -145,8 +145,8 @@ class Stencils:
         every, blocks, taken = torch.arange(len(plan.length)), [], []
         for number, candidate in enumerate(self.candidates):
             rows = every[plan.candidate == number]
-            entry = 8 * candidate.size * num_monomials(self.shape.frames.shape[2], candidate.degree)
-            for centers in rows.split(max(64, PIECE_BYTES // entry)) if len(rows) else ():
+            entry = candidate.size * num_monomials(self.shape.frames.shape[2], candidate.degree)
+            for centers in rows.split(rows_at_once(entry)) if len(rows) else ():
                 places = plan.entries(centers)
                 places = places.gather(1, _own_first(plan.col[places], centers))
                 index, used = plan.col[places].long(), plan.used[places][:, 1:]
@@ -329,7 +329,7 @@ class Stencils:
         candidates = [
             c
             for c in list_candidates(dim, degrees, num_neighbors=self.num_neighbors)
-            if c.factor <= WIDEST_AT_BOUNDARY
+            if c.factor <= FACTOR
         ]
         assert self.shape.balls is not None
         search = Search(self.shape.balls, centers, candidates)
@@ -346,13 +346,13 @@ class Stencils:
 def _good_slope(weights: Weights) -> Bool[Tensor, " B"]:
     """Whether the points determine first derivatives, and well."""
     growth = weights.radius * weights.gradient.abs().sum(1).amax(1)
-    return (weights.residual <= MAX_RESIDUAL) & (growth <= GRADIENT_GROWTH)
+    return (weights.residual <= NEGLIGIBLE) & (growth <= GRADIENT_GROWTH)
 
 
 def assemble(stencils: Stencils, *, progress: bool = True) -> Rows:
     """Rows of all points, in chunks.
 
-    Memory beyond the result: about 0.1 GB whatever N (`candidates.PIECE_BYTES`). The result takes 16 + 8 d
+    Memory beyond the result: about 0.1 GB whatever N (`precision.BYTES`). The result takes 16 + 8 d
     bytes an entry.
     """
     shape = stencils.shape

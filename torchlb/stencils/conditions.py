@@ -13,10 +13,8 @@ from torch import Tensor
 
 from torchlb.errors import InputError, first_few
 from torchlb.geometry.boundary import Boundary
+from torchlb.linalg.precision import LOW
 from torchlb.stencils.rows import Rows
-
-CLOSEST = 0.1
-"""Share of the farthest distance in its row that a boundary point's own scale has at least: near pairs are stiff."""
 
 
 class Condition:
@@ -108,7 +106,7 @@ class Dirichlet(Condition):
     """f = 0: no entry joins a boundary point to another point.
 
     A boundary point has −4d/h² for itself, as a grid's fastest wave, h its distance to the nearest point, but at least
-    `CLOSEST` of that to the farthest in its row.
+    `LOW` of that to the farthest in its row.
     """
 
     name = "dirichlet"
@@ -130,7 +128,7 @@ class Dirichlet(Condition):
         square = (points[col] - points[row]).square().sum(1)
         farthest = square.new_zeros(len(centers)).scatter_reduce(0, local, square, "amax")
         square = torch.where(row == col, torch.inf, square)
-        nearest = farthest.scatter_reduce(0, local, square, "amin").maximum(CLOSEST**2 * farthest)
+        nearest = farthest.scatter_reduce(0, local, square, "amin").maximum(LOW**2 * farthest)
         nearest = torch.where(nearest > 0, nearest, 1.0)  # a row of coincident points has no scale
         kept = torch.where(mask[row] | mask[col], 0.0, rows.laplacian)
         own = mask[row] & (row == col)

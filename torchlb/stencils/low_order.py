@@ -14,10 +14,8 @@ from torchlb.errors import first_few, warn
 from torchlb.galerkin.assembly import linear_elements
 from torchlb.galerkin.delaunay import delaunay_cover, sound_lengths
 from torchlb.galerkin.nodes import lagrange_nodes
+from torchlb.linalg.precision import ROUNDING
 from torchlb.linalg.sparse import with_diagonal
-
-LEAST_AREA = 1e-12
-"""Of the mean: what the mass of a vertex has at least."""
 
 
 def simplex_shares(
@@ -91,19 +89,19 @@ class MeshLowOrder:
         )
         corner = self.cells.flatten(), square.repeat_interleave(self.cells.shape[1])
         longest.scatter_reduce_(0, *corner, "amax")
-        sound = self.cells.shape[1] != 3 or (shares > LEAST_AREA * longest).all()
+        sound = self.cells.shape[1] != 3 or (shares > ROUNDING * longest).all()
         return shares if sound else self._masses
 
     @cached_property
     def _masses(self) -> Float[Tensor, " N"]:
         """Lumped masses of the triangulation, none of them zero."""
         mass = self._elements[1]
-        least = LEAST_AREA * mass.mean()
+        least = ROUNDING * mass.mean()
         tiny = (mass < least).nonzero()[:, 0]
         if len(tiny):
             warn(
                 f"{len(tiny)} points ({first_few(tiny)}) have next to no area, their triangles are degenerate; "
-                f"{LEAST_AREA:g} of the mean is taken, so that rows stay finite"
+                f"{ROUNDING:.0e} of the mean is taken, so that rows stay finite"
             )
         return mass.clamp_min(least)
 

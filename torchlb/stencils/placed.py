@@ -18,7 +18,8 @@ from torchlb.geometry.frames import (
     vertex_normals,
 )
 from torchlb.geometry.local_fits import FitPlan, LocalFits
-from torchlb.geometry.vectors import TINY, dot
+from torchlb.geometry.vectors import dot
+from torchlb.linalg.precision import TINY
 
 
 class Beside(NamedTuple):

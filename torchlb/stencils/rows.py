@@ -12,13 +12,11 @@ from scipy import sparse
 from torch import Tensor
 
 from torchlb.fits.rules import WEIGHT_RULES
-from torchlb.fits.weights import MAX_RESIDUAL, Weights
+from torchlb.fits.weights import Weights
 from torchlb.geometry.numbering import Numbering
+from torchlb.geometry.thresholds import SLIGHT
+from torchlb.linalg.precision import NEGLIGIBLE, ROOT_EPS
 from torchlb.linalg.sparse import from_scipy
-
-STEEPEST = 0.05
-"""Entries of JJᵀ − 1, J the derivatives of the points themselves, above which a fit is steep over its frame: with it
-|∇x_c| ≤ 1.05."""
 
 
 class Reason(IntEnum):
@@ -190,7 +188,7 @@ def to_tangent_vectors(
 
     With weights G of these derivatives J = Gx are tangent vectors of the surface that the fit makes of the points x,
     and over it ∇f = Jᵀ(JJᵀ)⁻¹Gf = J⁺Gf. Of coordinates ∇ is Eᵀ times a projector, so no longer than 1, however steep
-    the fit is over the frame. Where the frame is tangent to it, to `STEEPEST`, G stays, and ∇ is exact for functions
+    the fit is over the frame. Where the frame is tangent to it, to `SLIGHT`, G stays, and ∇ is exact for functions
     that are linear in the tangent plane.
 
     >>> steep = torch.tensor([[[1.0, 2.0]]])
@@ -198,9 +196,9 @@ def to_tangent_vectors(
     [[[0.2]]]
     """
     turn = torch.eye(jacobian.shape[1], dtype=jacobian.dtype).repeat(len(jacobian), 1, 1)
-    askew = (jacobian @ jacobian.mT - turn).abs().amax((1, 2)) > STEEPEST
+    askew = (jacobian @ jacobian.mT - turn).abs().amax((1, 2)) > SLIGHT
     # Singular values are those of [1, slope], 1 and more, and 0 across a line on which all points lie.
-    inverse = torch.linalg.pinv(jacobian[askew], atol=MAX_RESIDUAL, rtol=0.0)
+    inverse = torch.linalg.pinv(jacobian[askew], atol=NEGLIGIBLE, rtol=0.0)
     turn[askew] = frames[askew].mT @ inverse
     return turn
 
@@ -256,7 +254,7 @@ def matrix_rows(
     size = size.clamp_min(torch.finfo(size.dtype).tiny ** 0.5)[:, None]
     coords = coords / size[local]
     moment = summed(coords[:, :, None] * coords[:, None, :])
-    inverse = torch.linalg.pinv(moment, rtol=1e-9, hermitian=True) / size[..., None]
+    inverse = torch.linalg.pinv(moment, rtol=ROOT_EPS, hermitian=True) / size[..., None]
     jacobian = inverse @ summed(coords[:, :, None] * offset[:, None, :])
     inverse = to_tangent_vectors(jacobian, frames[centers]) @ inverse
     gradient = torch.einsum("ecd,ed->ec", inverse[local], coords)

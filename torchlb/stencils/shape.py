@@ -23,14 +23,14 @@ from torchlb.geometry.frames import (
     vertex_normals,
 )
 from torchlb.geometry.local_fits import FitPlan, LocalFits
-from torchlb.geometry.neighbors import AT_ONCE, GraphBalls, mesh_graph, nearest_neighbors
+from torchlb.geometry.neighbors import GraphBalls, mesh_graph, nearest_neighbors
+from torchlb.geometry.thresholds import NEAREST
+from torchlb.linalg.precision import AT_ONCE
 from torchlb.stencils.conditions import Condition, Neumann
 from torchlb.stencils.low_order import MeshLowOrder
 from torchlb.stencils.placed import Beside, Placed, ShapePlan, first_frames, righthanded, turned
 
 NEUMANN = Neumann()
-NEAREST = 24
-"""Nearest points among which those on the other side of a thin shape are."""
 
 
 @dataclass(frozen=True)

@@ -26,10 +26,10 @@ from torch.func import jvp
 from torch.nn.functional import pad
 
 from torchlb.errors import InputError
+from torchlb.linalg.precision import ROOT_EPS
 
-ON_SURFACE = 1e-8  # a point is on the surface if the retraction moves it by no more than this
-PACKING = {2: (4 / 3) ** 0.25, 3: 2 ** (1 / 6)}  # spacing of the densest lattice of density 1
-NEIGHBORS = {2: 9, 3: 16}  # that repel a point, by dimension
+PACKING = {2: (4 / 3) ** 0.25, 3: 2 ** (1 / 6)}
+"""Spacing of the densest lattice of density 1, by dimension."""
 
 Places = Float[Tensor, "*batch n"]
 Points = Float[Tensor, "N n"]
@@ -145,7 +145,7 @@ class Surface:
 
     def _repel(self, free: Points, fixed: Float[Tensor, "B n"], spacing: float) -> Points:
         """The free points after 40 steps away from neighbours nearer than 1.3 spacings."""
-        neighbors = min(NEIGHBORS[self.dim], len(free) + len(fixed) - 1)
+        neighbors = min((self.dim + 1) ** 2, len(free) + len(fixed) - 1)
         for _ in range(10):
             everything = torch.cat([free, fixed]).numpy()
             _, found = KDTree(everything).query(free.numpy(), k=neighbors + 1)
@@ -161,7 +161,7 @@ class Surface:
 
     def boundary_mask(self, points: Points) -> Bool[Tensor, " N"]:
         """Which of the points lie on the boundary."""
-        on_circle = (self._checked(points)[:, :2].norm(dim=1) - 1).abs() < ON_SURFACE
+        on_circle = (self._checked(points)[:, :2].norm(dim=1) - 1).abs() < ROOT_EPS
         return on_circle & (self.perimeter > 0)
 
     def _checked(self, points: Points) -> Points:
@@ -170,7 +170,7 @@ class Surface:
         given = f"{points.dtype} {tuple(points.shape)}"
         require(fits and points.dtype == torch.float64, name, expected, given)
         distance = (self.retract(points) - points).norm(dim=1)
-        off = torch.nonzero(~(distance <= ON_SURFACE))[:, 0].tolist()  # not-a-number is off, too
+        off = torch.nonzero(~(distance <= ROOT_EPS))[:, 0].tolist()  # not-a-number is off, too
         require(not off, name, "points on the surface (use retract)", f"others: {off[:8]}")
         return points.detach()
 
