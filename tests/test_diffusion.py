@@ -259,7 +259,7 @@ def test_learned_times_stay_positive_and_are_learned():
     assert (layer.time > 0).all()
 
 
-def test_what_cannot_work_is_said():
+def test_what_cannot_work_is_said(unchecked):
     lb = KINDS["points"]()
     f = rough(300)
     with pytest.raises(InputError, match=r"expected one of \('deflated'.*got 'implicit'"):
