@@ -14,7 +14,7 @@ from torchlb.geometry.candidates import (
     list_candidates,
     stencil_candidates,
 )
-from torchlb.geometry.neighbors import GraphBalls, nearest_neighbors
+from torchlb.geometry.neighbors import GraphNeighborhoods, nearest_neighbors
 from torchlb.surfaces import Sphere
 
 
@@ -39,20 +39,22 @@ def test_a_given_size_replaces_the_listed_ones():
 
 
 @pytest.fixture(scope="module")
-def balls():
+def neighborhoods():
     points = Sphere().points(300)
     frames = Sphere().frames(points)
-    return GraphBalls(points, nearest_graph(points, frames, nearest_neighbors(points, 24)), frames)
+    return GraphNeighborhoods(
+        points, nearest_graph(points, frames, nearest_neighbors(points, 24)), frames
+    )
 
 
 CANDIDATES = [Candidate(m, size, "least_squares") for m in (3, 2) for size in (16, 20, 30, 50)]
 
 
-def found(balls, centers, willing, start=None, candidates=CANDIDATES, rejects=None):
+def found(neighborhoods, centers, willing, start=None, candidates=CANDIDATES, rejects=None):
     """Who settles on which candidate (−1: none), if centre c does from `willing[c]` on; and what was tried."""
     taken = torch.full((len(centers),), -1)
     tried = []
-    search = Search(balls, centers, candidates, start)
+    search = Search(neighborhoods, centers, candidates, start)
     for number, rows, index in search:
         assert index.shape == (len(rows), candidates[number].size)
         assert torch.equal(index[:, 0], centers[rows])
@@ -66,10 +68,10 @@ def found(balls, centers, willing, start=None, candidates=CANDIDATES, rejects=No
     return taken, tried
 
 
-def test_every_centre_takes_the_first_candidate_that_passes(balls):
+def test_every_centre_takes_the_first_candidate_that_passes(neighborhoods):
     centers = torch.arange(3, 300, 7)
     willing = torch.randint(0, len(CANDIDATES), (300,))
-    taken, tried = found(balls, centers, willing)
+    taken, tried = found(neighborhoods, centers, willing)
     assert torch.equal(taken, willing[centers])
     # In order, each once, and none after it passed.
     assert sorted(tried) == sorted(
@@ -78,26 +80,26 @@ def test_every_centre_takes_the_first_candidate_that_passes(balls):
     assert [number for number, _ in tried] == sorted(number for number, _ in tried)
 
 
-def test_pieces_cover_all_centres_within_the_bound(balls, monkeypatch):
+def test_pieces_cover_all_centres_within_the_bound(neighborhoods, monkeypatch):
     entry = 8 * CANDIDATES[0].size * num_monomials(2, CANDIDATES[0].degree)
     monkeypatch.setattr("torchlb.linalg.precision.BYTES", 100 * entry)
-    pieces = list(Search(balls, torch.arange(300), CANDIDATES[:1]))
+    pieces = list(Search(neighborhoods, torch.arange(300), CANDIDATES[:1]))
     assert torch.equal(torch.cat([rows for _, rows, _ in pieces]), torch.arange(300))
     assert [len(rows) for _, rows, _ in pieces] == [100, 100, 100]
 
 
-def test_start_keeps_rows_off_the_candidates_before_their_own(balls):
+def test_start_keeps_rows_off_the_candidates_before_their_own(neighborhoods):
     centers = torch.arange(20)
     start = torch.arange(20) % (len(CANDIDATES) + 1)
-    taken, tried = found(balls, centers, torch.zeros(300), start)
+    taken, tried = found(neighborhoods, centers, torch.zeros(300), start)
     assert torch.equal(taken, torch.where(start < len(CANDIDATES), start, -1))
     assert all(number >= start[row] for number, row in tried)
 
 
-def test_who_rejects_a_degree_goes_on_with_the_next(balls):
+def test_who_rejects_a_degree_goes_on_with_the_next(neighborhoods):
     """Four sizes of two degrees: after the first of degree 3 come those of degree 2, and after that nothing."""
     rejects = torch.arange(300) % 2 == 0
-    taken, tried = found(balls, torch.arange(10), torch.full((300,), 99), rejects=rejects)
+    taken, tried = found(neighborhoods, torch.arange(10), torch.full((300,), 99), rejects=rejects)
     assert (taken == -1).all()
     assert [number for number, center in tried if center == 4] == [0, 4]
     assert [number for number, center in tried if center == 5] == list(range(8))
@@ -119,8 +121,8 @@ def test_candidates_of_a_row():
     assert degrees(3, on_mesh=True, weights="polyharmonic") == [(4, "p"), (4, "l")]
 
 
-def test_who_passes_nowhere_does_not_appear(balls):
-    taken, tried = found(balls, torch.arange(10), torch.full((300,), 99))
+def test_who_passes_nowhere_does_not_appear(neighborhoods):
+    taken, tried = found(neighborhoods, torch.arange(10), torch.full((300,), 99))
     assert (taken == -1).all()
     assert len(tried) == 10 * len(CANDIDATES)
 
@@ -130,8 +132,8 @@ def test_candidates_larger_than_the_ball_are_not_tried():
     points = torch.cat([Sphere().points(150), Sphere().points(150) + 10])
     frames = Sphere().frames(points[:150]).repeat(2, 1, 1)
     graph = nearest_graph(points, frames, nearest_neighbors(points, 24))
-    balls = GraphBalls(points, graph, frames)
+    neighborhoods = GraphNeighborhoods(points, graph, frames)
     candidates = [Candidate(2, 200, "least_squares"), Candidate(2, 12, "least_squares")]
-    taken, tried = found(balls, torch.arange(300), torch.zeros(300), candidates=candidates)
+    taken, tried = found(neighborhoods, torch.arange(300), torch.zeros(300), candidates=candidates)
     assert (taken == 1).all()
     assert {number for number, _ in tried} == {1}

@@ -16,7 +16,7 @@ from torchlb.galerkin.assembly import element_matrices, flat_metric, summed
 from torchlb.galerkin.delaunay import delaunay_cover
 from torchlb.galerkin.elements import simplex
 from torchlb.galerkin.nodes import lagrange_nodes
-from torchlb.pde.conduction import conducting, elements_of
+from torchlb.pde.conduction import elements_of, with_conductivity
 from torchlb.surfaces import UnitDisk
 
 SQUARE = np.sort([np.pi**2 * (i * i + j * j) for i in range(8) for j in range(8)])[:12]
@@ -66,7 +66,7 @@ def test_long_triangles_along_the_boundary_bind_nothing(mesh, median, worst):
         forms = elements_of(operator)
         for count in (len(mesh[0]), len(mesh[1])):
             ones = torch.ones(count, dtype=torch.float64)
-            assert conducting(operator, ones).shape == operator.shape
+            assert with_conductivity(operator, ones).shape == operator.shape
             diagonal = forms.matrix(forms.conductivities(ones)).diagonal().real
             expected = operator.stiffness.to_dense().diagonal()
             np.testing.assert_allclose(diagonal, expected, rtol=1e-9)

@@ -6,7 +6,7 @@ from torch.autograd import gradcheck
 
 from torchlb import InputError, LaplaceBeltrami, implicit_step, poisson_solve
 from torchlb.galerkin.forms import Forms
-from torchlb.pde.conduction import conducting, elements_of
+from torchlb.pde.conduction import elements_of, with_conductivity
 from torchlb.surfaces import Ellipsoid, Sphere, Torus, UnitDisk
 
 
@@ -66,7 +66,7 @@ def test_stiffness_is_symmetric_and_positive_for_any_conductivity(kind):
     lb = build(kind)
     for count in (80, len(lb.faces)):
         kappa = (3 * torch.randn(count, dtype=torch.float64)).exp()
-        crow, col, values = conducting(lb, kappa).weak.pair
+        crow, col, values = with_conductivity(lb, kappa).weak.pair
         dense = torch.sparse_csr_tensor(crow, col, values[0]).to_dense()
         scale = dense.abs().max()
         assert (dense - dense.T).abs().max() <= 1e-12 * scale

@@ -18,7 +18,7 @@ from torchlb.geometry.frames import (
     mesh_frames,
     normals_of_frames,
 )
-from torchlb.geometry.neighbors import GraphBalls, nearest_neighbors
+from torchlb.geometry.neighbors import GraphNeighborhoods, nearest_neighbors
 from torchlb.surfaces import (
     CliffordTorus,
     Ellipsoid,
@@ -45,12 +45,12 @@ def close(actual, expected):
 def initial_and_balls(surface, points):
     candidates = nearest_neighbors(points, 64 if surface.dim == 3 else 24)
     initial = cloud_frames(points, candidates, surface.dim)
-    return initial, GraphBalls(points, nearest_graph(points, initial, candidates), initial)
+    return initial, GraphNeighborhoods(points, nearest_graph(points, initial, candidates), initial)
 
 
 def refined(surface, points, degree):
-    _, balls = initial_and_balls(surface, points)
-    search = FitSearch(balls, degree)
+    _, neighborhoods = initial_and_balls(surface, points)
+    search = FitSearch(neighborhoods, degree)
     search.refine(torch.arange(len(points)))
     plan, fits = search.finish()
     return fits.frames, plan.order

@@ -10,14 +10,14 @@ from scipy.sparse.linalg import eigsh
 from tolerances import TOLERANCE
 from torchlb import InputError, LaplaceBeltrami
 from torchlb.galerkin import flips
+from torchlb.galerkin.boundary_curves import boundary_curves_plan
 from torchlb.galerkin.elements import lattice, simplex
 from torchlb.galerkin.flips import flipped
 from torchlb.galerkin.pair import mesh_pair
-from torchlb.galerkin.rim import rim_plan
 from torchlb.geometry.boundary import boundary_faces
 from torchlb.geometry.fit_search import FitSearch
 from torchlb.geometry.frames import complete_frames, vertex_normals
-from torchlb.geometry.neighbors import GraphBalls, mesh_graph
+from torchlb.geometry.neighbors import GraphNeighborhoods, mesh_graph
 from torchlb.surfaces import CliffordTorus, Hemisphere, Sphere, Torus, UnitDisk, deserno_points
 
 
@@ -150,8 +150,10 @@ def test_linear_elements_are_the_cotangent_with_its_full_mass(surface):
     """The pair beside that of quadratic ones: libigl's matrices to rounding, a test of the assembly."""
     vertices, faces = surface.mesh(400)
     frames = complete_frames(vertex_normals(vertices, faces))
-    balls = GraphBalls(vertices, mesh_graph(faces, len(vertices)), frames)
-    pair = mesh_pair(vertices, faces, *FitSearch(balls, 0, (2,)).finish(), 2, (2,))[1].linear
+    neighborhoods = GraphNeighborhoods(vertices, mesh_graph(faces, len(vertices)), frames)
+    pair = mesh_pair(vertices, faces, *FitSearch(neighborhoods, 0, (2,)).finish(), 2, (2,))[
+        1
+    ].linear
     args = vertices.numpy(), faces.numpy()
     expected = -igl.cotmatrix(*args), igl.massmatrix(*args, igl.MASSMATRIX_TYPE_FULL)
     for values, matrix in zip(pair.values, expected, strict=True):
@@ -260,7 +262,7 @@ def test_curves_of_the_rim_reproduce_polynomials_of_arc_length():
     x = torch.tensor([0.0, 1, 1.5, 2.7, 4, 5.5], dtype=torch.float64)
     points = torch.stack([x, 0 * x, 0 * x], 1)
     rim = torch.stack([torch.arange(5), torch.arange(1, 6)], 1)
-    curves = rim_plan(points, rim, 4).at(points)
+    curves = boundary_curves_plan(points, rim, 4).at(points)
     weights = curves.weights(torch.full((5, 1), 0.3, dtype=torch.float64))
     places = (weights * x[curves.index][:, None]).sum(-1)[:, 0]
     torch.testing.assert_close(places, x[:-1] + 0.3 * x.diff(), **TOLERANCE[torch.float64])

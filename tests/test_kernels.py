@@ -9,12 +9,12 @@ import pytest
 import torch
 from scipy import sparse
 
-from torchlb.cloud.cocone import best_manifold, wings
+from torchlb.cloud.cocone import best_manifold, conormals
 from torchlb.fits.least_squares import left_inverse
 from torchlb.fits.weights import scaled_system
 from torchlb.galerkin import forms
 from torchlb.galerkin.pair import Pattern
-from torchlb.geometry.admission import admissible, normal_frames
+from torchlb.geometry.compatibility import compatible, normal_frames
 from torchlb.geometry.complex import components, edges_of, spanning_pairs, tree_sides
 from torchlb.geometry.thresholds import CREASE, HALF_CREASE
 from torchlb.linalg import kernels
@@ -103,7 +103,7 @@ def one_by_one(points, faces):
     chosen, tips = [], {}
 
     def way(tip, edge):
-        return wings(points, *np.array([[tail] for tail in edge]), np.array([tip]))[0]
+        return conormals(points, *np.array([[tail] for tail in edge]), np.array([tip]))[0]
 
     for a, b, c in faces.tolist():
         sides = [
@@ -164,7 +164,7 @@ def test_edges_are_those_of_all_pairs(faces):
 
 
 def grown(points, frames, sides, graph, center, size, wanted, rings):
-    """A graph ball by its definition, ring by ring."""
+    """A k-hop neighbourhood by its definition, ring by ring."""
     planes = frames if frames.shape[2] < points.shape[1] else torch.zeros_like(points)
     ball, ring = [center], [center]
     for _ in range(rings):
@@ -173,7 +173,7 @@ def grown(points, frames, sides, graph, center, size, wanted, rings):
         start = torch.full_like(near, center)
         good = (sides[near] @ sides[center]) >= 0
         if frames.shape[1] > frames.shape[2]:
-            good &= admissible(points, planes, start, near)
+            good &= compatible(points, planes, start, near)
         ring = near[good].tolist()
         ball += ring
         if len(ball) >= wanted or not ring:
@@ -204,7 +204,7 @@ def test_graph_balls_are_what_walks_reach(n, dim):
     shape = (x.contiguous().numpy() for x in (points, normal_frames(frames), sides))
     rows = graph.indptr.astype(np.int32), graph.indices.astype(np.int32)
     bounds = 12, 18.0, 4, HALF_CREASE, CREASE
-    index, count = kernels.graph_balls(*shape, *rows, np.arange(120), *bounds)
+    index, count = kernels.k_hop_neighborhoods(*shape, *rows, np.arange(120), *bounds)
     for center in range(120):
         expected = grown(points, frames, sides, graph, center, 12, 18.0, 4)
         assert index[center, : count[center]].tolist() == expected

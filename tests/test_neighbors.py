@@ -1,4 +1,4 @@
-"""Neighbourhoods: natural neighbours, graphs, and balls that stay on their own sheet."""
+"""Neighbourhoods: natural neighbours, graphs, and neighborhoods that stay on their own sheet."""
 
 import itertools
 import math
@@ -10,9 +10,9 @@ from scipy.sparse import csgraph
 
 from torchlb.cloud.frames import cloud_frames
 from torchlb.cloud.voronoi import nearest_graph
-from torchlb.geometry.admission import admissible
+from torchlb.geometry.compatibility import compatible
 from torchlb.geometry.frames import mesh_frames
-from torchlb.geometry.neighbors import GraphBalls, mesh_graph, nearest_neighbors
+from torchlb.geometry.neighbors import GraphNeighborhoods, mesh_graph, nearest_neighbors
 from torchlb.surfaces import Ellipsoid, Sphere, Torus
 
 
@@ -29,11 +29,11 @@ def square_grid(size):
 
 
 def cloud_balls(points, dim=2):
-    """What a cloud is given: graph and balls on initial frames."""
+    """What a cloud is given: graph and neighborhoods on initial frames."""
     candidates = nearest_neighbors(points, 24)
     frames = cloud_frames(points, candidates, dim)
     graph = nearest_graph(points, frames, candidates)
-    return GraphBalls(points, graph, frames)
+    return GraphNeighborhoods(points, graph, frames)
 
 
 def real_pairs(index, count):
@@ -58,7 +58,7 @@ def test_admission_by_angle_and_by_height():
         frames = torch.tensor([[[1.0, 0], [0, 1], [0, 0]], tilted], dtype=torch.float64)
         place = [0.0, math.sqrt(1 - height**2), height]
         points = torch.tensor([[0.0, 0, 0], place], dtype=torch.float64)
-        return admissible(points, frames, torch.tensor([0]), torch.tensor([1])).item()
+        return compatible(points, frames, torch.tensor([0]), torch.tensor([1])).item()
 
     degree = math.pi / 180
     assert verdict(0.0, 0.0)
@@ -79,8 +79,8 @@ def test_admission_does_not_depend_on_the_choice_of_frames():
         frames = torch.linalg.qr(torch.eye(4)[:, :dim] + 0.3 * torch.randn(60, 4, dim).double())[0]
         turn = torch.linalg.qr(torch.randn(60, dim, dim, dtype=torch.float64))[0]
         centers, others = torch.triu_indices(60, 60, 1)
-        expected = admissible(points, frames, centers, others)
-        assert torch.equal(admissible(points, frames @ turn, centers, others), expected)
+        expected = compatible(points, frames, centers, others)
+        assert torch.equal(compatible(points, frames @ turn, centers, others), expected)
         assert 0 < expected.sum() < len(expected)
 
 
@@ -142,9 +142,9 @@ def test_balls_of_a_well_sampled_sphere_are_nearest_neighbours(kind):
     """K = 24 of 2000 points: the same sets nearly everywhere, in the same order."""
     points, faces = Sphere().mesh(2000)
     frames = mesh_frames(points, faces)
-    balls = GraphBalls(points, mesh_graph(faces, 2000), frames)
-    balls = cloud_balls(points) if kind == "cloud" else balls
-    index, count = balls(torch.arange(2000), 24)
+    neighborhoods = GraphNeighborhoods(points, mesh_graph(faces, 2000), frames)
+    neighborhoods = cloud_balls(points) if kind == "cloud" else neighborhoods
+    index, count = neighborhoods(torch.arange(2000), 24)
     assert (count == 24).all()
     assert (index == nearest_neighbors(points, 24)).all(1).double().mean() > 0.99
 
@@ -166,7 +166,7 @@ def test_a_point_comes_before_those_that_coincide_with_it():
     graph = mesh_graph(torch.cat([faces, torch.where(around < 20, around + 300, around)]), 320)
     frames = mesh_frames(points, faces)
     points, frames = torch.cat([points, points[:20]]), torch.cat([frames, frames[:20]])
-    index, _ = GraphBalls(points, graph, frames)(torch.arange(320), 20)
+    index, _ = GraphNeighborhoods(points, graph, frames)(torch.arange(320), 20)
     assert torch.equal(index[:, 0], torch.arange(320))
     nearest = nearest_neighbors(points, 9)
     assert torch.equal(nearest[:, 0], torch.arange(320))
@@ -178,11 +178,11 @@ def test_a_point_comes_before_those_that_coincide_with_it():
 
 def test_everything_in_a_ball_is_admissible():
     points = Ellipsoid((1.0, 1.0, 0.1)).points(800)
-    balls = cloud_balls(points)
-    index, count = balls(torch.arange(800), 30)
+    neighborhoods = cloud_balls(points)
+    index, count = neighborhoods(torch.arange(800), 30)
     row, others = real_pairs(index, count)
     apart = others != row
-    assert admissible(points, balls.frames, row[apart], others[apart]).all()
+    assert compatible(points, neighborhoods.frames, row[apart], others[apart]).all()
 
 
 def test_short_rows_are_padded_by_their_centre():
@@ -191,7 +191,7 @@ def test_short_rows_are_padded_by_their_centre():
     distance = torch.cdist(points, points)
     i, j = (distance < 1.01 * distance[distance > 0].min()).nonzero(as_tuple=True)
     graph = mesh_graph(torch.stack([i, j], 1), 24)
-    index, count = GraphBalls(points, graph, frames)(torch.tensor([0, 5, 20]), 40)
+    index, count = GraphNeighborhoods(points, graph, frames)(torch.tensor([0, 5, 20]), 40)
     assert index.shape == (3, 40)
     assert count.tolist() == [12, 12, 12]
     assert (index[:, 12:] == torch.tensor([[0], [5], [20]])).all()
@@ -200,7 +200,7 @@ def test_short_rows_are_padded_by_their_centre():
 
 def test_an_isolated_point_is_alone():
     points, frames = flat(square_grid(2))
-    index, count = GraphBalls(points, mesh_graph(torch.tensor([[0, 1]]), 4), frames)(
+    index, count = GraphNeighborhoods(points, mesh_graph(torch.tensor([[0, 1]]), 4), frames)(
         torch.tensor([3]), 5
     )
     assert count.tolist() == [1]
@@ -209,15 +209,15 @@ def test_an_isolated_point_is_alone():
 
 @pytest.mark.parametrize("size", [6, 24, 60])
 def test_no_ball_crosses_between_parallel_sheets(size):
-    """Two sheets 2h apart, n = 900 each, h = 1/√n: the plain ball of 24 mixes them, the graph ball does not."""
+    """Two sheets 2h apart, n = 900 each, h = 1/√n: the plain ball of 24 mixes them, k-hop ones do not."""
     n = 900
     step = torch.tensor([0.7548776662466927, 0.5698402909980532], dtype=torch.float64)
     sheet = (0.5 + torch.arange(n, dtype=torch.float64)[:, None] * step) % 1
     other = (sheet + 0.37) % 1
     height = torch.tensor([0.0, 2 / math.sqrt(n)]).double().repeat_interleave(n)
     points = torch.cat([torch.cat([sheet, other]), height[:, None]], 1)
-    balls = cloud_balls(points)
-    index, count = balls(torch.arange(2 * n), size)
+    neighborhoods = cloud_balls(points)
+    index, count = neighborhoods(torch.arange(2 * n), size)
     row, others = real_pairs(index, count)
     assert torch.equal(row < n, others < n)
     plain = nearest_neighbors(points, 24)
@@ -226,9 +226,9 @@ def test_no_ball_crosses_between_parallel_sheets(size):
 
 def test_balls_do_not_depend_on_the_chunk():
     points = Sphere().random_points(300)
-    balls = cloud_balls(points)
-    index, count = balls(torch.arange(300), 20)
-    one = [balls(torch.tensor([c]), 20) for c in range(0, 300, 30)]
+    neighborhoods = cloud_balls(points)
+    index, count = neighborhoods(torch.arange(300), 20)
+    one = [neighborhoods(torch.tensor([c]), 20) for c in range(0, 300, 30)]
     assert torch.equal(torch.cat([i for i, _ in one]), index[::30])
     assert torch.equal(torch.cat([c for _, c in one]), count[::30])
     assert np.isfinite(index.numpy()).all()

@@ -8,7 +8,7 @@ import torch
 from tolerances import TOLERANCE
 from torchlb.cloud.frames import cloud_frames
 from torchlb.cloud.orientation import mended_normals, nearest_pairs
-from torchlb.geometry.admission import thin_sides
+from torchlb.geometry.compatibility import thin_sides
 from torchlb.geometry.complex import consistently_wound
 from torchlb.geometry.frames import complete_frames, face_normals, normals_of_frames
 from torchlb.geometry.neighbors import nearest_neighbors

@@ -40,7 +40,7 @@ class CloudBoundaryPlan(BoundaryPlan):
     ) -> tuple[Float[Tensor, "b n"], Float[Tensor, " b"], Float[Tensor, " b"]]:
         """Vectors that leave the shape; volumes of the boundary's own Voronoi cells, and no folds."""
         own, ends = points[self.members], self.sides.shape[1] == 1
-        size = torch.full_like(own[:, 0], float(ends))  # a single point of a rim has no length
+        size = torch.full_like(own[:, 0], float(ends))  # a single point of a boundary has no length
         if self.near.shape[1] > 1:
             offset = own[self.near[:, 1:]] - own[:, None]
             valid = torch.ones_like(self.near[:, 1:], dtype=torch.bool)

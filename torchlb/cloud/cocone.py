@@ -42,8 +42,8 @@ class Cloud:
     neighbors
         (N, K), nearest points, itself first.
     reach
-        (N,), ℓ: of a triangle the circumradius is no larger than those of its corners; half if all are on the rim.
-    rim
+        (N,), ℓ: of a triangle the circumradius is no larger than those of its corners; half if all are on the boundary.
+    boundary
         (N,), points of a declared boundary.
     """
 
@@ -51,7 +51,7 @@ class Cloud:
     normals: Float[np.ndarray, "N 3"]
     neighbors: Int[np.ndarray, "N K"]
     reach: Float[np.ndarray, " N"]
-    rim: Bool[np.ndarray, " N"]
+    boundary: Bool[np.ndarray, " N"]
 
     def circles(self, faces: Faces) -> tuple[Float[np.ndarray, " F"], Float[np.ndarray, "F 3"]]:
         """Circumradii, ℓ, and unit normals of triangles."""
@@ -74,7 +74,7 @@ class Cloud:
         level = self.alignment(self.circles(faces[across])[1], faces[across]) > LEVEL
         across = across[level]
         limit[across] = widest[across]
-        return limit / np.where(smallest(self.rim.take(faces)), 2, 1)
+        return limit / np.where(smallest(self.boundary.take(faces)), 2, 1)
 
     def alignment(self, normal: Float[np.ndarray, "F 3"], faces: Faces) -> Float[np.ndarray, " F"]:
         """The least cosine between a triangle's normal and those of its corners, on either side."""
@@ -240,7 +240,7 @@ def _leaves_cone(
     return (np.abs(one) <= COCONE) | (np.abs(two) <= COCONE) | (one * two < 0)
 
 
-def wings(
+def conormals(
     points: Float[np.ndarray, "N 3"],
     tail: Int[np.ndarray, "*batch"],
     head: Int[np.ndarray, "*batch"],
@@ -261,13 +261,13 @@ def best_manifold(points: Float[np.ndarray, "N 3"], faces: Faces) -> Faces:
     """
     edges = edges_of(faces, len(points))
     tail, head = (end.reshape(-1, 3) for end in edges.ends)
-    wing = wings(points, tail, head, faces).reshape(-1, 3)
+    conormal = conormals(points, tail, head, faces).reshape(-1, 3)
     one, two = edges.twins
     contested = edges.uses > 2
-    contested[edges.of[one[inner(wing[one], wing[two]) > CREASE]]] = True
+    contested[edges.of[one[inner(conormal[one], conormal[two]) > CREASE]]] = True
     rows = np.flatnonzero(contested[edges.of].reshape(-1, 3).any(1))
     taken, halves = np.ones(len(faces), dtype=bool), np.arange(3 * len(faces)).reshape(-1, 3)[rows]
-    parts = (*wing.T, edges.of, contested[edges.of])
+    parts = (*conormal.T, edges.of, contested[edges.of])
     x, y, z, of, doubtful = (part[halves.ravel()].tolist() for part in parts)
     uses, first = [0] * len(edges.keys), [0] * len(edges.keys)
     for number, face in enumerate(rows.tolist()):

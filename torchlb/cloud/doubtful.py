@@ -20,7 +20,7 @@ from torchlb.cloud.cocone import REACH
 from torchlb.cloud.manifold import face_vectors
 from torchlb.cloud.outliers import spacing_at
 from torchlb.cloud.surface import CloudSurface
-from torchlb.geometry.admission import admissible_neighbors
+from torchlb.geometry.compatibility import admissible_neighbors
 from torchlb.geometry.complex import Faces, edges_of, pieces_of
 from torchlb.geometry.frames import complete_frames
 from torchlb.geometry.thresholds import AROUND, FACTOR, LEVEL, NEAREST, OBTUSE

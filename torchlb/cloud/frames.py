@@ -9,7 +9,7 @@ from torch.nn.functional import normalize
 
 from torchlb.fits.polynomials import monomials
 from torchlb.fits.weights import window
-from torchlb.geometry.admission import admissible_neighbors, planes_of
+from torchlb.geometry.compatibility import admissible_neighbors, planes_of
 from torchlb.geometry.frames import complete_frames
 from torchlb.geometry.vectors import dot
 from torchlb.linalg.precision import AT_ONCE, ROUNDING, TINY
@@ -20,7 +20,7 @@ def cloud_frames(
 ) -> Float[Tensor, "N n d"]:
     """Initial frames of a cloud: principal components of the nearer half of the candidates, decaying with distance.
 
-    Each further round takes the nearest that the frames before found admissible, so that the other side of a thin
+    Each further round takes the nearest that the frames before found compatible, so that the other side of a thin
     sheet drops out. Error O(h) on a smooth surface.
     """
     planes = None
@@ -64,7 +64,7 @@ def refined_normals(
     centers: Int[Tensor, " B"] | None = None,
     rounds: int = 1,
 ) -> Float[Tensor, "N 3"]:
-    """Unit normals, those of `centers` from quadratics through their admissible candidates, error O(h²); not oriented.
+    """Unit normals, those of `centers` from quadratics through their compatible candidates, error O(h²); not oriented.
 
     The quadratics need not go through the point itself, which lessens what noise does to the slope.
     """

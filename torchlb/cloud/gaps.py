@@ -8,7 +8,7 @@ from __future__ import annotations
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from torchlb.cloud.cocone import REACH, Cloud, wings
+from torchlb.cloud.cocone import REACH, Cloud, conormals
 from torchlb.cloud.manifold import boundary_loops
 from torchlb.geometry.complex import Edges, Faces, edges_of
 from torchlb.geometry.thresholds import CREASE, NEAREST, ROUGH, SLIGHT
@@ -26,8 +26,8 @@ def filled(
 ) -> Faces:
     """The faces and what extends them without folds or overlaps; the very array where there is nothing.
 
-    Triangles of the pool, or ears between two rim edges, best first, in rounds, until nothing fits; no ear has all its
-    corners on a declared boundary. If `oriented`, the faces and normals agree on which way is out, and triangles have
+    Triangles of the pool, or ears between two boundary edges, best first, in rounds, until nothing fits; no ear has all
+    its corners on a declared boundary. If `oriented`, the faces and normals agree on which way is out, and triangles have
     to agree with them. If not `strict` they may face away from the normals by nearly a right angle, and overlap what
     they share no edge with.
     """
@@ -37,14 +37,16 @@ def filled(
     away, around = faces[~near], faces[near]
     while True:
         edges = edges_of(around, count)
-        half = edges.rim[outer[edges.ends[0][edges.rim]] & outer[edges.ends[1][edges.rim]]]
+        half = edges.boundary[
+            outer[edges.ends[0][edges.boundary]] & outer[edges.ends[1][edges.boundary]]
+        ]
         free = outer.copy()
         free[around.ravel()] = False
         for end in edges.ends:
             free[end[half]] = True
         pool = pool[free[pool].all(1)]
         ears = _ears(edges, half)
-        candidates = np.concatenate([pool, ears[~cloud.rim[ears].all(1)]])
+        candidates = np.concatenate([pool, ears[~cloud.boundary[ears].all(1)]])
         new = _proposals(cloud, edges, half, candidates, oriented, ROUGH if strict else LOW)
         new = new[~overlapping(cloud, new, around)] if strict else new
         if len(new) == 0:
@@ -58,7 +60,7 @@ def filled(
 
 
 def _ears(edges: Edges, half: Int[np.ndarray, " G"]) -> Faces:
-    """Triangles of two edges of the rim that meet in a point where no others do."""
+    """Triangles of two edges of the boundary that meet in a point where no others do."""
     tail, head = (end[half] for end in edges.ends)
     here, there = np.concatenate([tail, head]), np.concatenate([head, tail])
     order = np.argsort(here, kind="stable")
@@ -76,7 +78,7 @@ def _proposals(
     oriented: bool,
     least: float,
 ) -> Faces:
-    """Those of the faces that fit to the rim's half-edges without a fold or third face, and aligned; best first."""
+    """Those of the faces that fit to half-edges of the boundary without a fold or third face, aligned; best first."""
     faces = np.unique(np.sort(faces, axis=1), axis=0)
     tail, head = np.roll(faces, -1, 1), np.roll(faces, -2, 1)
     edge, uses = edges.find(tail, head)
@@ -93,9 +95,9 @@ def _proposals(
         alignment = np.where(plus, smallest(cosine), np.where(minus, -largest(cosine), -1.0))
     else:
         alignment = smallest(np.abs(cosine))
-    wing = np.zeros((len(edges.keys), 3))
-    wing[of] = wings(cloud.points, starts, stops, edges.faces.ravel()[half])
-    folds = inner(wing.take(edge, 0), wings(cloud.points, tail, head, faces)) > CREASE
+    conormal = np.zeros((len(edges.keys), 3))
+    conormal[of] = conormals(cloud.points, starts, stops, edges.faces.ravel()[half])
+    folds = inner(conormal.take(edge, 0), conormals(cloud.points, tail, head, faces)) > CREASE
     ok = alignment > least
     ok &= radius <= cloud.limits(faces)
     ok &= ~((uses == 1) & folds).any(1)
@@ -173,7 +175,7 @@ def closed(
     for loop in boundary_loops(faces, count):
         wide = REACH * reach[loop].mean()
         places = cloud.points[loop]
-        declared = cloud.rim[loop] & cloud.rim[np.roll(loop, 1)]
+        declared = cloud.boundary[loop] & cloud.boundary[np.roll(loop, 1)]
         if declared.any() or kept[loop].any() or np.ptp(places, axis=0).max() > wide:
             continue
         if max(lengths(places - place).max() for place in places) > wide:

@@ -103,7 +103,7 @@ def boundary_loops(faces: Faces, count: int) -> list[list[int]]:
     mate[one], mate[two] = two, one
     tail, head = edges.ends
     found, seen = [], set()
-    for start in edges.rim.tolist():
+    for start in edges.boundary.tolist():
         if start in seen:
             continue
         half, at, loop = start, int(head[start]), [int(tail[start])]

@@ -9,7 +9,7 @@ from scipy.spatial import KDTree
 from torch import Tensor
 
 from torchlb.fits.polynomials import monomials, num_monomials
-from torchlb.geometry.admission import admissible_neighbors
+from torchlb.geometry.compatibility import admissible_neighbors
 from torchlb.geometry.frames import complete_frames
 from torchlb.geometry.vectors import dot
 from torchlb.linalg.precision import AT_ONCE, LOW, NEGLIGIBLE, ROUNDING
@@ -88,7 +88,7 @@ def _residuals(
     centers: Int[Tensor, " B"],
     degree: int,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Radius, number of admissible neighbours, sum of squares that polynomials through them leave, height at 0."""
+    """Radius, number of compatible neighbours, sum of squares that polynomials through them leave, height at 0."""
     index, plane = candidates[centers], planes[centers]
     offset = points[index] - points[centers, None]
     good = admissible_neighbors(points, planes, index)

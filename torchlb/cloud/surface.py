@@ -29,7 +29,7 @@ from torchlb.cloud.places import Places, in_words, places_of
 from torchlb.cloud.poles import Poles, corrected_normals
 from torchlb.cloud.stars import gaps_between, stars_in_gaps
 from torchlb.errors import InputError
-from torchlb.geometry.admission import mutually_admissible
+from torchlb.geometry.compatibility import mutually_admissible
 from torchlb.geometry.complex import Faces, components, delaunay, pieces_of
 from torchlb.geometry.frames import vertex_normals
 from torchlb.geometry.neighbors import mesh_graph, nearest_neighbors
@@ -186,13 +186,13 @@ def _start(
         points = torch.from_numpy(put_beside(points.numpy(), lone))
         candidates = nearest_neighbors(points, candidates.shape[1])
     frames, near = cloud_frames(points, candidates, 2, rounds=1), candidates.numpy()
-    rim = np.zeros(len(points), dtype=bool) if boundary is None else boundary.numpy()
+    on_boundary = np.zeros(len(points), dtype=bool) if boundary is None else boundary.numpy()
     planar = _planar_triangles(points.numpy())
     if planar is not None:
         faces, normal = planar
         up = torch.from_numpy(normal if normal[2] >= 0 else -normal).expand_as(points)
         normals, places = up if given is None else given, points.numpy()
-        cloud = Cloud(places, normals.numpy(), near, _reaches(places, near), rim)
+        cloud = Cloud(places, normals.numpy(), near, _reaches(places, near), on_boundary)
         small = cloud.small(faces)
         every = np.ones(len(small), dtype=bool)
         return _Start(
@@ -212,7 +212,7 @@ def _start(
     if given is None:
         normals = corrected_normals(points, normals, candidates, poles)
     side, two_sided = poles.sides(normals)
-    cloud = Cloud(places, normals.numpy(), near, _reaches(places, near), rim)
+    cloud = Cloud(places, normals.numpy(), near, _reaches(places, near), on_boundary)
     return _Start(cloud, tetrahedra.candidates(cloud, side), two_sided, frames, noise, lone)
 
 
@@ -326,13 +326,13 @@ def _along(cloud: Cloud, vectors: Float[np.ndarray, "N 3"]) -> Cloud:
 
 
 def _righted(cloud: Cloud, faces: Faces) -> Cloud:
-    """The cloud with the normals of its faces where its own are askew to them, on the side that these had."""
+    """The cloud with the normals of its faces where its own are misaligned to them, on the side that these had."""
     points, triangles = torch.from_numpy(cloud.points), torch.from_numpy(faces)
     of_faces = vertex_normals(points, triangles).numpy()
     cosine = (cloud.normals * of_faces).sum(1)
-    askew = (np.abs(cosine) < LEVEL) & of_faces.any(1)
-    righted = of_faces * np.where(cosine < 0, -1.0, 1.0)[:, None]
-    return replace(cloud, normals=np.where(askew[:, None], righted, cloud.normals))
+    misaligned = (np.abs(cosine) < LEVEL) & of_faces.any(1)
+    realigned = of_faces * np.where(cosine < 0, -1.0, 1.0)[:, None]
+    return replace(cloud, normals=np.where(misaligned[:, None], realigned, cloud.normals))
 
 
 def _planar_triangles(
@@ -361,7 +361,7 @@ def _contacts(cloud: Cloud, faces: Faces) -> Bool[np.ndarray, " N"]:
 
 
 def _kin(cloud: Cloud) -> tuple[np.ndarray, np.ndarray]:
-    """Pairs of points that belong together: each and its nearest admissible ones; all its nearest in a small piece."""
+    """Pairs of points that belong together: each and its nearest compatible ones; all its nearest in a small piece."""
     points, normals = torch.from_numpy(cloud.points), torch.from_numpy(cloud.normals)
     i, j, good = mutually_admissible(points, normals, torch.from_numpy(cloud.neighbors))
     near = (good & (good.cumsum(1) <= RING)).view(-1).numpy()

@@ -23,7 +23,7 @@ from torchlb.cloud.complexes import Complex
 from torchlb.cloud.frames import cloud_frames
 from torchlb.cloud.manifold import boundary_loops
 from torchlb.errors import InputError, first_few
-from torchlb.geometry.admission import mutually_admissible, planes_of
+from torchlb.geometry.compatibility import mutually_admissible, planes_of
 from torchlb.geometry.complex import Faces, delaunay, edges_of
 from torchlb.geometry.neighbors import nearest_neighbors
 from torchlb.geometry.thresholds import AROUND, FACTOR, SLIGHT

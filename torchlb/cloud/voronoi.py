@@ -16,7 +16,7 @@ from jaxtyping import Bool, Float, Int
 from scipy import sparse
 from torch import Tensor
 
-from torchlb.geometry.admission import mutually_admissible, planes_of
+from torchlb.geometry.compatibility import mutually_admissible, planes_of
 from torchlb.geometry.neighbors import adjacency
 from torchlb.geometry.thresholds import CREASE, WIDER
 from torchlb.linalg.precision import rows_at_once
@@ -141,9 +141,9 @@ def nearest_graph(
 ) -> sparse.csr_array:
     """A cloud's stand-in for the edges of a mesh, symmetric (N, N).
 
-    Each point is joined to its 2^(d+1) nearest admissible neighbours (4, 8, 16 for curves, surfaces, solids) and to
+    Each point is joined to its 2^(d+1) nearest compatible neighbours (4, 8, 16 for curves, surfaces, solids) and to
     its natural neighbours in the tangent plane, which bridge the voids of an uneven cloud. `candidates`
-    come from `nearest_neighbors`; an edge must be admissible from both its ends.
+    come from `nearest_neighbors`; an edge must be compatible from both its ends.
     """
     dim = frames.shape[-1]
     wanted = 2 ** (dim + 1)

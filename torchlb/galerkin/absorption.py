@@ -12,20 +12,20 @@ from torchlb.galerkin.pair import SparsePair, WeakPair
 from torchlb.linalg.precision import LOW
 
 
-def absorbing(pair: WeakPair, a: Float[Tensor, " N"], rim: Bool[Tensor, " N"]) -> WeakPair:
-    """The pair with R_ij = B_ij √(a_i a_j), a ≥ 0 at the vertices of the boundary `rim`; itself where R = 0.
+def absorbing(pair: WeakPair, a: Float[Tensor, " N"], at_boundary: Bool[Tensor, " N"]) -> WeakPair:
+    """The pair with R_ij = B_ij √(a_i a_j), a ≥ 0 at the vertices of the boundary `at_boundary`; itself where R = 0.
 
     R is positive semidefinite whatever a is, aB for one a, and of the order of B where a is smooth and positive. The
     linear pair has it of B lumped to its row sums, at least a tenth of the absolute ones.
     """
     whole, near = pair.matrices, pair.linear
-    if len(whole.values) < 3 or not (a[rim] > 0).any():
+    if len(whole.values) < 3 or not (a[at_boundary] > 0).any():
         return pair
     row, boundary = _rows(whole), whole.values[2]
     sums, sizes = (torch.zeros_like(a).index_add(0, row, b) for b in (boundary, boundary.abs()))
-    a = torch.where(rim, a, 0.0)
-    if bool((sizes[~rim] > 0).any()):
-        a = _continued(a, rim, near or whole)
+    a = torch.where(at_boundary, a, 0.0)
+    if bool((sizes[~at_boundary] > 0).any()):
+        a = _continued(a, at_boundary, near or whole)
     values = [*whole.values, boundary * (a[row] * a[whole.col]).sqrt()]
     if near is not None:
         row = _rows(near)
@@ -35,13 +35,13 @@ def absorbing(pair: WeakPair, a: Float[Tensor, " N"], rim: Bool[Tensor, " N"]) -
 
 
 def _continued(
-    a: Float[Tensor, " N"], rim: Bool[Tensor, " N"], pair: SparsePair
+    a: Float[Tensor, " N"], at_boundary: Bool[Tensor, " N"], pair: SparsePair
 ) -> Float[Tensor, " N"]:
     """Inside, where fits along the boundary of a solid and coarse triangles reach: means over neighbours, ring by ring.
 
     What they are of another continuation changes eigenvalues of a cube of 2,000 points by 5e-6.
     """
-    row, known = _rows(pair), rim
+    row, known = _rows(pair), at_boundary
     while True:
         near = known[pair.col]
         count, total = (

@@ -13,6 +13,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from torchlb.galerkin.boundary_curves import BoundaryCurvesPlan, boundary_curves_plan
 from torchlb.galerkin.curving import (
     BoundaryNodes,
     BoundaryNodesPlan,
@@ -23,12 +24,11 @@ from torchlb.galerkin.curving import (
 from torchlb.galerkin.elements import inner, subsets
 from torchlb.galerkin.nodes import Nodes, lagrange_nodes
 from torchlb.galerkin.prolongation import prolongation
-from torchlb.galerkin.rim import RimPlan, rim_plan
 from torchlb.geometry.boundary import boundary_creases, outer_faces
 from torchlb.geometry.fit_search import FitSearch
 from torchlb.geometry.frames import mesh_frames
 from torchlb.geometry.local_fits import FitPlan, LocalFits
-from torchlb.geometry.neighbors import GraphBalls, mesh_graph
+from torchlb.geometry.neighbors import GraphNeighborhoods, mesh_graph
 
 
 def boundary_nodes(
@@ -53,7 +53,7 @@ def boundary_nodes(
     if nodes.dim == 2:
         # the curve through as many vertices on either side, two more than a polynomial of that degree needs
         width = 2 * (nodes.degree // 2 + 2)
-        return OnCurves(nodes, outer, rim_plan(points, nodes.edges[outer], width))
+        return OnCurves(nodes, outer, boundary_curves_plan(points, nodes.edges[outer], width))
     faithful = tuple(degree for degree in degrees if degree > 2) or (3,)  # creases stay flat
     return OnSurface.of(points, nodes, faithful, held)
 
@@ -81,22 +81,22 @@ class OnCurves:
     ----------
     nodes
         Of the triangles.
-    rim
+    outer
         (G,), the edges along the boundary.
     curves
         Through which vertices.
     """
 
     nodes: Nodes
-    rim: Int[Tensor, " G"]
-    curves: RimPlan
+    outer: Int[Tensor, " G"]
+    curves: BoundaryCurvesPlan
 
     def at(self, points: Float[Tensor, "N n"]) -> BoundaryNodes:
         """Their places and values."""
-        nodes, rim, curves = self.nodes, self.rim, self.curves.at(points)
+        nodes, outer, curves = self.nodes, self.outer, self.curves.at(points)
         within, on_edge = inner(3, nodes.degree), nodes.degree - 1
-        steps = inner(2, nodes.degree)[:, 1].to(points).expand(len(rim), -1)
-        ends = points[nodes.edges[rim]]
+        steps = inner(2, nodes.degree)[:, 1].to(points).expand(len(outer), -1)
+        ends = points[nodes.edges[outer]]
 
         def bulge(edges: Tensor, share: Tensor) -> Tensor:
             weights = curves.over(edges).weights(share)
@@ -104,12 +104,12 @@ class OnCurves:
             chord = ends[edges, None, 0] + share[..., None] * chord[:, None]
             return (weights[..., None] * points[curves.index[edges]][:, None]).sum(2) - chord
 
-        every = torch.arange(len(rim))
-        place = rim[:, None] * on_edge + torch.arange(on_edge)
+        every = torch.arange(len(outer))
+        place = outer[:, None] * on_edge + torch.arange(on_edge)
         moved = points.new_zeros(len(nodes.shares), points.shape[1])
         moved[place] = bulge(every, steps)
         number = torch.full((len(nodes.edges),), -1)
-        number[rim] = every
+        number[outer] = every
         for side, (i, j) in enumerate(subsets(2, 2)):
             face = (number[nodes.edge[:, side]] >= 0).nonzero()[:, 0]
             if len(face) == 0 or len(within) == 0:
@@ -166,8 +166,10 @@ class OnSurface:
         outer = (facets.uses == 1).nonzero()[:, 0]
         vertices, cells = torch.unique(outer_faces(points, nodes.cells), return_inverse=True)
         places, count = points[vertices], len(vertices)
-        balls = GraphBalls(places, mesh_graph(cells, count), mesh_frames(places, cells))
-        plan, fits = FitSearch(balls, 0, degrees).finish()
+        neighborhoods = GraphNeighborhoods(
+            places, mesh_graph(cells, count), mesh_frames(places, cells)
+        )
+        plan, fits = FitSearch(neighborhoods, 0, degrees).finish()
         plan = plan.flattened(boundary_creases(points, nodes.cells)[vertices])
         own = lagrange_nodes(cells, count, nodes.degree)
         curving, _ = curve(places, plan, fits, own, WithoutBoundary(len(own.shares)))

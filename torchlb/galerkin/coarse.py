@@ -27,9 +27,9 @@ def with_area(points: Float[Tensor, "N n"], faces: Int[Tensor, "F 3"]) -> Bool[T
     low = spare < 2 * SINGLE**2 * longest  # the height is at most √(spare · longest / 2)
     while low.any():
         found = edges_of(faces[kept].numpy(), count)
-        rim = torch.zeros(len(faces), 3, dtype=torch.bool)
-        rim[kept] = torch.from_numpy(np.asarray(found.uses)[found.of] == 1).view(-1, 3)
-        out = low & kept & (rim.sum(1) == 1) & rim[torch.arange(len(faces)), place]
+        on_boundary = torch.zeros(len(faces), 3, dtype=torch.bool)
+        on_boundary[kept] = torch.from_numpy(np.asarray(found.uses)[found.of] == 1).view(-1, 3)
+        out = low & kept & (on_boundary.sum(1) == 1) & on_boundary[torch.arange(len(faces)), place]
         left = torch.bincount(faces[kept & ~out].flatten(), minlength=count)
         out &= (left[faces] > 0).all(1)
         if not out.any():
@@ -75,9 +75,9 @@ def _without_inside(points: Tensor, nodes: Nodes, fits: FitPlan) -> Bool[Tensor,
         kinked = torch.zeros_like(bound)
         kinked[pairs[turn < KINK].flatten()] = True
         bound |= kinked & (fits.reason == IN_ROWS)
-    rim = torch.zeros_like(bound)
-    rim[nodes.edges[nodes.sides[2].uses != 2].flatten()] = True
-    bound |= rim & (_around(nodes, (~bound & ~rim).long()) == 0)
+    on_boundary = torch.zeros_like(bound)
+    on_boundary[nodes.edges[nodes.sides[2].uses != 2].flatten()] = True
+    bound |= on_boundary & (_around(nodes, (~bound & ~on_boundary).long()) == 0)
     around = _around(nodes, torch.where(bound, 1, -FACTOR))
     return (around > 0)[nodes.cells].all(1) | lone[nodes.cells].all(1)
 

@@ -215,7 +215,7 @@ def assembled_pair(
     """
     forms = plan.forms(fits, mesh)
     near, flat, p = forms.near(), forms.flat(), forms.prolongation
-    rim = boundary_mass(fits.points, plan.curving, mesh, p)
+    boundary = boundary_mass(fits.points, plan.curving, mesh, p)
     blocks, nodes = [forms.blocks()], forms.nodes
     del forms, mesh  # some of what is here is as large as the pair, and is let go of in time
     fits.let_go()
@@ -229,7 +229,7 @@ def assembled_pair(
     for name, matrix in {"linear": near, "matrices": upper}.items():
         if name not in patterns or not patterns[name].is_of(matrix):
             patterns[name] = Pattern.of(matrix, numbering)
-        more = () if rim is None or matrix is near else (rim,)
+        more = () if boundary is None or matrix is near else (boundary,)
         found[name] = patterns[name].pair(matrix, *more)
     return WeakPair(**found, mass=torch.from_numpy(mass + beside)), lowered
 

@@ -20,7 +20,7 @@ from torch import Tensor
 from torchlb.geometry.fit_search import FitSearch
 from torchlb.geometry.frames import mesh_frames, normals_of_frames
 from torchlb.geometry.local_fits import FitPlan, LocalFits
-from torchlb.geometry.neighbors import GraphBalls, mesh_graph
+from torchlb.geometry.neighbors import GraphNeighborhoods, mesh_graph
 from torchlb.geometry.thresholds import CREASE, KINK
 
 
@@ -104,7 +104,9 @@ class BoundaryPlan:
         self, points: Float[Tensor, "N n"], graph: sparse.csr_array, degree: int
     ) -> BoundaryPlan:
         """The same with fits of the boundary's tangents, of this degree or lower ones."""
-        search = FitSearch(GraphBalls(points[self.members], graph, self.initial(points)), degree)
+        search = FitSearch(
+            GraphNeighborhoods(points[self.members], graph, self.initial(points)), degree
+        )
         search.refine(torch.arange(len(self.members)))
         return replace(self, fits=search.finish()[0])
 

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from torchlb.fits.polynomials import num_monomials
 from torchlb.fits.rules import SIZE_FACTORS
-from torchlb.geometry.neighbors import GraphBalls
+from torchlb.geometry.neighbors import GraphNeighborhoods
 from torchlb.linalg.precision import rows_at_once
 
 
@@ -105,12 +105,12 @@ class Search:
 
     def __init__(
         self,
-        balls: GraphBalls,
+        neighborhoods: GraphNeighborhoods,
         centers: Int[Tensor, " B"],
         candidates: Sequence[Candidate],
         start: Int[Tensor, " B"] | None = None,
     ) -> None:
-        self.balls, self.centers, self.candidates = balls, centers, candidates
+        self.neighborhoods, self.centers, self.candidates = neighborhoods, centers, candidates
         self._next = torch.zeros_like(centers) if start is None else start.clone()
 
     def settle(self, rows: Int[Tensor, " b"]) -> None:
@@ -123,8 +123,8 @@ class Search:
         self._next[rows] = sum(other.degree >= degree for other in self.candidates)
 
     def __iter__(self) -> Iterator[tuple[int, Int[Tensor, " b"], Int[Tensor, "b K"]]]:
-        """Candidates that somebody can try; balls are gathered small at first, since most rows settle early."""
-        pending, dim = torch.arange(len(self.centers)), self.balls.frames.shape[-1]
+        """Candidates that somebody can try; neighborhoods are gathered small at first, since most rows settle early."""
+        pending, dim = torch.arange(len(self.centers)), self.neighborhoods.frames.shape[-1]
         held = 0
         index = count = torch.empty(0)
         for number, candidate in enumerate(self.candidates):
@@ -138,7 +138,7 @@ class Search:
             if candidate.size > held:
                 within = [c.size for c in self.candidates if c.size <= 2 * candidate.size]
                 held = candidate.size if held == 0 else max(within)
-                index, count = self.balls(self.centers[pending], held)
+                index, count = self.neighborhoods(self.centers[pending], held)
             tried = (eligible & (count >= candidate.size)).nonzero()[:, 0]
             entry = candidate.size * num_monomials(dim, candidate.degree)
             for piece in tried.split(rows_at_once(entry)):

@@ -74,7 +74,7 @@ class Edges:
         return np.roll(self.faces, -1, 1).ravel(), np.roll(self.faces, -2, 1).ravel()
 
     @cached_property
-    def rim(self) -> Int[np.ndarray, " G"]:
+    def boundary(self) -> Int[np.ndarray, " G"]:
         """Half-edges of edges that have one face."""
         return np.flatnonzero(self.uses[self.of] == 1)
 
@@ -86,11 +86,11 @@ class Edges:
 
     @cached_property
     def outer(self) -> Bool[np.ndarray, " N"]:
-        """Which points lie on the rim or in no face."""
+        """Which points lie on the boundary or in no face."""
         result = np.ones(self.count, dtype=bool)
         result[self.faces.ravel()] = False
         for end in self.ends:
-            result[end[self.rim]] = True
+            result[end[self.boundary]] = True
         return result
 
     def find(

@@ -12,7 +12,7 @@ from torchlb.fits.polynomials import num_monomials
 from torchlb.fits.weights import CenteredFit
 from torchlb.geometry.candidates import Search, list_candidates
 from torchlb.geometry.local_fits import FitPlan, LocalFits, Neighborhoods, slope_of
-from torchlb.geometry.neighbors import GraphBalls
+from torchlb.geometry.neighbors import GraphNeighborhoods
 from torchlb.geometry.thresholds import CREASE, ROUGH, SLIGHT, WIDER
 from torchlb.geometry.vectors import at
 from torchlb.linalg.precision import AT_ONCE, NEGLIGIBLE, rows_at_once
@@ -21,14 +21,14 @@ MAX_LEBESGUE = 10.0
 """Largest Lebesgue constant of a fit in the middles of the edges of its point; below 2 of good ones."""
 REASONS = (
     "reached",
-    "too few admissible neighbours",
+    "too few compatible neighbours",
     "neighbours too close to a line or conic",
     "points do not resolve the surface",
 )
 IN_ROWS = REASONS.index("neighbours too close to a line or conic")
 
 
-class _Pile:
+class _Buffer:
     """Rows of several tensors, in large pieces, of which only what is filled takes memory.
 
     Thousands of arrays that stay, between those that come and go, would scatter the memory.
@@ -65,7 +65,7 @@ class FitSearch:
 
     Parameters
     ----------
-    balls
+    neighborhoods
         Neighbourhoods, and the frames that the fits are over.
     frame_degree
         q of the tangent planes; 0 leaves them alone.
@@ -77,32 +77,32 @@ class FitSearch:
 
     def __init__(
         self,
-        balls: GraphBalls,
+        neighborhoods: GraphNeighborhoods,
         frame_degree: int = 0,
         degrees: tuple[int, ...] = (),
         num_neighbors: int | None = None,
     ) -> None:
-        count, self.balls, self.degrees = len(balls.points), balls, degrees
+        count, self.neighborhoods, self.degrees = len(neighborhoods.points), neighborhoods, degrees
         self.candidates = list_candidates(
-            balls.dim, range(frame_degree, 0, -1), num_neighbors=num_neighbors
+            neighborhoods.dim, range(frame_degree, 0, -1), num_neighbors=num_neighbors
         )
         self.highest = max(frame_degree, *degrees, 0) if degrees else 0
         self.jet, self.reach = (1, 0.5) if max(degrees, default=0) <= 3 else (degrees[0], 1.0)
-        self.fits = LocalFits(balls.points, balls.frames, self.highest)
+        self.fits = LocalFits(neighborhoods.points, neighborhoods.frames, self.highest)
         self.order, self.degree, self.surface_degree, self.size, self.tried, self.owner = (
             torch.zeros(6, count, dtype=torch.int64)
         )
         self.reason, self._takings = torch.ones_like(self.order), 0
-        self._surface: dict[int, dict[int, _Pile]] = {}
-        self._functions: dict[int, dict[int, _Pile]] = {}
+        self._surface: dict[int, dict[int, _Buffer]] = {}
+        self._functions: dict[int, dict[int, _Buffer]] = {}
 
     def refine(self, centers: Int[Tensor, " B"]) -> None:
         """Find tangent planes at `centers`; fits of functions try the neighbourhoods that are looked at anyway.
 
         Each centre takes the first candidate whose fit is regular, and has a tilt below 60°.
         """
-        middles = self.balls.middles(centers)
-        search = Search(self.balls, centers, self.candidates)
+        middles = self.neighborhoods.middles(centers)
+        search = Search(self.neighborhoods, centers, self.candidates)
         steepest = 1 / CREASE**2 - 1  # |∇H|² of a tilt of 60°, bounded by the Frobenius norm
         for number, rows, index in search:
             block = _block(self.candidates[number].degree, centers[rows], index)
@@ -121,28 +121,28 @@ class FitSearch:
 
         Vertices without a fit of functions have tried the degrees, with more neighbours in turn, or with all of few.
         """
-        dim = self.balls.dim
+        dim = self.neighborhoods.dim
         for degree in self.degrees:
             sizes = list_candidates(dim, [degree])
             for vertices in (self.degree == 0).nonzero()[:, 0].split(AT_ONCE):
                 start = self.tried[vertices] if degree == self.degrees[0] else None
-                search = Search(self.balls, vertices, sizes, start)
+                search = Search(self.neighborhoods, vertices, sizes, start)
                 for _, rows, index in search:
                     search.settle(rows[self._try(_block(degree, vertices[rows], index))])
                 vertices = vertices[self.degree[vertices] == 0]
                 least, few = 1 + ceil(WIDER * (num_monomials(dim, degree) - 1)), sizes[0].size
-                index, count = self.balls(vertices, few)
+                index, count = self.neighborhoods(vertices, few)
                 some = (count >= least) & (count < few)
                 keep = torch.arange(1, few) < count[some, None]
                 self._try(_block(degree, vertices[some], index[some], keep))
         surface, functions = [], []
-        for degree, piles in self._surface.items():
-            for rows in (rows for pile in piles.values() for rows in pile.rows()):
+        for degree, buffers in self._surface.items():
+            for rows in (rows for buffer in buffers.values() for rows in buffer.rows()):
                 *block, owner = rows
                 block[-1] &= self.owner[block[0]] == owner
                 surface.append(_kept(degree, block, block[-1] | block[-2]))
-        for degree, piles in self._functions.items():
-            for rows in (rows for pile in piles.values() for rows in pile.rows()):
+        for degree, buffers in self._functions.items():
+            for rows in (rows for buffer in buffers.values() for rows in buffer.rows()):
                 *block, coefficients = rows
                 functions.append(Neighborhoods(degree, *(column.clone() for column in block)))
                 self.fits.coefficients.append(coefficients)
@@ -154,7 +154,7 @@ class FitSearch:
         self, block: Neighborhoods, fit: CenteredFit, heights: Tensor, graph: Tensor
     ) -> None:
         """Try the nearest points of the neighbourhoods first for functions, by the same fit if it is that."""
-        first = list_candidates(self.balls.dim, self.degrees)[0]
+        first = list_candidates(self.neighborhoods.dim, self.degrees)[0]
         size = block.points.shape[1]
         if size < first.size:
             return
@@ -175,8 +175,8 @@ class FitSearch:
     ) -> Bool[Tensor, " b"]:
         """Keep the fits of functions that pass; which do."""
         degree = min(block.degree, self.jet)
-        terms = num_monomials(self.balls.dim, degree) - 1
-        regular = is_regular(fit, self.balls.middles(block.vertices), degree)
+        terms = num_monomials(self.neighborhoods.dim, degree) - 1
+        regular = is_regular(fit, self.neighborhoods.middles(block.vertices), degree)
         good = self._keep_surface(block, fit, heights, graph, regular, torch.zeros_like(regular))
         if good.any():
             found, size = block.vertices[good], block.points.shape[1]
@@ -223,9 +223,9 @@ class FitSearch:
             self._pile(self._surface, block).add(*(at(column, rows) for column in columns), owner)
         return good
 
-    def _pile(self, piles: dict[int, dict[int, _Pile]], block: Neighborhoods) -> _Pile:
-        of_degree = piles.setdefault(block.degree, {})
-        return of_degree.setdefault(block.points.shape[1], _Pile(len(self.order)))
+    def _pile(self, buffers: dict[int, dict[int, _Buffer]], block: Neighborhoods) -> _Buffer:
+        of_degree = buffers.setdefault(block.degree, {})
+        return of_degree.setdefault(block.points.shape[1], _Buffer(len(self.order)))
 
 
 def _block(

@@ -1,9 +1,9 @@
 """Neighbourhoods: who may enter a point's stencil, and in which order (`method.md`, section 4).
 
 A plain ball of the nearest points mixes the two sides of a thin sheet, whose tangent planes agree. So a stencil is
-drawn from a *graph ball*: walk the edges of a mesh, or of the graph of each point's few nearest admissible neighbours
-on a cloud, and step only on points that are admissible from the centre. The `size` nearest of what was reached are the
-pool, ordered by distance. A path across a crease is cut there, where the tangent planes turn away.
+drawn from a *k-hop neighbourhood*: walk the edges of a mesh, or of the graph of each point's few nearest compatible
+neighbours on a cloud, and step only on points that are compatible from the centre. The `size` nearest of what was
+reached are the pool, ordered by distance. A path across a crease is cut there, where the tangent planes turn away.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from scipy import sparse
 from scipy.spatial import KDTree
 from torch import Tensor
 
-from torchlb.geometry.admission import (
+from torchlb.geometry.compatibility import (
     normal_frames,
 )
 from torchlb.geometry.thresholds import AROUND, CREASE, HALF_CREASE, WIDER
@@ -107,8 +107,8 @@ class _Level:
         self.place[centers] = torch.arange(first, self.held, dtype=torch.int32)
 
 
-class GraphBalls:
-    """The nearest points of a graph ball, for any chunk of centres. What has been found is kept.
+class GraphNeighborhoods:
+    """The nearest points of a k-hop neighbourhood, for any chunk of centres. What has been found is kept.
 
     Parameters
     ----------
@@ -117,7 +117,7 @@ class GraphBalls:
     graph
         (N, N) symmetric adjacency, from `mesh_graph` or `nearest_graph`.
     frames
-        (N, n, d) tangent frames that decide admission.
+        (N, n, d) tangent frames that decide compatibility.
     sides
         (N, n) from `thin_sides`: also refused is a point on the other side of a thin shape. None if not known.
     """
@@ -142,11 +142,11 @@ class GraphBalls:
 
     def with_frames(
         self, frames: Float[Tensor, "N n d"], sides: Float[Tensor, "N n"] | None
-    ) -> GraphBalls:
-        """The same balls for slightly other frames; those not found yet are admitted by the new ones."""
-        balls = GraphBalls(self.points, self.graph, frames, sides)
-        balls._kept = self._kept
-        return balls
+    ) -> GraphNeighborhoods:
+        """The same neighborhoods for slightly other frames; those not found yet are admitted by the new ones."""
+        neighborhoods = GraphNeighborhoods(self.points, self.graph, frames, sides)
+        neighborhoods._kept = self._kept
+        return neighborhoods
 
     @cached_property
     def _arrays(self) -> dict[str, np.ndarray]:
@@ -170,7 +170,7 @@ class GraphBalls:
     def __call__(
         self, centers: Int[Tensor, " B"], size: int
     ) -> tuple[Int[Tensor, "B K"], Int[Tensor, " B"]]:
-        """The `size` nearest admissible points of each centre, itself first.
+        """The `size` nearest compatible points of each centre, itself first.
 
         Returns
         -------
@@ -192,14 +192,14 @@ class GraphBalls:
     def _grown(
         self, centers: Int[Tensor, " B"], size: int
     ) -> tuple[Int[Tensor, "B K"], Int[Tensor, " B"]]:
-        """The balls, and how many points they hold.
+        """The neighborhoods, and how many points they hold.
 
         A round ball has about half as many rings as they have at most: what grows along a strip alone is none.
         """
         from torchlb.linalg import kernels
 
         wanted = WIDER * size
-        index, count = kernels.graph_balls(
+        index, count = kernels.k_hop_neighborhoods(
             **self._arrays,
             centers=centers.numpy(),
             size=size,

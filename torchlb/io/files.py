@@ -118,14 +118,18 @@ def _sewn(vertices: Float[Tensor, "N 3"], faces: Int[Tensor, "F 3"]) -> tuple[Te
     faces = number[faces]
     found = edges_of(proper_faces(faces).numpy(), len(vertices))
     edges = torch.from_numpy(np.stack(np.divmod(found.keys, len(vertices)), 1))
-    rim = torch.unique(edges[found.uses == 1])
-    if len(rim) == 0:
+    open_vertices = torch.unique(edges[found.uses == 1])
+    if len(open_vertices) == 0:
         return vertices, faces
-    place = torch.full((len(vertices),), -1).index_put((rim,), torch.arange(len(rim)))
+    place = torch.full((len(vertices),), -1).index_put(
+        (open_vertices,), torch.arange(len(open_vertices))
+    )
     between = place[edges]
     reach = STEPS * torch.finfo(torch.float32).eps * float(vertices.abs().max())
     one = torch.arange(len(vertices))
-    one[rim] = rim[merged(vertices[rim], reach, between[(between >= 0).all(1)])]
+    one[open_vertices] = open_vertices[
+        merged(vertices[open_vertices], reach, between[(between >= 0).all(1)])
+    ]
     kept, number = torch.unique(one, return_inverse=True)
     return vertices[kept], number[faces]
 

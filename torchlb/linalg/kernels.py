@@ -142,7 +142,7 @@ def _distance(
     alignment: float,
     room: np.ndarray,
 ) -> float:
-    """Square of the distance, ℓ², or −1 where `geometry.admission.admissible` refuses the other.
+    """Square of the distance, ℓ², or −1 where `geometry.compatibility.compatible` refuses the other.
 
     C = AᵀB of the frames A, B of the normal spaces has those angles that the tangent spaces have; and σ_min(C) is as
     large as the alignment a if CᵀC − a²I = LDLᵀ with D > 0. There is `room` for C and CᵀC.
@@ -201,7 +201,7 @@ def _nearest_first(square: np.ndarray, ball: np.ndarray, total: int, size: int) 
     return kept
 
 
-def graph_balls(
+def k_hop_neighborhoods(
     points: np.ndarray,
     normals: np.ndarray,
     sides: np.ndarray,
@@ -214,7 +214,7 @@ def graph_balls(
     slope: float,
     alignment: float,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """The `size` nearest points of each graph ball, padded by the centre, and how many are real.
+    """The `size` nearest points of each k-hop neighbourhood, padded by the centre, and how many are real.
 
     Parameters
     ----------
@@ -230,14 +230,14 @@ def graph_balls(
     wanted, rings
         A ball grows ring by ring until it holds so many points, or is so many rings wide.
     slope, alignment
-        Bounds of `admissible`.
+        Bounds of `compatible`.
     """
     num_points, _, m = normals.shape
     index, count = np.empty((len(centers), size), np.int32), np.empty(len(centers), np.int32)
     seen, ball = np.zeros((2, num_points), np.int32)
     room = seen, ball, np.empty(num_points), np.empty((2, m, m))
     inputs = points, normals, sides, indptr, indices, centers
-    _graph_balls(*inputs, wanted, rings, slope, alignment, *room, index, count)
+    _k_hop_neighborhoods(*inputs, wanted, rings, slope, alignment, *room, index, count)
     return index, count
 
 
@@ -246,7 +246,7 @@ def graph_balls(
     "float64, float64, int32[::1], int32[::1], float64[::1], float64[:, :, ::1], int32[:, ::1], int32[::1])"
 )
 @no_type_check
-def _graph_balls(
+def _k_hop_neighborhoods(
     points: np.ndarray,
     normals: np.ndarray,
     sides: np.ndarray,

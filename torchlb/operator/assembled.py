@@ -73,9 +73,9 @@ class AssembledOperator:
         share = None if condition is None else condition.share
         if self.pair is None or self.on_boundary is None or share is None:
             return self.pair
-        rim = torch.zeros_like(self.on_boundary)
-        rim[boundary_faces(self.faces).flatten()] = True
-        return absorbing(self.pair, share * self.on_boundary.to(self.points), rim)
+        at_boundary = torch.zeros_like(self.on_boundary)
+        at_boundary[boundary_faces(self.faces).flatten()] = True
+        return absorbing(self.pair, share * self.on_boundary.to(self.points), at_boundary)
 
     def restored(
         self, numbering: Numbering, points: Float[Tensor, "N n"], faces: Int[Tensor, "F v"]

@@ -178,13 +178,13 @@ def build_cotangent(vertices: ArrayLike, faces: ArrayLike) -> AssembledOperator:
 def _warn_of_long_triangles(vertices: Float[Tensor, "N n"], faces: Int[Tensor, "F 3"]) -> None:
     """A warning where much of the boundary is that of triangles that lie along it."""
     nodes = lagrange_nodes(faces, len(vertices), 2)
-    rim = nodes.sides[2].uses == 1
-    of = torch.zeros_like(rim)
-    of[nodes.edge[lying_triangles(vertices, nodes, rim)].flatten()] = True
+    outer = nodes.sides[2].uses == 1
+    of = torch.zeros_like(outer)
+    of[nodes.edge[lying_triangles(vertices, nodes, outer)].flatten()] = True
     length = (vertices[nodes.edges[:, 0]] - vertices[nodes.edges[:, 1]]).norm(dim=1)
-    long, whole = length[of & rim].sum(), length[rim].sum()
+    long, whole = length[of & outer].sum(), length[outer].sum()
     if long > LOW * whole:
-        ends = nodes.edges[of & rim].unique()
+        ends = nodes.edges[of & outer].unique()
         warn(
             f"cotangent operator: {long / whole:.0%} of the boundary ({first_few(ends)}) has long triangles along it, "
             "which tie the vertices there to straight lines, and eigenvalues may be far too large; "

@@ -26,11 +26,11 @@ from torchlb.operator.batching import (
 from torchlb.operator.build_cloud import Reconstruction, build_cloud, built_again
 from torchlb.operator.inputs import ArrayLike, check_points, float_type, warn_of_gradients
 from torchlb.operator.options import Options
+from torchlb.operator.pair_methods import MatrixName, PairMethods
 from torchlb.operator.parts import Modes, PairMatrices
 from torchlb.operator.plan import Plan, evaluate
-from torchlb.operator.stencil_face import StencilFace
+from torchlb.operator.stencil_methods import StencilMethods
 from torchlb.operator.storage import FIT_FIELDS, ROW_FIELDS
-from torchlb.operator.weak_face import MatrixName, WeakFace
 from torchlb.spectral.eigenbasis import (
     stack_eigenbases,
     unstack_eigenbases,
@@ -38,7 +38,7 @@ from torchlb.spectral.eigenbasis import (
 from torchlb.stencils.conditions import Condition, ConditionName
 
 
-class LaplaceBeltrami(StencilFace, WeakFace):
+class LaplaceBeltrami(StencilMethods, PairMethods):
     """The Laplace–Beltrami operator Δ of a surface (or any manifold in Rⁿ) as a sparse matrix.
 
     Build it with `from_points`, `from_mesh` or `from_cotangent`; ``LaplaceBeltrami()`` alone is empty and takes any

@@ -98,7 +98,7 @@ def evaluate(plan: Plan, points: Float[Tensor, "N n"]) -> AssembledOperator:
         shape = Shape(
             **vars(placed),
             normal_order=plan.shape.fits.order,
-            balls=None,
+            neighborhoods=None,
             areas=pair.mass,
             low_order=MeshLowOrder(fits.points, plan.shape.cells, plan.flips, plan.shape.shares),
             condition=options.held(plan.numbering) or Condition(),

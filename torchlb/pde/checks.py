@@ -12,7 +12,7 @@ from torch import Tensor
 from torchlb.errors import InputError
 from torchlb.linalg.checks import check_finite, check_operator, check_tensor
 from torchlb.operator.laplace_beltrami import LaplaceBeltrami
-from torchlb.operator.weak_face import check_pair
+from torchlb.operator.pair_methods import check_pair
 
 P = ParamSpec("P")
 T = TypeVar("T")

@@ -21,7 +21,7 @@ from torchlb.operator.parts import OperatorCache, PairMatrices
 
 
 @dataclass(frozen=True, eq=False)
-class Conducting:
+class WithConductivity:
     """(K(κ), M) of an operator, with what its condition adds to K, and the derivatives of K in κ."""
 
     lb: LaplaceBeltrami
@@ -66,7 +66,7 @@ def elements_of(lb: LaplaceBeltrami) -> Forms:
     return lb.cache.elements
 
 
-def conducting(lb: LaplaceBeltrami, conductivity: Tensor) -> Conducting:
+def with_conductivity(lb: LaplaceBeltrami, conductivity: Tensor) -> WithConductivity:
     """The operator with the stiffness of div κ∇, κ > 0 of the vertices (N,) or of the faces (F,).
 
     Raises
@@ -92,7 +92,7 @@ def conducting(lb: LaplaceBeltrami, conductivity: Tensor) -> Conducting:
     linear = _with_rest(lb.weak.linear, forms.near(values)) if lb.weak.linear.num_rows else None
     whole = _with_rest(lb.weak, forms.matrix(values))
     weak = PairMatrices(whole.crow, whole.col, whole.values, linear)
-    return Conducting(lb, forms, weak, OperatorCache(weak.values))
+    return WithConductivity(lb, forms, weak, OperatorCache(weak.values))
 
 
 def _with_rest(pair: Csr, matrix: Any) -> Csr:

@@ -20,7 +20,7 @@ from torchlb.linalg.precision import ROOT_EPS
 from torchlb.linalg.sparse import compute_dtype
 from torchlb.operator.checks import check_tolerance
 from torchlb.operator.laplace_beltrami import LaplaceBeltrami
-from torchlb.operator.weak_face import check_pair
+from torchlb.operator.pair_methods import check_pair
 from torchlb.pde.checks import as_columns, as_times, check_choice
 from torchlb.pde.pair_flow import pair_flow
 from torchlb.spectral.eigenbasis import Eigenbasis

@@ -15,9 +15,9 @@ from torchlb.linalg.precision import SINGLE
 from torchlb.linalg.sparse import compute_dtype, symmetric_product
 from torchlb.operator.checks import check_tolerance
 from torchlb.operator.laplace_beltrami import LaplaceBeltrami
-from torchlb.operator.weak_face import check_pair
+from torchlb.operator.pair_methods import check_pair
 from torchlb.pde.checks import as_columns, as_times, uncompiled
-from torchlb.pde.conduction import Conducting, conducting
+from torchlb.pde.conduction import WithConductivity, with_conductivity
 from torchlb.pde.systems import solve_columns
 
 TOLERANCE = 1e-10
@@ -74,11 +74,11 @@ def implicit_step(
     x = as_columns(f, lb)
     dtype = torch.float64 if tolerance < SINGLE else compute_dtype(x, lb.mass)
     columns, time = _columns(x, as_times(t, x, torch.float64), dtype)
-    given, poured = (_data(lb, d, n, f) for d, n in ((boundary_values, 0), (flux, 1)))
-    medium = lb if conductivity is None else conducting(lb, conductivity)
+    given, fluxes = (_data(lb, d, n, f) for d, n in ((boundary_values, 0), (flux, 1)))
+    medium = lb if conductivity is None else with_conductivity(lb, conductivity)
     right = _product(lb, 1, columns)
-    if poured is not None:
-        right = right + time * lb.product("boundary_mass", poured)
+    if fluxes is not None:
+        right = right + time * lb.product("boundary_mass", fluxes)
     if given is not None:
         right = right - _product(lb, 1, given) - time * _product(medium, 0, given)
     u = _solve(right, time, conductivity, given, medium, tolerance)
@@ -113,11 +113,11 @@ def poisson_solve(
     check_tolerance(tolerance)
     x = as_columns(f, lb)
     columns, _ = _columns(x, None)
-    given, poured = (_data(lb, d, n, f) for d, n in ((boundary_values, 0), (flux, 1)))
-    medium = lb if conductivity is None else conducting(lb, conductivity)
+    given, fluxes = (_data(lb, d, n, f) for d, n in ((boundary_values, 0), (flux, 1)))
+    medium = lb if conductivity is None else with_conductivity(lb, conductivity)
     right = _product(lb, 1, columns)
-    if poured is not None:
-        right = right + lb.product("boundary_mass", poured)
+    if fluxes is not None:
+        right = right + lb.product("boundary_mass", fluxes)
     if given is not None:
         right = right - _product(medium, 0, given)
     u = _solve(right, None, conductivity, given, medium, tolerance)
@@ -187,7 +187,7 @@ def _data(lb: LaplaceBeltrami, data: Tensor | float | None, kind: int, f: Tensor
         return None
     name = ("boundary_values", "flux")[kind]
     fixed = torch.zeros_like(lb.mass, dtype=torch.bool) if lb.fixed is None else lb.fixed
-    counts = _poured(lb, ~fixed) if kind == 1 else fixed
+    counts = _reached_by_flux(lb, ~fixed) if kind == 1 else fixed
     if not bool(counts.any()):
         raise InputError(f"{name}: {_missing(lb, kind)}")
     values = torch.as_tensor(data, dtype=torch.float64, device=f.device)
@@ -204,7 +204,7 @@ def _data(lb: LaplaceBeltrami, data: Tensor | float | None, kind: int, f: Tensor
     return columns
 
 
-def _poured(lb: LaplaceBeltrami, free: Tensor) -> Tensor:
+def _reached_by_flux(lb: LaplaceBeltrami, free: Tensor) -> Tensor:
     """(N,), points of the boundary whose flux comes to a free point."""
     if len(lb.weak.values) < 3:
         return torch.zeros_like(free)
@@ -221,7 +221,7 @@ def _missing(lb: LaplaceBeltrami, kind: int) -> str:
     return "a Dirichlet condition holds along the whole boundary; pass a mask as `boundary` that leaves some of it"
 
 
-def _product(lb: LaplaceBeltrami | Conducting, number: int, x: Tensor) -> Tensor:
+def _product(lb: LaplaceBeltrami | WithConductivity, number: int, x: Tensor) -> Tensor:
     """K, with what a condition adds, or M times x."""
     crow, col, values = lb.weak.pair
     return symmetric_product(crow, col, values[number].to(x), x)

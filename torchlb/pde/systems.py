@@ -27,16 +27,16 @@ from torchlb.linalg.conjugate_gradients import Linear, conjugate_gradients
 from torchlb.linalg.factor import Factor
 from torchlb.linalg.precision import LOW, NEGLIGIBLE, SINGLE, TINY
 from torchlb.linalg.sparse import multiply, to_scipy
-from torchlb.linalg.two_levels import Matrix, absolute_row_sums, main_entries, two_levels
+from torchlb.linalg.two_grid import Matrix, absolute_row_sums, two_grid, without_small_entries
 from torchlb.operator.batching import shapes_of
 from torchlb.operator.laplace_beltrami import LaplaceBeltrami
-from torchlb.pde.conduction import Conducting
+from torchlb.pde.conduction import WithConductivity
 
 KEPT = 8
 """Factors that are kept for each operator."""
 SPACING = 4.0
 """Ratio of the times that have factors: M + tK and the matrix of its factor then differ by its root at most."""
-Operator = LaplaceBeltrami | Conducting
+Operator = LaplaceBeltrami | WithConductivity
 
 
 def pair_system(lb: Operator) -> PairSystem:
@@ -196,7 +196,7 @@ class PairSystem:
     def _rough(self) -> list[tuple[Matrix, Float[Tensor, "N 1"]]]:
         """What smoothing takes of K and of M, scaled to one, and the absolute row sums."""
         parts = zip(self.parts, self.units, strict=True)
-        matrices = [main_entries(*self.pattern, v.double() / unit) for v, unit in parts]
+        matrices = [without_small_entries(*self.pattern, v.double() / unit) for v, unit in parts]
         return [(m, absolute_row_sums(m[0], m[2])) for m in matrices]
 
     def _cycle(self, shares: list[Tensor], coarse: Linear) -> Linear:
@@ -206,7 +206,7 @@ class PairSystem:
         terms = [(share, matrix) for share, (matrix, _) in zip(shares, self._rough, strict=False)]
         if len(sums) == 2 and bool((sums[0][:, 0] > sums[1][:, 0] / LOW).all()):
             terms = terms[:1]
-        return two_levels(partial(self._product, terms), sum(sums[1:], sums[0]), coarse)
+        return two_grid(partial(self._product, terms), sum(sums[1:], sums[0]), coarse)
 
     def _product(self, terms: list[tuple[Tensor, Matrix]], x: Tensor) -> Tensor:
         """Of every column with its shares of the matrices."""

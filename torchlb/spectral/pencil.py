@@ -35,7 +35,7 @@ from torchlb.linalg.precision import (
     TINY,
 )
 from torchlb.linalg.sparse import multiply, on_one_pattern
-from torchlb.linalg.two_levels import Matrix, absolute_row_sums, main_entries, two_levels
+from torchlb.linalg.two_grid import Matrix, absolute_row_sums, two_grid, without_small_entries
 from torchlb.spectral.components import constants, members
 from torchlb.spectral.eigenbasis import Eigenbasis
 
@@ -326,8 +326,8 @@ def _correction(
 
 def _two_levels(stiffness: Sparse, coarse: Inverse) -> Inverse:
     """An approximate inverse of K around a coarse solve, in float32."""
-    rough = main_entries(*_tensors(stiffness))
-    cycle = two_levels(
+    rough = without_small_entries(*_tensors(stiffness))
+    cycle = two_grid(
         partial(multiply, *rough),
         absolute_row_sums(rough[0], rough[2]),
         lambda r: torch.from_numpy(coarse(r.numpy())),

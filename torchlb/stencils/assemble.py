@@ -86,8 +86,8 @@ class Stencils:
         """Rows of `centers`, each of the first candidate (from `start` on) that passes, else the low-order row."""
         blocks, taken = [], []
         reason = torch.full_like(centers, Reason.FEW)  # until something is tried
-        assert self.shape.balls is not None
-        search = Search(self.shape.balls, centers, self.candidates, start)
+        assert self.shape.neighborhoods is not None
+        search = Search(self.shape.neighborhoods, centers, self.candidates, start)
         for number, tried, index in search:
             candidate = self.candidates[number]
             holds = self._holds_boundary(index)
@@ -300,7 +300,7 @@ class Stencils:
         if len(bad):
             raise StencilError(
                 f"{len(bad)} points have neither a stencil after {len(self.candidates)} tries nor a low-order row: "
-                f"{first_few(bad)}. Nothing admissible lies around them; remove them, or merge them with their "
+                f"{first_few(bad)}. Nothing compatible lies around them; remove them, or merge them with their "
                 "neighbours"
             )
         rows = replace(rows, candidate=torch.full_like(centers, len(self.candidates)))
@@ -331,8 +331,8 @@ class Stencils:
             for c in list_candidates(dim, degrees, num_neighbors=self.num_neighbors)
             if c.factor <= FACTOR
         ]
-        assert self.shape.balls is not None
-        search = Search(self.shape.balls, centers, candidates)
+        assert self.shape.neighborhoods is not None
+        search = Search(self.shape.neighborhoods, centers, candidates)
         for number, tried, index in search:
             weights = self._free_weights(centers[tried], index, candidates[number])
             passed = _good_slope(weights) & self.acceptance.follows(weights, candidates[number])

@@ -31,7 +31,7 @@ class Reason(IntEnum):
         return reason
 
     REACHED = 0, "requested order reached"
-    FEW = 1, "too few admissible neighbours"
+    FEW = 1, "too few compatible neighbours"
     MOMENTS = 2, "moment equations not met"
     UNRESOLVED = 3, "points do not resolve the surface"
     RATIO = 4, "neighbours outweigh the centre"
@@ -196,10 +196,10 @@ def to_tangent_vectors(
     [[[0.2]]]
     """
     turn = torch.eye(jacobian.shape[1], dtype=jacobian.dtype).repeat(len(jacobian), 1, 1)
-    askew = (jacobian @ jacobian.mT - turn).abs().amax((1, 2)) > SLIGHT
+    tilted = (jacobian @ jacobian.mT - turn).abs().amax((1, 2)) > SLIGHT
     # Singular values are those of [1, slope], 1 and more, and 0 across a line on which all points lie.
-    inverse = torch.linalg.pinv(jacobian[askew], atol=NEGLIGIBLE, rtol=0.0)
-    turn[askew] = frames[askew].mT @ inverse
+    inverse = torch.linalg.pinv(jacobian[tilted], atol=NEGLIGIBLE, rtol=0.0)
+    turn[tilted] = frames[tilted].mT @ inverse
     return turn
 
 

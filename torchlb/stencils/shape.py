@@ -13,8 +13,8 @@ from tqdm import tqdm
 from torchlb.cloud.boundary import boundary_of_cloud
 from torchlb.cloud.surface import CloudSurface
 from torchlb.errors import InputError, first_few
-from torchlb.geometry.admission import thin_sides
 from torchlb.geometry.boundary import BoundaryPlan, boundary_of_mesh
+from torchlb.geometry.compatibility import thin_sides
 from torchlb.geometry.complex import consistently_wound
 from torchlb.geometry.fit_search import FitSearch
 from torchlb.geometry.frames import (
@@ -23,7 +23,7 @@ from torchlb.geometry.frames import (
     vertex_normals,
 )
 from torchlb.geometry.local_fits import FitPlan, LocalFits
-from torchlb.geometry.neighbors import GraphBalls, mesh_graph, nearest_neighbors
+from torchlb.geometry.neighbors import GraphNeighborhoods, mesh_graph, nearest_neighbors
 from torchlb.geometry.thresholds import NEAREST
 from torchlb.linalg.precision import AT_ONCE
 from torchlb.stencils.conditions import Condition, Neumann
@@ -41,7 +41,7 @@ class Shape(Placed):
     ----------
     normal_order
         (N,), the degree q of the fit behind each frame; 0 for a frame that stayed the initial one.
-    balls
+    neighborhoods
         Its neighbourhoods; None where all is decided.
     areas
         (N,), ℓ^d, positive: a first-order share of the area.
@@ -56,7 +56,7 @@ class Shape(Placed):
     """
 
     normal_order: Int[Tensor, " N"]
-    balls: GraphBalls | None
+    neighborhoods: GraphNeighborhoods | None
     areas: Float[Tensor, " N"]
     low_order: MeshLowOrder | None
     condition: Condition
@@ -96,10 +96,10 @@ def mesh_shape(
     if hypersurface and areas is None and consistently_wound(faces):
         candidates = nearest_neighbors(vertices, min(NEAREST, len(vertices)))
         sides = thin_sides(vertices, vertex_normals(vertices, faces), candidates)
-    balls = GraphBalls(
+    neighborhoods = GraphNeighborhoods(
         vertices, mesh_graph(faces, len(vertices)), mesh_frames(vertices, faces), sides
     )
-    plan, fits = _searched(balls, normal_order, num_neighbors, progress, fit_degrees)
+    plan, fits = _searched(neighborhoods, normal_order, num_neighbors, progress, fit_degrees)
     edge = None
     if shares is not None:
         dim = faces.shape[1] - 1
@@ -115,7 +115,7 @@ def mesh_shape(
     side = torch.ones(len(vertices), dtype=torch.int8) if hypersurface else None
     whole = ShapePlan(faces, shares, plan, None, side, None if condition is None else edge)
     on_mesh = on_mesh and faces.shape[1] == 3
-    return _shape(whole, fits, balls, areas, low_order, condition, on_mesh)
+    return _shape(whole, fits, neighborhoods, areas, low_order, condition, on_mesh)
 
 
 def surface_shape(
@@ -144,8 +144,10 @@ def surface_shape(
         graph.eliminate_zeros()
     beside = Beside.of(given, surface.points, triangles, surface.neighbors[:, 1], surface.normals)
     points = beside.places(given, triangles)
-    balls = GraphBalls(points, graph, first_frames(points, triangles, beside), sides)
-    plan, fits = _searched(balls, normal_order, num_neighbors, progress, fit_degrees)
+    neighborhoods = GraphNeighborhoods(
+        points, graph, first_frames(points, triangles, beside), sides
+    )
+    plan, fits = _searched(neighborhoods, normal_order, num_neighbors, progress, fit_degrees)
     edge = None
     if condition is not None:
         edge = boundary_of_mesh(points, surface.cells, normal_order)
@@ -162,13 +164,13 @@ def surface_shape(
         side = torch.where(against, -1, 1).to(torch.int8)
     low_order = MeshLowOrder(points, triangles)
     whole = ShapePlan(triangles, None, plan, beside, side, edge)
-    return _shape(whole, fits, balls, low_order.areas(), low_order, condition)
+    return _shape(whole, fits, neighborhoods, low_order.areas(), low_order, condition)
 
 
 def _shape(
     plan: ShapePlan,
     fits: LocalFits,
-    balls: GraphBalls,
+    neighborhoods: GraphNeighborhoods,
     areas: Float[Tensor, " N"],
     low_order: MeshLowOrder | None,
     condition: Condition | None,
@@ -179,7 +181,9 @@ def _shape(
     return Shape(
         **vars(placed),
         normal_order=plan.fits.order,
-        balls=balls.with_frames(placed.frames, _follow(balls.sides, placed.frames)),
+        neighborhoods=neighborhoods.with_frames(
+            placed.frames, _follow(neighborhoods.sides, placed.frames)
+        ),
         areas=areas,
         low_order=low_order,
         condition=Condition() if condition is None else condition,
@@ -208,19 +212,19 @@ def _follow(sides: Tensor | None, frames: Tensor) -> Tensor | None:
 
 
 def _searched(
-    balls: GraphBalls,
+    neighborhoods: GraphNeighborhoods,
     degree: int,
     num_neighbors: int | None,
     progress: bool,
     fit_degrees: tuple[int, ...] = (),
 ) -> tuple[FitPlan, LocalFits]:
     """Tangent planes of order q, in chunks, the initial ones if q = 0 or in a flat space; and fits of functions."""
-    flat = balls.dim == balls.points.shape[1]
-    search = FitSearch(balls, 0 if flat else degree, fit_degrees, num_neighbors)
+    flat = neighborhoods.dim == neighborhoods.points.shape[1]
+    search = FitSearch(neighborhoods, 0 if flat else degree, fit_degrees, num_neighbors)
     if flat or degree == 0:
         search.order.fill_(degree)
     else:
-        parts = torch.arange(len(balls.points)).split(AT_ONCE)
+        parts = torch.arange(len(neighborhoods.points)).split(AT_ONCE)
         for centers in tqdm(parts, "tangent frames", delay=2, disable=not progress, leave=False):
             search.refine(centers)
     return search.finish()

@@ -18,7 +18,7 @@ FIRST, SECOND = 8 * (1 + LOWEST) / SIZE, -8 / SIZE
 """Of the smoother D⁻¹(a + b AD⁻¹): 1 − x(a + bx), x in the spectrum, is the Chebyshev polynomial T₂ there, 1 at 0."""
 
 
-def two_levels(product: Linear, sums: Float[Tensor, "N _"], coarse: Linear) -> Linear:
+def two_grid(product: Linear, sums: Float[Tensor, "N _"], coarse: Linear) -> Linear:
     """An approximate inverse of a symmetric A ≥ 0, itself symmetric and definite, for right sides (N, C) in float32.
 
     Smoothing is by Chebyshev polynomials of degree 2 over the upper three quarters of the spectrum of D⁻¹A, D the
@@ -34,7 +34,7 @@ def two_levels(product: Linear, sums: Float[Tensor, "N _"], coarse: Linear) -> L
         A solve with what is near A on smooth functions.
 
     >>> diagonal = torch.tensor([[2.0], [4.0]])
-    >>> cycle = two_levels(lambda x: diagonal * x, diagonal, torch.zeros_like)
+    >>> cycle = two_grid(lambda x: diagonal * x, diagonal, torch.zeros_like)
     >>> cycle(diagonal).T.round(decimals=2)
     tensor([[0.95, 0.95]])
     """
@@ -56,7 +56,7 @@ def two_levels(product: Linear, sums: Float[Tensor, "N _"], coarse: Linear) -> L
     return cycle
 
 
-def main_entries(
+def without_small_entries(
     crow: Int[Tensor, " N_plus_1"], col: Int[Tensor, " nnz"], values: Float[Tensor, " nnz"]
 ) -> Matrix:
     """A symmetric matrix without entries below a thousandth of √(d_i d_j), d the absolute row sums; in float32.
@@ -64,7 +64,7 @@ def main_entries(
     They go to the diagonal, so that row sums stay. Of a stiffness matrix four of ten are left, which do for smoothing.
 
     >>> crow, col = torch.tensor([0, 2, 4]), torch.tensor([0, 1, 0, 1])
-    >>> main_entries(crow, col, torch.tensor([1.0, 1e-4, 1e-4, 1.0]))[1:]
+    >>> without_small_entries(crow, col, torch.tensor([1.0, 1e-4, 1e-4, 1.0]))[1:]
     (tensor([0, 1], dtype=torch.int32), tensor([1.0001, 1.0001]))
     """
     values, col, count = values.float(), col.int(), crow.diff()

@@ -28,7 +28,7 @@ def _smallest_singular_value(
 
 
 def planes_of(frames: Float[Tensor, "N n d"]) -> Float[Tensor, "N n d"] | Float[Tensor, "N n"]:
-    """What `admissible` takes: the unit normals of a surface in R³, else the frames."""
+    """What `compatible` takes: the unit normals of a surface in R³, else the frames."""
     return torch.linalg.cross(*frames.unbind(-1)) if frames.shape[1:] == (3, 2) else frames
 
 
@@ -44,7 +44,7 @@ def normal_frames(frames: Float[Tensor, "N n d"]) -> Float[Tensor, "N n m"]:
     return torch.linalg.qr(frames, mode="complete")[0][..., dim:]
 
 
-def admissible(
+def compatible(
     points: Float[Tensor, "N n"],
     planes: Float[Tensor, "N n d"] | Float[Tensor, "N n"],
     centers: Int[Tensor, " P"],
@@ -79,9 +79,9 @@ def admissible_neighbors(
     planes: Float[Tensor, "N n d"] | Float[Tensor, "N n"],
     index: Int[Tensor, "B K"],
 ) -> Bool[Tensor, "B K"]:
-    """Which points of each row may enter the stencil of its first, see `admissible`."""
+    """Which points of each row may enter the stencil of its first, see `compatible`."""
     centers = index[:, 0].repeat_interleave(index.shape[1])
-    return admissible(points, planes, centers, index.flatten()).view(index.shape)
+    return compatible(points, planes, centers, index.flatten()).view(index.shape)
 
 
 def mutually_admissible(
@@ -89,10 +89,10 @@ def mutually_admissible(
     planes: Float[Tensor, "N n d"] | Float[Tensor, "N n"],
     candidates: Int[Tensor, "N K"],
 ) -> tuple[Int[Tensor, " P"], Int[Tensor, " P"], Bool[Tensor, "N others"]]:
-    """Each point with all other candidates of its row, (i, j) in turn; and which of them are admissible both ways."""
+    """Each point with all other candidates of its row, (i, j) in turn; and which of them are compatible both ways."""
     others = candidates[:, 1:]
     i, j = torch.arange(len(points)).repeat_interleave(others.shape[1]), others.reshape(-1)
-    good = admissible(points, planes, i, j) & admissible(points, planes, j, i)
+    good = compatible(points, planes, i, j) & compatible(points, planes, j, i)
     return i, j, good.view(others.shape)
 
 

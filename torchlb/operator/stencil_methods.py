@@ -1,4 +1,4 @@
-"""The first face of an operator, its stencil: what Δf, ∇f and curvature are at a point."""
+"""What an operator says by its stencil: Δf, ∇f and curvature are at a point."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from torchlb.operator.report import StencilReport
 from torchlb.operator.storage import OperatorStorage
 
 
-class StencilFace(OperatorStorage):
+class StencilMethods(OperatorStorage):
     """Products with the rows of the stencil, and what they make of a function."""
 
     @property
@@ -111,17 +111,17 @@ class StencilFace(OperatorStorage):
 
         Where rows of Δ hold a point of the boundary, and with it a condition that x does not satisfy, it is div ∇x.
         """
-        normal, rim = self(self.points), self._rim()
-        if not rim.any():
+        normal, on_boundary = self(self.points), self._boundary_points()
+        if not on_boundary.any():
             return normal
-        row = self.stencil.row[rim[self.stencil.col]]
-        free = torch.ones_like(rim).index_fill(0, row, False)[:, None]
+        row = self.stencil.row[on_boundary[self.stencil.col]]
+        free = torch.ones_like(on_boundary).index_fill(0, row, False)[:, None]
         return torch.where(free, normal, self.divergence(self.gradient(self.points)))
 
-    def _rim(self) -> Bool[Tensor, " N"]:
+    def _boundary_points(self) -> Bool[Tensor, " N"]:
         """Points of the boundary, whether a condition holds there or not."""
-        rim = torch.zeros_like(self.mass, dtype=torch.bool)
+        on_boundary = torch.zeros_like(self.mass, dtype=torch.bool)
         if self.boundary is not None:
-            rim |= self.boundary
+            on_boundary |= self.boundary
         sides = boundary_faces(self.faces.cpu()).flatten()
-        return rim.index_fill(0, sides.to(rim.device), True)
+        return on_boundary.index_fill(0, sides.to(on_boundary.device), True)

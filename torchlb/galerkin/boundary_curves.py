@@ -17,7 +17,7 @@ from torchlb.geometry.thresholds import CREASE, FACTOR, KINK
 
 
 @dataclass(frozen=True)
-class RimPlan:
+class BoundaryCurvesPlan:
     """The vertices that a polynomial curve over each boundary edge goes through.
 
     Attributes
@@ -31,7 +31,7 @@ class RimPlan:
     index: Int[Tensor, "G S"]
     valid: Bool[Tensor, "G S"]
 
-    def at(self, points: Float[Tensor, "N n"]) -> RimCurves:
+    def at(self, points: Float[Tensor, "N n"]) -> BoundaryCurves:
         """The curves."""
         steps = self.index.shape[1] // 2 - 1
         index, arcs = self.index, [points.new_zeros(len(self.index), 1)]
@@ -40,17 +40,19 @@ class RimPlan:
             arcs.append(step.norm(dim=2).cumsum(1))
         length = (points[index[:, 1]] - points[index[:, 0]]).norm(dim=1, keepdim=True)
         first, ahead, behind = arcs
-        return RimCurves(index, self.valid, torch.cat([first, length, length + ahead, -behind], 1))
+        return BoundaryCurves(
+            index, self.valid, torch.cat([first, length, length + ahead, -behind], 1)
+        )
 
 
 @dataclass(frozen=True)
-class RimCurves:
+class BoundaryCurves:
     """A polynomial curve over each boundary edge.
 
     Attributes
     ----------
     index, valid
-        As in `RimPlan`.
+        As in `BoundaryCurvesPlan`.
     arc
         (G, S), ℓ: their places along the boundary, 0 at the edge's first end.
     """
@@ -59,9 +61,9 @@ class RimCurves:
     valid: Bool[Tensor, "G S"]
     arc: Float[Tensor, "G S"]
 
-    def over(self, edges: Int[Tensor, " E"]) -> RimCurves:
+    def over(self, edges: Int[Tensor, " E"]) -> BoundaryCurves:
         """Those over some of the edges."""
-        return RimCurves(self.index[edges], self.valid[edges], self.arc[edges])
+        return BoundaryCurves(self.index[edges], self.valid[edges], self.arc[edges])
 
     def weights(self, share: Float[Tensor, "G q"]) -> Float[Tensor, "G q S"]:
         """Lagrange weights of the vertices at shares of the edge, 0 at its first end and 1 at its second."""
@@ -73,23 +75,25 @@ class RimCurves:
         return (to / gap[:, None]).prod(-1) * self.valid[:, None]
 
 
-def rim_plan(points: Float[Tensor, "N n"], rim: Int[Tensor, "G 2"], width: int) -> RimPlan:
-    """Curves through `width` vertices, fewer where corners are near, over the boundary edges `rim`."""
-    mate = _mates(points, rim)
-    walks = [_walk(rim, mate, side, width - 2) for side in (0, 1)]
+def boundary_curves_plan(
+    points: Float[Tensor, "N n"], edges: Int[Tensor, "G 2"], width: int
+) -> BoundaryCurvesPlan:
+    """Curves through `width` vertices, fewer where corners are near, over the boundary edges `edges`."""
+    mate = _mates(points, edges)
+    walks = [_walk(edges, mate, side, width - 2) for side in (0, 1)]
     (left, left_length, wrapped), (right, right_length, _) = walks
     extra = torch.where(wrapped, left_length.clamp_max(width - 2), width - 2)
     ahead = torch.minimum(right_length, torch.maximum(extra // 2, extra - left_length))
     behind = torch.minimum(left_length, extra - ahead)
     place = torch.arange(width - 2)
-    ends = torch.ones_like(rim, dtype=torch.bool)
+    ends = torch.ones_like(edges, dtype=torch.bool)
     used = place < ahead[:, None], place < behind[:, None]
-    plan = RimPlan(torch.cat([rim, right, left], 1), torch.cat([ends, *used], 1))
+    plan = BoundaryCurvesPlan(torch.cat([edges, right, left], 1), torch.cat([ends, *used], 1))
     _bound(plan.at(points))
     return plan
 
 
-def _bound(curves: RimCurves) -> None:
+def _bound(curves: BoundaryCurves) -> None:
     """Leave out the farthest vertices of curves whose Lebesgue constant is too large, as where spacings jump."""
     middle = curves.arc[:, 1:2] / 2
     distance = (curves.arc - middle).abs()
@@ -102,17 +106,17 @@ def _bound(curves: RimCurves) -> None:
         curves.valid[steep, (distance * curves.valid)[steep].argmax(1)] = False
 
 
-def _mates(points: Float[Tensor, "N n"], rim: Int[Tensor, "G 2"]) -> Int[Tensor, " two_G"]:
+def _mates(points: Float[Tensor, "N n"], edges: Int[Tensor, "G 2"]) -> Int[Tensor, " two_G"]:
     """Of end s of edge e, number e + G s, the end of another edge that continues it smoothly; −1 for none."""
-    count = len(rim)
-    vertex = torch.cat([rim[:, 0], rim[:, 1]])
+    count = len(edges)
+    vertex = torch.cat([edges[:, 0], edges[:, 1]])
     order = vertex.argsort(stable=True)
     _, uses = torch.unique_consecutive(vertex[order], return_counts=True)
     first = uses.cumsum(0) - uses
     one, two = order[first[uses == 2]], order[first[uses == 2] + 1]
     mate = torch.full_like(vertex, -1)
     mate[one], mate[two] = two, one
-    away = points[torch.cat([rim[:, 1], rim[:, 0]])] - points[vertex]
+    away = points[torch.cat([edges[:, 1], edges[:, 0]])] - points[vertex]
     away = torch.nn.functional.normalize(away, eps=torch.finfo(away.dtype).tiny)
     straight = torch.where(mate >= 0, -(away * away[mate]).sum(1), -1.0)  # cosine of the turn
     angle = straight.clamp(-1, 1).acos()
@@ -124,11 +128,11 @@ def _mates(points: Float[Tensor, "N n"], rim: Int[Tensor, "G 2"]) -> Int[Tensor,
 
 
 def _walk(
-    rim: Int[Tensor, "G 2"], mate: Int[Tensor, " two_G"], side: int, steps: int
+    edges: Int[Tensor, "G 2"], mate: Int[Tensor, " two_G"], side: int, steps: int
 ) -> tuple[Int[Tensor, "G steps"], Int[Tensor, " G"], Bool[Tensor, " G"]]:
     """(vertices, their number, whether the walk came round) beyond one end of every edge; it stays where it ends."""
-    count = len(rim)
-    end, start = rim[:, side], rim[:, 1 - side]
+    count = len(edges)
+    end, start = edges[:, side], edges[:, 1 - side]
     half = torch.arange(count) + count * side
     alive, wrapped = (torch.full((count,), value) for value in (True, False))
     at, vertices, length = end, [], torch.zeros(count, dtype=torch.int64)
@@ -136,7 +140,7 @@ def _walk(
         following = mate[half]
         alive &= following >= 0
         half = torch.where(alive, (following + count) % (2 * count), half)  # the far end
-        next_at = torch.cat([rim[:, 0], rim[:, 1]])[half]
+        next_at = torch.cat([edges[:, 0], edges[:, 1]])[half]
         wrapped |= alive & (next_at == start)
         alive &= next_at != start
         at = torch.where(alive, next_at, at)

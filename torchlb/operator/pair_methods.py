@@ -1,4 +1,4 @@
-"""The second face of an operator, its weak pair: spectrum, and the matrices behind diffusion and solves."""
+"""What an operator says by its weak pair: spectrum, and the matrices behind diffusion and solves."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def check_pair(lb: Any) -> None:
         raise InputError(NO_PAIR.format("eigenpairs, flows and solves"))
 
 
-class WeakFace(OperatorStorage):
+class PairMethods(OperatorStorage):
     """Stiffness and mass matrix where there is a weak pair, and its eigenbasis."""
 
     @property
