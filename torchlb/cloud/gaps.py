@@ -26,10 +26,10 @@ def filled(
 ) -> Faces:
     """The faces and what extends them without folds or overlaps; the very array where there is nothing.
 
-    Triangles of the pool, or ears between two boundary edges, best first, in rounds, until nothing fits; no ear has all
-    its corners on a declared boundary. If `oriented`, the faces and normals agree on which way is out, and triangles have
-    to agree with them. If not `strict` they may face away from the normals by nearly a right angle, and overlap what
-    they share no edge with.
+    Triangles of the pool, or ears between two boundary edges, best first, in rounds, until nothing fits; no ear has
+    all its corners on a declared boundary. If `oriented`, the faces and normals agree on which way is out, and
+    triangles have to agree with them. If not `strict` they may face away from the normals by nearly a right angle,
+    and overlap what they share no edge with.
     """
     count = len(cloud.points)
     outer = edges_of(faces, count).outer  # only there can anything be added
