@@ -460,9 +460,7 @@ def test_positions_that_require_gradients_are_told_once_a_build(tmp_path):
     vertices, faces = Sphere().mesh(60)
     vertices.requires_grad_()
     builds = {
-        "points": [lambda v: LaplaceBeltrami.from_points(v, order=1)],
         "vertices": [
-            lambda v: LaplaceBeltrami.from_mesh(v, faces, order=1),
             lambda v: LaplaceBeltrami.from_cotangent(v, faces),
             lambda v: load_or_build(v, faces, cache=tmp_path, order=1),
             lambda v: load_or_build(v, faces, cache=tmp_path, order=1),  # out of the cache

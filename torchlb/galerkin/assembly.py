@@ -28,8 +28,8 @@ def metric(
     for coordinate in places.T:
         along = (coordinate[elements] @ slopes).chunk(dim, 1)
         pairs = combinations_with_replacement(along, 2)
-        for entry, (x, y) in zip(entries, pairs, strict=True):
-            entry += x * y
+        for number, (x, y) in enumerate(pairs):
+            entries[number] += x * y
     return entries.movedim(0, -1)
 
 

@@ -54,7 +54,7 @@ class Cover(NamedTuple):
             col = torch.cat([torch.arange(2 * count), pair[:, [0, 1, 0, 1]].flatten()])
             weight = torch.stack([share, 1 - share, share, 1 - share], 1).flatten()
             where = row.numpy(), col.numpy()
-            result = sparse.csr_array((torch.cat([same, weight]).numpy(), where)) @ result
+            result = sparse.csr_array((torch.cat([same, weight.detach()]).numpy(), where)) @ result
         return result
 
 

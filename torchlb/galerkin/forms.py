@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from itertools import combinations_with_replacement
 from typing import Any, NamedTuple
@@ -28,6 +29,8 @@ from torchlb.geometry.local_fits import FitPlan, LocalFits
 from torchlb.geometry.numbering import Numbering
 from torchlb.linalg.once import once_differentiable
 from torchlb.linalg.precision import AT_ONCE
+
+Density = Callable[[Tensor, Element, Tensor, list[Tensor]], Tensor]
 
 
 class FlatCells(NamedTuple):
@@ -100,6 +103,8 @@ class Forms:
         mesh: CurvedMesh,
         stars: Int[Tensor, "S corners"],
         shares: Float[Tensor, " F"] | None,
+        *,
+        prolong: bool = True,
     ) -> Forms:
         """Those of curved cells, or shares of them, of the cover that stands for coarse triangles, and of local stars.
 
@@ -113,7 +118,7 @@ class Forms:
         if len(stars):
             lengths = sound_lengths(edge_lengths(fits.points, stars), stars)
             flats.append(FlatCells(stars, lengths, 1 / stars.shape[1], False, None))
-        p = prolongation(fit_plan, fits, plan, mesh)
+        p = prolongation(fit_plan, fits, plan, mesh) if prolong else None
         every = torch.arange(len(own))
         parts = nodes.cells, mesh.lengths, every, nodes.elements, mesh.metric
         if mesh.cover is not None:
@@ -201,12 +206,26 @@ class Forms:
     def sensitivity(self, w: Float[Tensor, "N C"], u: Float[Tensor, "N C"]) -> list[Tensor]:
         """∂/∂κ of Σ_c w_cᵀK(κ)u_c, of the shapes of `conductivities`: weights times ∇w·∇u."""
         at_nodes = [torch.from_numpy(self.prolongation @ x.numpy()) for x in (w, u)]
-        own = _slopes(self.metric, self.element, self.nodes, at_nodes)
+        own, *flat = self.densities(slopes, at_nodes, [w, u])
+        return [own, *(each.sum(1) for each in flat)]
+
+    def densities(
+        self, density: Density, nodes: list[Tensor], corners: list[Tensor]
+    ) -> list[Tensor]:
+        """A density of two functions, w and u at the nodes and at the vertices, times the weights of the Gauss points.
+
+        Of the curved elements, (T, Q), and of each lot of flat cells, (F, Q); differentiable.
+        """
+        own = density(self.metric, self.element, self.nodes, nodes)
         found = [own if self.shares is None else self.shares[:, None] * own]
         for flat in self.flats:
             shape = simplex(self.element.dim, 1)
             metric = flat_metric(flat.lengths)[:, None].expand(-1, len(shape.weights), -1)
-            found.append(flat.share * _slopes(metric, shape, flat.cells, [w, u]).sum(1))
+            if flat.lumped and density is products:
+                part = _lumped(metric[:, 0], shape, flat.cells, corners)
+            else:
+                part = density(metric, shape, flat.cells, corners)
+            found.append(flat.share * part)
         return found
 
 
@@ -240,7 +259,33 @@ def _renumbered(matrix: Any, columns: Int[Tensor, " C"], count: int) -> sparse.c
     return sparse.csr_array(parts, shape=(matrix.shape[0], count))
 
 
-def _slopes(
+def products(
+    metric: Float[Tensor, "T Q S"],
+    element: Element,
+    nodes: Int[Tensor, "T n"],
+    values: list[Tensor],
+) -> Float[Tensor, "T Q"]:
+    """Weights times Σ_c w_c u_c at the Gauss points."""
+    found = []
+    for part in torch.arange(len(nodes)).split(max(AT_ONCE // values[0].shape[1], 1)):
+        one, two = (torch.einsum("qn,tnc->tqc", element.values, x[nodes[part]]) for x in values)
+        found.append(element.weights * area_element(metric[part]) * (one * two).sum(2))
+    return torch.cat(found) if found else metric.new_zeros(metric.shape[:2])
+
+
+def _lumped(
+    metric: Float[Tensor, "F S"],
+    shape: Element,
+    cells: Int[Tensor, "F corners"],
+    values: list[Tensor],
+) -> Float[Tensor, "F corners"]:
+    """The same with the mass of each cell in equal shares at its corners."""
+    share = area_element(metric) * shape.weights.sum() / cells.shape[1]
+    one, two = (x[cells] for x in values)
+    return share[:, None] * (one * two).sum(2)
+
+
+def slopes(
     metric: Float[Tensor, "T Q S"],
     element: Element,
     nodes: Int[Tensor, "T n"],

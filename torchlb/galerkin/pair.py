@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import torch
@@ -17,8 +17,9 @@ from torchlb.galerkin.boundary import boundary_nodes
 from torchlb.galerkin.coarse import boundary_shares
 from torchlb.galerkin.curving import CurvedMesh, CurvingPlan, curve
 from torchlb.galerkin.elements import simplex
-from torchlb.galerkin.forms import Forms, upper_congruence
+from torchlb.galerkin.forms import Forms, products, slopes, upper_congruence
 from torchlb.galerkin.nodes import lagrange_nodes
+from torchlb.galerkin.prolongation import prolonged
 from torchlb.geometry.local_fits import FitPlan, LocalFits
 from torchlb.geometry.numbering import Numbering
 from torchlb.linalg.precision import LOW
@@ -127,6 +128,9 @@ ELEMENTS = {1: (2, (2,)), 2: (2, (2,)), 3: (2, (3, 2)), 4: (3, (4, 2)), 5: (4, (
 """Degree r of the elements, and degrees m of the fits of functions, best first, by the order p; above 5 as for 5."""
 
 
+FormName = Literal["stiffness", "mass", "lumped"]
+
+
 @dataclass(frozen=True)
 class PairPlan:
     """What is decided about the weak pair of a complex of d-simplices.
@@ -163,6 +167,24 @@ class PairPlan:
         """The pair from the fits at given points, its matrices in the user's numbers."""
         mesh = self.curving.at(fits.points, self.fits, fits)
         return assembled_pair(self, fits, mesh, numbering, self.patterns)[0]
+
+    def bilinear(
+        self, name: FormName, fits: LocalFits, w: Float[Tensor, "N C"], u: Float[Tensor, "N C"]
+    ) -> Float[Tensor, ""]:
+        """Σ_c w_cᵀK u_c, or Σ_c w_cᵀM u_c, differentiable in the points of the fits: the matrix is not made.
+
+        "lumped" is the latter with the rows of P that the mass of the vertices is found by: w = 1 makes Σ_i m_i u_i.
+        """
+        mesh = self.curving.at(fits.points, self.fits, fits)
+        rest = self.stars, self.shares
+        forms = Forms.curved(self.fits, fits, self.curving, mesh, *rest, prolong=False)
+        bent, curving = self.curving.bent, self.curving
+        if name == "lumped":
+            curving = replace(curving, bent=bent.index_fill(0, self.lowered, False))
+        both = prolonged(self.fits, fits, curving, mesh, torch.cat([w, u], 1))
+        nodes = list(both.split(w.shape[1], 1))
+        density = forms.densities(slopes if name == "stiffness" else products, nodes, [w, u])
+        return torch.stack([part.sum() for part in density]).sum()
 
     @property
     def counts(self) -> Int[Tensor, "4 N"]:

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from typing import Any
 
 import torch
-from jaxtyping import Bool
+from jaxtyping import Bool, Float
 from scipy import sparse
 from torch import Tensor
 
@@ -23,20 +24,13 @@ def prolongation(
     Identity rows at the vertices, linear ones at flat nodes, and those of the boundary's own curves along it; a row is
     the sum of those of all fits that its node asks.
     """
-    count, ends = len(fits.points), mesh.ends
+    count = len(fits.points)
     row, col, value, by_fit = _without_fits(count, curving, mesh)
     parts = [(row, torch.ones_like(row), col.int(), value)]
-    for block, coefficients in zip(plan.functions, fits.coefficients, strict=True):
-        for part, own, used in ends.of(block.vertices):
-            used, vertex = used & at(by_fit, own), block.vertices[part]
-            asked = at(ends.node, own)
-            offset = plan.reach * (at(mesh.places, count + asked) - fits.points[vertex, None])
-            y = offset @ fits.initial[vertex] / fits.radius[vertex, None, None]
-            weights = cardinal(coefficients[part], y, min(block.degree, plan.jet))
-            weights *= at(ends.share, own)[..., None]
-            points = at(block.points[part], used.nonzero()[:, 0])
-            length = torch.full((len(points),), points.shape[1])
-            parts.append((count + asked[used], length, points.flatten(), weights[used].flatten()))
+    for asked, used, points, weights in _by_fits(plan, fits, mesh, by_fit):
+        points = at(points, used.nonzero()[:, 0])
+        length = torch.full((len(points),), points.shape[1])
+        parts.append((count + asked[used], length, points.flatten(), weights[used].flatten()))
     row, length, col, value = (torch.cat(columns) for columns in zip(*parts, strict=True))
     del parts
     indptr = torch.cat([length.new_zeros(1), length.cumsum(0)]).int()
@@ -45,6 +39,40 @@ def prolongation(
     added: Any = sparse.csr_array(which, shape=(len(mesh.places), len(row)))
     entries = value.numpy(), col.numpy(), indptr.numpy()
     return added @ sparse.csr_array(entries, shape=(len(row), count))
+
+
+def prolonged(
+    plan: FitPlan,
+    fits: LocalFits,
+    curving: CurvingPlan,
+    mesh: CurvedMesh,
+    values: Float[Tensor, "N C"],
+) -> Float[Tensor, "NX C"]:
+    """P times functions, without the matrix, differentiable in the points that the fits are of."""
+    count = len(fits.points)
+    row, col, weight, by_fit = _without_fits(count, curving, mesh)
+    found = values.new_zeros(len(mesh.places), values.shape[1])
+    found = found.index_add(0, row, weight[:, None] * values[col])
+    for asked, used, points, weights in _by_fits(plan, fits, mesh, by_fit):
+        said = weights @ at(values, points)  # (c, e, C)
+        found = found.index_add(0, count + asked[used], said[used])
+    return found
+
+
+def _by_fits(
+    plan: FitPlan, fits: LocalFits, mesh: CurvedMesh, by_fit: Bool[Tensor, " E"]
+) -> Iterator[tuple[Tensor, Tensor, Tensor, Tensor]]:
+    """(nodes (c, e), which of them count, points (c, K), weights (c, e, K)) of some vertices' fits at a time."""
+    count, ends = len(fits.points), mesh.ends
+    for block, coefficients in zip(plan.functions, fits.coefficients, strict=True):
+        for part, own, used in ends.of(block.vertices):
+            used, vertex = used & at(by_fit, own), block.vertices[part]
+            asked = at(ends.node, own)
+            offset = plan.reach * (at(mesh.places, count + asked) - fits.points[vertex, None])
+            y = offset @ fits.initial[vertex] / fits.radius[vertex, None, None]
+            weights = cardinal(coefficients[part], y, min(block.degree, plan.jet))
+            weights *= at(ends.share, own)[..., None]
+            yield asked, used, block.points[part], weights
 
 
 def _without_fits(

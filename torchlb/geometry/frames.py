@@ -7,13 +7,14 @@ of order q.
 
 from __future__ import annotations
 
-from typing import Literal
+from typing import Any, Literal
 
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
 from torchlb.geometry.vectors import at, dot
+from torchlb.linalg.once import once_differentiable
 from torchlb.linalg.precision import ROUNDING
 
 
@@ -32,7 +33,27 @@ def mesh_frames(
     projector = (area[:, None, None] * (basis @ basis.mT)).repeat_interleave(dim + 1, dim=0)
     total = vertices.new_zeros(len(vertices), *projector.shape[1:])
     total.index_add_(0, faces.reshape(-1), projector)
-    return torch.linalg.eigh(total).eigenvectors[..., -dim:]
+    return _Leading.apply(total, dim)  # pyright: ignore[reportReturnType]
+
+
+class _Leading(torch.autograd.Function):
+    """Eigenvectors of the largest eigenvalues, with the derivatives of what does not depend on a turn of them."""
+
+    @staticmethod
+    def forward(ctx: Any, matrix: Tensor, dim: int) -> Tensor:  # pyright: ignore[reportIncompatibleMethodOverride]
+        values, vectors = torch.linalg.eigh(matrix)
+        ctx.save_for_backward(values, vectors)
+        ctx.dim = dim
+        return vectors[..., -dim:].clone()
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor, None]:  # pyright: ignore[reportIncompatibleMethodOverride]
+        values, vectors = ctx.saved_tensors
+        leading, rest = vectors[..., -ctx.dim :], vectors[..., : -ctx.dim]
+        gap = values[..., None, -ctx.dim :] - values[..., : -ctx.dim, None]
+        half = rest @ (rest.mT @ grad / gap) @ leading.mT
+        return (half + half.mT) / 2, None
 
 
 def orthonormalized(frames: Float[Tensor, "B n d"]) -> Float[Tensor, "B n d"]:

@@ -126,7 +126,7 @@ class LocalFits:
         self.points, self.initial, self.frames = points, initial, initial.clone()
         terms = num_monomials(initial.shape[2], degree) - 1
         self.heights = points.new_zeros(len(points), terms, points.shape[1])
-        self.surface_radius, self.radius = points.new_ones(2, len(points))
+        self.surface_radius, self.radius = (points.new_ones(len(points)) for _ in range(2))
         self.coefficients: list[Tensor] = []
 
     @classmethod

@@ -75,7 +75,7 @@ def load_or_build(
     >>> with tempfile.TemporaryDirectory() as folder:
     ...     first = load_or_build(vertices, faces, cache=folder, order=2)
     ...     again = load_or_build(vertices, faces, cache=folder, order=2)  # from the file
-    >>> torch.equal(first.values, again.values)
+    >>> torch.equal(first.stencil.values, again.stencil.values)
     True
     """
     warn_of_gradients(vertices, "vertices")

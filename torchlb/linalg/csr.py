@@ -11,7 +11,7 @@ from itertools import accumulate
 from typing import Any
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Float, Int, Shaped
 from scipy import sparse
 from torch import Tensor, nn
 from torch.nn.functional import pad
@@ -167,7 +167,7 @@ class Csr(Tensors):
     def product(
         self,
         channel: int,
-        f: Float[Tensor, "*batch N C"] | Float[Tensor, " N"],
+        f: Shaped[Tensor, "*batch N C"] | Shaped[Tensor, " N"],
         *,
         transposed: bool = False,
         dtype: torch.dtype | None = None,

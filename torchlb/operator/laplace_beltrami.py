@@ -11,7 +11,7 @@ from torch import Tensor
 
 from torchlb.certified.certificate import Certificate
 from torchlb.cloud.surface import SurfaceSummary
-from torchlb.errors import InputError, InputTypeError
+from torchlb.errors import DerivativeError, InputError, InputTypeError
 from torchlb.fits.rules import WeightsName
 from torchlb.geometry.frames import Projection
 from torchlb.linalg.csr import Csr, Record
@@ -31,6 +31,7 @@ from torchlb.operator.parts import Modes, PairMatrices
 from torchlb.operator.plan import Plan, evaluate
 from torchlb.operator.stencil_methods import StencilMethods
 from torchlb.operator.storage import FIT_FIELDS, ROW_FIELDS
+from torchlb.operator.through import known, refused
 from torchlb.spectral.eigenbasis import (
     stack_eigenbases,
     unstack_eigenbases,
@@ -107,8 +108,8 @@ class LaplaceBeltrami(StencilMethods, PairMethods):
         Parameters
         ----------
         points
-            (N, n) tensor or array, length ℓ, without duplicates. Computed in float64 on the CPU, without gradients, as
-            a warning says where they are required; the result has the floating type of the points.
+            (N, n) tensor or array, length ℓ, without duplicates. Computed in float64 on the CPU; the result has the
+            floating type of the points. If they require a gradient, see `at`.
         dim, order, normal_order
             d of the manifold, n − 1 by default; p ≥ 1 of the Laplacian, whose error falls like h^p; q of the tangent
             frames, p + 1 by default.
@@ -139,11 +140,11 @@ class LaplaceBeltrami(StencilMethods, PairMethods):
         options = Options(
             order, normal_order, projection, weights, num_neighbors, condition, weak_form, certify
         )
-        warn_of_gradients(points, "points")
         with torch.inference_mode(False):  # what is kept serves a training, too
             given = {"normals": normals, "boundary": boundary, "reconstruction": reconstruct}
             built = build_cloud(points, dim, options, **given, progress=progress)
-            return cls._from_assembled(built, points)
+            lb = cls._from_assembled(built, points)
+        return lb._carrying(points)
 
     @classmethod
     def from_mesh(
@@ -167,7 +168,7 @@ class LaplaceBeltrami(StencilMethods, PairMethods):
         Parameters
         ----------
         vertices
-            (N, n) tensor or array, length ℓ.
+            (N, n) tensor or array, length ℓ; if they require a gradient, see `at`.
         faces
             (F, 3) indices. Any triangle mesh: several components, non-manifold edges, zero-area triangles. Also (F, 2)
             polylines and (F, 4) tetrahedra, for manifolds of dimension 1 and 3 in Rⁿ.
@@ -186,10 +187,10 @@ class LaplaceBeltrami(StencilMethods, PairMethods):
         options = Options(
             order, normal_order, projection, weights, num_neighbors, condition, weak_form, certify
         )
-        warn_of_gradients(vertices, "vertices")
         with torch.inference_mode(False):
             built = build.build_mesh(vertices, faces, options, boundary=boundary, progress=progress)
-            return cls._from_assembled(built, vertices)
+            lb = cls._from_assembled(built, vertices)
+        return lb._carrying(vertices)
 
     @classmethod
     def from_cotangent(cls, vertices: ArrayLike, faces: ArrayLike) -> LaplaceBeltrami:
@@ -269,7 +270,9 @@ class LaplaceBeltrami(StencilMethods, PairMethods):
         Parameters
         ----------
         points
-            (N, n), ℓ, in the order of those that the operator was built from.
+            (N, n), ℓ, in the order of those that the operator was built from. If they require a gradient, it comes by
+            eigenvalues, the mass, and `product` with "stiffness" and "mass"; where another result is asked for one, it
+            raises DerivativeError.
 
         Raises InputError for another shape, where there is no `plan`, and with a certificate.
 
@@ -279,7 +282,6 @@ class LaplaceBeltrami(StencilMethods, PairMethods):
         >>> ratio[1:].round(decimals=6).tolist()
         [0.25, 0.25, 0.25]
         """
-        warn_of_gradients(points, "points")
         there = check_points(points)
         if there.shape != self.points.shape:
             raise InputError(
@@ -287,7 +289,25 @@ class LaplaceBeltrami(StencilMethods, PairMethods):
             )
         with torch.inference_mode(False):
             built = replace(evaluate(self.plan, there), surface=self.surface, plan=self.plan)
-            return self._from_assembled(built, points).to(self.device)
+            lb = self._from_assembled(built, points).to(self.device)
+        return lb._carrying(points)
+
+    def _carrying(self, points: ArrayLike) -> LaplaceBeltrami:
+        """Itself; where points require a gradient, it comes by what has one, and errors by all else."""
+        if not (isinstance(points, Tensor) and points.requires_grad and torch.is_grad_enabled()):
+            return self
+        if not self.has_weak_form or len(self.weak.near.values) > 3 or len(self.plan.moved):
+            raise DerivativeError(
+                "points: they require gradients, which there are none of without a weak pair, with a Robin condition, "
+                "and of noisy curves, whose points are moved; pass points.detach() if results may be constants of them"
+            )
+        ones = torch.ones(self.num_points, 1, dtype=torch.float64)
+        self.points = points.to(self.points).view_as(self.points)  # a buffer is no Parameter
+        self.mass = known(points, self.mass, self.plan, lambda g: {"lumped": (ones, g[:, None])})
+        self.stencil.values = refused(points, self.stencil.values, "rows of Δ and ∇")
+        self.frames = refused(points, self.frames, "frames")
+        self.normals = refused(points, self.normals, "normals")
+        return self
 
     def product(self, name: MatrixName, f: Tensor) -> Tensor:
         """A matrix of the operator times f, of the shape of f, differentiable in f any number of times.
@@ -305,7 +325,18 @@ class LaplaceBeltrami(StencilMethods, PairMethods):
         Raises InputError for another name or shape, and where there is no such matrix.
         """
         matrices, channel = self._channel(name)
-        return matrices.product(channel, f)
+        result = matrices.product(channel, f)
+        if not self.points.requires_grad:
+            return result
+        if name == "boundary_mass":
+            return result + refused(self.points, torch.zeros_like(result), name)
+        other = f.detach().cpu().double()
+        other = other[:, None] if f.ndim == 1 else other.transpose(0, -2).flatten(1)
+
+        def forms(g: Tensor) -> dict[Any, Any]:
+            return {name: (g[:, None] if g.ndim == 1 else g.transpose(0, -2).flatten(1), other)}
+
+        return result + known(self.points, torch.zeros_like(result), self.plan, forms)
 
     def unbatch(self) -> list[LaplaceBeltrami]:
         """The operators of the shapes of a `batch`, with all that they had: certificates, spectral radii, eigenbases.

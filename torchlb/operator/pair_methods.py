@@ -15,6 +15,7 @@ from torchlb.linalg.threads import threads_for
 from torchlb.operator.batching import shapes_of
 from torchlb.operator.checks import check_tolerance
 from torchlb.operator.storage import OperatorStorage
+from torchlb.operator.through import known, refused
 from torchlb.spectral.eigenbasis import (
     Eigenbasis,
     check_num_pairs,
@@ -123,7 +124,22 @@ class PairMethods(OperatorStorage):
         InputError
             Without a weak pair.
         """
-        return self.invariant_basis(k, tolerance=tolerance, store=store).truncate(k)
+        basis = self.invariant_basis(k, tolerance=tolerance, store=store).truncate(k)
+        return self._carried(basis) if self.points.requires_grad else basis
+
+    def _carried(self, basis: Eigenbasis) -> Eigenbasis:
+        """The basis with dλ = φᵀ(dK − λ dM)φ; in a cluster, symmetric functions of its eigenvalues have derivatives."""
+        points, vectors = self.points, basis.eigenvectors.cpu().double()
+
+        squares = basis.eigenvalues.cpu().double()
+
+        def forms(g: Tensor) -> dict[Any, Any]:
+            return {"stiffness": (g * vectors, vectors), "mass": (-g * squares * vectors, vectors)}
+
+        values = known(points, basis.eigenvalues, self.plan, forms)
+        sides = (refused(points, t, "eigenvectors") for t in (basis.eigenvectors, basis.left))
+        modes, left = sides
+        return Eigenbasis(values, modes, self.mass, left, relative_errors=basis.relative_errors)
 
     def invariant_basis(
         self, k: int, *, tolerance: float | None = None, store: bool = False

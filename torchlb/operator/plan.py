@@ -9,12 +9,13 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
 from torchlb.errors import InputError, renumbered
 from torchlb.galerkin.forms import Forms
-from torchlb.galerkin.pair import PairPlan
+from torchlb.galerkin.pair import FormName, PairPlan
 from torchlb.geometry.numbering import Numbering
 from torchlb.linalg.threads import threads_for
 from torchlb.operator.assembled import AssembledOperator
@@ -70,6 +71,19 @@ class Plan:
         here = self._sorted(points)
         _, fits = self.shape.at(here)
         return self.pair.forms(fits).restored(self.numbering, self.order, len(self.faces))
+
+    def gradient(
+        self, points: Float[Tensor, "N n"], forms: dict[FormName, tuple[Tensor, Tensor]]
+    ) -> Float[Tensor, "N n"]:
+        """The derivative in the user's points of the sum of bilinear forms of constant functions (w, u), (N, C)."""
+        with torch.enable_grad():
+            x = points.requires_grad_()
+            _, fits = self.shape.at(self._sorted(x))
+            parts = [
+                self.pair.bilinear(name, fits, *(self.numbering.sorted(f) for f in pair))
+                for name, pair in forms.items()
+            ]
+            return torch.autograd.grad(torch.stack(parts).sum(), x)[0]
 
     def _sorted(self, points: Float[Tensor, "N n"]) -> Float[Tensor, "N n"]:
         if len(self.moved):

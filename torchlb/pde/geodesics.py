@@ -22,6 +22,7 @@ from torchlb.geometry.neighbors import mesh_graph
 from torchlb.linalg.checks import check_operator
 from torchlb.linalg.precision import NEGLIGIBLE
 from torchlb.operator.laplace_beltrami import LaplaceBeltrami
+from torchlb.pde.checks import off_geometry
 
 FROM_MESH = ("mesh", "cotangent")
 """Sources of operators whose faces are all there is."""
@@ -74,7 +75,7 @@ def geodesic_distance(
         foot = points[np.maximum(nearest, 0)]  # any, where no path leads to one
         enough = NEGLIGIBLE * float(length.mean())
         distance = _straightened(distance, foot, points, _triangles(lb), enough)
-    return torch.from_numpy(distance).to(lb.mass)
+    return off_geometry(torch.from_numpy(distance).to(lb.mass), lb)
 
 
 def _sources(lb: LaplaceBeltrami, sources: int | Sequence[int] | Tensor) -> Int[Tensor, " S"]:

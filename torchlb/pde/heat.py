@@ -21,7 +21,7 @@ from torchlb.linalg.sparse import compute_dtype
 from torchlb.operator.checks import check_tolerance
 from torchlb.operator.laplace_beltrami import LaplaceBeltrami
 from torchlb.operator.pair_methods import check_pair
-from torchlb.pde.checks import as_columns, as_times, check_choice
+from torchlb.pde.checks import as_columns, as_times, check_choice, off_geometry
 from torchlb.pde.pair_flow import pair_flow
 from torchlb.spectral.eigenbasis import Eigenbasis
 
@@ -93,6 +93,7 @@ def flow(
         y = flow(lb, columns, times, method, k, tolerance)
         return y.view(x.shape[1], x.shape[0], x.shape[2]).transpose(0, 1)
     check_pair(lb)
+    x = off_geometry(x, lb)
     if method == "spectral":
         return _spectral(lb.eigenbasis(k), x, time)
     if method == "deflated":

@@ -16,7 +16,7 @@ from torchlb.linalg.sparse import compute_dtype, symmetric_product
 from torchlb.operator.checks import check_tolerance
 from torchlb.operator.laplace_beltrami import LaplaceBeltrami
 from torchlb.operator.pair_methods import check_pair
-from torchlb.pde.checks import as_columns, as_times, uncompiled
+from torchlb.pde.checks import as_columns, as_times, off_geometry, uncompiled
 from torchlb.pde.conduction import WithConductivity, with_conductivity
 from torchlb.pde.systems import solve_columns
 
@@ -81,7 +81,7 @@ def implicit_step(
         right = right + time * lb.product("boundary_mass", fluxes)
     if given is not None:
         right = right - _product(lb, 1, given) - time * _product(medium, 0, given)
-    u = _solve(right, time, conductivity, given, medium, tolerance)
+    u = _solve(off_geometry(right, lb), time, conductivity, given, medium, tolerance)
     return _shaped(u if given is None else u + given, f, x.dtype)
 
 
@@ -120,7 +120,7 @@ def poisson_solve(
         right = right + lb.product("boundary_mass", fluxes)
     if given is not None:
         right = right - _product(medium, 0, given)
-    u = _solve(right, None, conductivity, given, medium, tolerance)
+    u = _solve(off_geometry(right, lb), None, conductivity, given, medium, tolerance)
     return _shaped(u if given is None else u + given, f, x.dtype)
 
 
@@ -160,7 +160,7 @@ def potential(
     if source is None and field is not None:
         source = field[..., 0, :]
     assert source is not None, "neither field nor source"
-    u = _solve(columns, None, None, None, lb, tolerance)
+    u = _solve(off_geometry(columns, lb), None, None, None, lb, tolerance)
     return _shaped(u, source, source.dtype)
 
 

@@ -1,0 +1,194 @@
+"""Derivatives of eigenvalues, mass and products with K and M in the points, at frozen decisions."""
+
+import functools
+
+import numpy as np
+import pytest
+import torch
+from scipy.spatial import Delaunay
+
+from torchlb import (
+    DerivativeError,
+    Diffusion,
+    LaplaceBeltrami,
+    Robin,
+    geodesic_distance,
+    heat_flow,
+    heat_kernel_signature,
+    implicit_step,
+    poisson_solve,
+)
+from torchlb.surfaces import Ellipsoid, Hemisphere, Sphere, Torus
+
+H = 1e-6
+
+
+def noise(*shape, seed=0):
+    return torch.randn(*shape, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
+
+
+def rough(points, faces=None, **options):
+    """At points moved a little, so that no two neighbours are at the same distance, where the window has a kink."""
+    points = torch.as_tensor(points) + 0.003 * noise(*points.shape)
+    if faces is None:
+        return LaplaceBeltrami.from_points(points, **options)
+    return LaplaceBeltrami.from_mesh(points, faces, **options)
+
+
+def trefoil():
+    t = torch.arange(60, dtype=torch.float64) * torch.pi / 30
+    x = [t.sin() + 2 * (2 * t).sin(), t.cos() - 2 * (2 * t).cos(), -(3 * t).sin()]
+    return torch.stack(x, 1), torch.stack([torch.arange(60), (torch.arange(60) + 1) % 60], 1)
+
+
+def cube():
+    axis = np.linspace(0, 1, 6)
+    points = np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), -1).reshape(-1, 3)
+    points += 0.03 * np.random.default_rng(0).normal(size=points.shape)
+    return points, Delaunay(points).simplices
+
+
+def flat():
+    """A triangulation whose rim has long triangles, which the cover of coarse triangles stands for."""
+    grid = np.stack(np.meshgrid(np.arange(12.0), np.arange(12.0)), -1).reshape(-1, 2)
+    points = grid + 0.2 * np.random.default_rng(1).normal(size=grid.shape)
+    return points, Delaunay(points).simplices
+
+
+SHAPES = {
+    "closed": lambda: rough(*Ellipsoid((1.0, 0.8, 0.6)).mesh(200)),
+    "open": lambda: rough(*Hemisphere().mesh(150)),
+    "held": lambda: rough(*Hemisphere().mesh(150), condition="dirichlet"),
+    "order 5": lambda: rough(*Torus().mesh(250), order=5),
+    "cloud": lambda: rough(Sphere().points(200)),
+    "curve": lambda: rough(*trefoil()),
+    "solid": lambda: rough(*cube()),
+    "coarse": lambda: rough(*flat()),
+}
+
+
+@functools.cache
+def built(name):
+    return SHAPES[name]()
+
+
+def slope(lb, value):
+    """The derivative of a value of `lb.at(points)` in a direction, by the chain rule and by a difference."""
+    way = noise(*lb.points.shape, seed=3)
+    x = lb.points.clone().requires_grad_()
+    (gradient,) = torch.autograd.grad(value(lb.at(x)), x)
+    ahead, behind = (value(lb.at(lb.points + s * H * way)).detach() for s in (1, -1))
+    return (gradient * way).sum(), (ahead - behind) / (2 * H)
+
+
+@pytest.mark.parametrize("name", SHAPES)
+def test_the_gradient_is_that_of_differences(name):
+    """Of wᵀKu, wᵀMu, ∫f and Σ log λ_k, at decisions that stand; eigenvalues are solved anew at both ends."""
+    lb = built(name)
+    assert (name == "coarse") == bool(lb.plan.pair.curving.coarse.any())
+    w, u = noise(2, lb.num_points, 3, seed=1)
+
+    def forms(matrix):
+        return lambda moved: (w * moved.product(matrix, u)).sum()
+
+    def logarithms(moved):
+        values = moved.eigenbasis(8, tolerance=1e-11).eigenvalues
+        return values[values > 1e-6].log().sum()
+
+    values = [forms("stiffness"), forms("mass"), lambda moved: (w[:, 0] * moved.mass).sum()]
+    for value in (*values, logarithms):
+        ours, theirs = slope(lb, value)
+        assert abs(ours - theirs) < 2e-4 * abs(theirs) + 1e-6, (ours, theirs)
+
+
+@pytest.mark.parametrize("name", ["closed", "cloud", "curve"])
+def test_scaling_turning_and_moving(name):
+    """λ falls as size^−2, so gradient · x = −2 Σ 1 of Σ log λ; no force, no torque."""
+    lb = built(name)
+    x = lb.points.clone().requires_grad_()
+    values = lb.at(x).eigenbasis(11, tolerance=1e-11).eigenvalues[1:]
+    (g,) = torch.autograd.grad(values.log().sum(), x)
+    assert abs((g * x).sum() + 20) < 1e-7
+    assert g.sum(0).abs().max() < 1e-8 * g.abs().sum()
+    torque = torch.linalg.cross(x.detach(), g).sum(0)
+    assert torque.abs().max() < 1e-8 * g.abs().sum()
+
+
+def test_descent_makes_an_ellipsoid_round():
+    """1/λ_1 + 1/λ_2 + 1/λ_3 ≥ 3A/8π, with equality on the round sphere (Hersch 1970), over axes of an ellipsoid."""
+    lb = built("closed")
+    stretch = torch.zeros(3, dtype=torch.float64, requires_grad=True)
+    optimizer = torch.optim.LBFGS([stretch], max_iter=15, line_search_fn="strong_wolfe")
+
+    def loss():
+        optimizer.zero_grad()
+        moved = lb.at(lb.points * stretch.exp())
+        value = (1 / moved.eigenbasis(4).eigenvalues[1:]).sum() / moved.mass.sum()
+        value.backward()
+        return value
+
+    optimizer.step(loss)
+    axes = (torch.tensor([1.0, 0.8, 0.6]) * stretch.detach().exp()).double()
+    assert axes.max() / axes.min() < 1.02
+    assert float(loss().detach()) == pytest.approx(3 / (8 * torch.pi), rel=1e-2)
+
+
+def test_float32_and_a_graph_before_the_points():
+    lb = built("closed")
+    scale = torch.tensor(1.1, requires_grad=True)
+    moved = lb.at(lb.points.float() * scale)
+    values = moved.eigenbasis(5).eigenvalues[1:]
+    (g,) = torch.autograd.grad(values.sum(), scale)
+    assert g.dtype == torch.float32
+    assert abs(g + 2 * values.sum() / 1.1) < 1e-3 * values.sum()
+
+
+def test_what_has_no_derivative_raises_and_nothing_is_zero_in_silence(unchecked):
+    lb = built("closed")
+    x = lb.points.clone().requires_grad_()
+    moved, f = lb.at(x), noise(lb.num_points, 2)
+    layer = Diffusion(2, k=6).double()
+    for value in (
+        moved(f),
+        moved.gradient(f),
+        moved.hessian(f),
+        moved.mean_curvature_normal(),
+        moved.frames,
+        moved.normals,
+        moved.eigenbasis(5).eigenvectors,
+        heat_kernel_signature(moved, k=6),
+        heat_flow(moved, f, 0.1),
+        implicit_step(moved, f, 0.1),
+        poisson_solve(moved, f),
+        geodesic_distance(moved, 0),
+        layer(f, moved),
+    ):
+        with pytest.raises(DerivativeError, match="no derivative in the points"):
+            value.sum().backward()
+    g = f.clone().requires_grad_()
+    (expected,) = torch.autograd.grad(heat_flow(lb, g, 0.1).square().sum(), g)
+    (found,) = torch.autograd.grad(heat_flow(moved, g, 0.1).square().sum(), g)
+    torch.testing.assert_close(found, expected)
+    vertices, faces = Hemisphere().mesh(100)
+    held = LaplaceBeltrami.from_mesh(vertices, faces, condition=Robin(1.0))
+    with pytest.raises(DerivativeError, match="Robin"):
+        held.at(held.points.clone().requires_grad_())
+    with pytest.raises(DerivativeError, match="without a weak pair"):
+        LaplaceBeltrami.from_mesh(vertices.requires_grad_(), faces, weak_form=False)
+
+
+@pytest.mark.parametrize("parameter", [False, True])
+def test_builders_carry_gradients(parameter):
+    """As `at` does: the same gradient, with no parameter that the module did not have."""
+    lb = built("cloud")
+    x, y = (lb.points.clone().requires_grad_() for _ in range(2))
+    x = torch.nn.Parameter(x.detach()) if parameter else x
+    made = LaplaceBeltrami.from_points(x)
+    assert list(made.parameters()) == []
+    gradients = [
+        torch.autograd.grad(other.eigenbasis(6, tolerance=1e-11).eigenvalues[1:].log().sum(), z)[0]
+        for other, z in ((made, x), (lb.at(y), y))
+    ]
+    torch.testing.assert_close(*gradients, rtol=1e-6, atol=1e-8)
+    with torch.no_grad():
+        assert not LaplaceBeltrami.from_points(x).points.requires_grad
