@@ -99,8 +99,8 @@ def element_matrices(
             cross = x[:, :, None] * y[:, None, :]
             products.append(cross if x is y else cross + cross.mT)
     gradients = torch.stack(products, 1).flatten(0, 1).flatten(1)
-    squares = _squares(shape)
-    blocks = torch.empty(len(g), squares.shape[1], dtype=torch.complex128)
+    masses = squares(shape)
+    blocks = torch.empty(len(g), masses.shape[1], dtype=torch.complex128)
     for first in range(0, len(g), AT_ONCE):
         part = slice(first, first + AT_ONCE)
         root = area_element(g[part])
@@ -108,7 +108,7 @@ def element_matrices(
         if conductivity is not None:
             inverse = conductivity[part, :, None] * inverse
         stiffness = inverse.flatten(1) @ gradients
-        blocks[part] = torch.complex(stiffness, (shape.weights * root) @ squares)
+        blocks[part] = torch.complex(stiffness, (shape.weights * root) @ masses)
     return blocks
 
 
@@ -116,10 +116,11 @@ def assemble_mass(
     size: Float[Tensor, "T Q"], nodes: Int[Tensor, "T n"], shape: Element, num_nodes: int
 ) -> sparse.csr_array:
     """∫ φ_i φ_j over elements whose area or length element at the Gauss points is `size`."""
-    return summed((shape.weights * size) @ _squares(shape), nodes, num_nodes)
+    return summed((shape.weights * size) @ squares(shape), nodes, num_nodes)
 
 
-def _squares(shape: Element) -> Float[Tensor, "Q n_times_n"]:
+def squares(shape: Element) -> Float[Tensor, "Q n_times_n"]:
+    """φ_i φ_j at the Gauss points."""
     return (shape.values[:, :, None] * shape.values[:, None, :]).flatten(1)
 
 

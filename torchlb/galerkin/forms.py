@@ -19,6 +19,7 @@ from torchlb.galerkin.assembly import (
     element_matrices,
     flat_metric,
     linear_elements,
+    squares,
     summed,
 )
 from torchlb.galerkin.curving import CurvedMesh, CurvingPlan
@@ -27,10 +28,11 @@ from torchlb.galerkin.elements import Element, simplex, subsets
 from torchlb.galerkin.prolongation import prolongation
 from torchlb.geometry.local_fits import FitPlan, LocalFits
 from torchlb.geometry.numbering import Numbering
+from torchlb.geometry.vectors import at
 from torchlb.linalg.once import once_differentiable
-from torchlb.linalg.precision import AT_ONCE
+from torchlb.linalg.precision import AT_ONCE, rows_at_once
 
-Density = Callable[[Tensor, Element, Tensor, list[Tensor]], Tensor]
+Density = Callable[[Tensor, Element, Tensor], Tensor]
 
 
 class FlatCells(NamedTuple):
@@ -206,25 +208,35 @@ class Forms:
     def sensitivity(self, w: Float[Tensor, "N C"], u: Float[Tensor, "N C"]) -> list[Tensor]:
         """∂/∂κ of Σ_c w_cᵀK(κ)u_c, of the shapes of `conductivities`: weights times ∇w·∇u."""
         at_nodes = [torch.from_numpy(self.prolongation @ x.numpy()) for x in (w, u)]
-        own, *flat = self.densities(slopes, at_nodes, [w, u])
+        own, *flat = self.densities(_slopes, at_nodes, [w, u], torch.ones(w.shape[1]).to(w))
         return [own, *(each.sum(1) for each in flat)]
 
-    def densities(
-        self, density: Density, nodes: list[Tensor], corners: list[Tensor]
-    ) -> list[Tensor]:
-        """A density of two functions, w and u at the nodes and at the vertices, times the weights of the Gauss points.
+    def form(
+        self, name: str, nodes: list[Tensor], corners: list[Tensor], c: Float[Tensor, " C"]
+    ) -> Float[Tensor, ""]:
+        """Σ_k c_k w_kᵀK u_k, of "stiffness", or Σ_k c_k w_kᵀM u_k, from w and u at the nodes and at the vertices."""
+        density = _slopes if name == "stiffness" else _products
+        parts = self.densities(density, nodes, corners, c)
+        return torch.stack([part.sum() for part in parts]).sum()
 
-        Of the curved elements, (T, Q), and of each lot of flat cells, (F, Q); differentiable.
+    def densities(
+        self, density: Density, nodes: list[Tensor], corners: list[Tensor], c: Float[Tensor, " C"]
+    ) -> list[Tensor]:
+        """A density of two functions times the weights of the Gauss points, differentiable in all.
+
+        Of the curved elements, (T, Q), and of each lot of flat cells, (F, Q).
         """
-        own = density(self.metric, self.element, self.nodes, nodes)
+        own = density(self.metric, self.element, _outer(self.nodes, nodes, c))
         found = [own if self.shares is None else self.shares[:, None] * own]
         for flat in self.flats:
             shape = simplex(self.element.dim, 1)
             metric = flat_metric(flat.lengths)[:, None].expand(-1, len(shape.weights), -1)
-            if flat.lumped and density is products:
-                part = _lumped(metric[:, 0], shape, flat.cells, corners)
+            blocks = _outer(flat.cells, corners, c)
+            if flat.lumped and density is _products:
+                share = area_element(metric[:, 0]) * shape.weights.sum() / flat.cells.shape[1]
+                part = share[:, None] * blocks[:, :: flat.cells.shape[1] + 1]
             else:
-                part = density(metric, shape, flat.cells, corners)
+                part = density(metric, shape, blocks)
             found.append(flat.share * part)
         return found
 
@@ -259,53 +271,33 @@ def _renumbered(matrix: Any, columns: Int[Tensor, " C"], count: int) -> sparse.c
     return sparse.csr_array(parts, shape=(matrix.shape[0], count))
 
 
-def products(
-    metric: Float[Tensor, "T Q S"],
-    element: Element,
-    nodes: Int[Tensor, "T n"],
-    values: list[Tensor],
+def _outer(
+    nodes: Int[Tensor, "T n"], values: list[Tensor], c: Float[Tensor, " C"]
+) -> Float[Tensor, "T n_times_n"]:
+    """Σ_k c_k w_k(i) u_k(j) for all pairs of nodes of each element."""
+    one, two = values[0] * c, values[1]
+    parts = nodes.split(rows_at_once(nodes.shape[1] * len(c)))
+    return torch.cat([(at(one, part) @ at(two, part).mT).flatten(1) for part in parts])
+
+
+def _slopes(
+    metric: Float[Tensor, "T Q S"], element: Element, blocks: Float[Tensor, "T n_times_n"]
 ) -> Float[Tensor, "T Q"]:
-    """Weights times Σ_c w_c u_c at the Gauss points."""
-    found = []
-    for part in torch.arange(len(nodes)).split(max(AT_ONCE // values[0].shape[1], 1)):
-        one, two = (torch.einsum("qn,tnc->tqc", element.values, x[nodes[part]]) for x in values)
-        found.append(element.weights * area_element(metric[part]) * (one * two).sum(2))
-    return torch.cat(found) if found else metric.new_zeros(metric.shape[:2])
+    """Weights times ∇w·∇u at the Gauss points."""
+    total, slopes = metric.new_zeros(metric.shape[:2]), element.gradients.unbind(-1)
+    pairs = combinations_with_replacement(slopes, 2)
+    for (x, y), entry in zip(pairs, cofactors(metric).unbind(-1), strict=True):
+        cross = x[:, :, None] * y[:, None, :]
+        cross = cross if x is y else cross + cross.mT
+        total = total + entry * (blocks @ cross.flatten(1).T)
+    return element.weights * total / area_element(metric)
 
 
-def _lumped(
-    metric: Float[Tensor, "F S"],
-    shape: Element,
-    cells: Int[Tensor, "F corners"],
-    values: list[Tensor],
-) -> Float[Tensor, "F corners"]:
-    """The same with the mass of each cell in equal shares at its corners."""
-    share = area_element(metric) * shape.weights.sum() / cells.shape[1]
-    one, two = (x[cells] for x in values)
-    return share[:, None] * (one * two).sum(2)
-
-
-def slopes(
-    metric: Float[Tensor, "T Q S"],
-    element: Element,
-    nodes: Int[Tensor, "T n"],
-    values: list[Tensor],
+def _products(
+    metric: Float[Tensor, "T Q S"], element: Element, blocks: Float[Tensor, "T n_times_n"]
 ) -> Float[Tensor, "T Q"]:
-    """Weights times Σ_c ∇w_c·∇u_c at the Gauss points."""
-    found = []
-    for part in torch.arange(len(nodes)).split(max(AT_ONCE // values[0].shape[1], 1)):
-        g = metric[part]
-        one, two = (
-            torch.einsum("qnd,tnc->dtqc", element.gradients, x[nodes[part]]) for x in values
-        )
-        pairs = combinations_with_replacement(range(element.dim), 2)
-        products = [
-            one[a] * two[b] if a == b else one[a] * two[b] + one[b] * two[a] for a, b in pairs
-        ]
-        parts = zip(cofactors(g).unbind(-1), products, strict=True)
-        total = sum(m * x.sum(-1) for m, x in parts)
-        found.append(element.weights * total / area_element(g))
-    return torch.cat(found) if found else metric.new_zeros(metric.shape[:2])
+    """Weights times w u at the Gauss points."""
+    return element.weights * area_element(metric) * (blocks @ squares(element).T)
 
 
 class _Prolonged(torch.autograd.Function):

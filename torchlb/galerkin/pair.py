@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 import torch
@@ -17,7 +18,7 @@ from torchlb.galerkin.boundary import boundary_nodes
 from torchlb.galerkin.coarse import boundary_shares
 from torchlb.galerkin.curving import CurvedMesh, CurvingPlan, curve
 from torchlb.galerkin.elements import simplex
-from torchlb.galerkin.forms import Forms, products, slopes, upper_congruence
+from torchlb.galerkin.forms import Forms, upper_congruence
 from torchlb.galerkin.nodes import lagrange_nodes
 from torchlb.galerkin.prolongation import prolonged
 from torchlb.geometry.local_fits import FitPlan, LocalFits
@@ -128,7 +129,13 @@ ELEMENTS = {1: (2, (2,)), 2: (2, (2,)), 3: (2, (3, 2)), 4: (3, (4, 2)), 5: (4, (
 """Degree r of the elements, and degrees m of the fits of functions, best first, by the order p; above 5 as for 5."""
 
 
-FormName = Literal["stiffness", "mass", "lumped"]
+class BilinearForm(NamedTuple):
+    """Σ_k c_k w_kᵀA u_k of constant functions w, u (N, C) and numbers c (C,), A by its name."""
+
+    name: Literal["stiffness", "mass", "lumped"]
+    w: Float[Tensor, "N C"]
+    u: Float[Tensor, "N C"]
+    c: Float[Tensor, " C"]
 
 
 @dataclass(frozen=True)
@@ -168,23 +175,28 @@ class PairPlan:
         mesh = self.curving.at(fits.points, self.fits, fits)
         return assembled_pair(self, fits, mesh, numbering, self.patterns)[0]
 
-    def bilinear(
-        self, name: FormName, fits: LocalFits, w: Float[Tensor, "N C"], u: Float[Tensor, "N C"]
-    ) -> Float[Tensor, ""]:
-        """Σ_c w_cᵀK u_c, or Σ_c w_cᵀM u_c, differentiable in the points of the fits: the matrix is not made.
+    def bilinear(self, fits: LocalFits, forms: Sequence[BilinearForm]) -> Float[Tensor, ""]:
+        """Σ of bilinear forms, differentiable in the points of the fits: no matrix is made.
 
-        "lumped" is the latter with the rows of P that the mass of the vertices is found by: w = 1 makes Σ_i m_i u_i.
+        "lumped" is "mass" with the rows of P that the mass of the vertices is found by: with w = 1 it is Σ_i m_i u_i.
         """
         mesh = self.curving.at(fits.points, self.fits, fits)
         rest = self.stars, self.shares
-        forms = Forms.curved(self.fits, fits, self.curving, mesh, *rest, prolong=False)
-        bent, curving = self.curving.bent, self.curving
-        if name == "lumped":
-            curving = replace(curving, bent=bent.index_fill(0, self.lowered, False))
-        both = prolonged(self.fits, fits, curving, mesh, torch.cat([w, u], 1))
-        nodes = list(both.split(w.shape[1], 1))
-        density = forms.densities(slopes if name == "stiffness" else products, nodes, [w, u])
-        return torch.stack([part.sum() for part in density]).sum()
+        elements = Forms.curved(self.fits, fits, self.curving, mesh, *rest, prolong=False)
+        flat = self.curving.bent.index_fill(0, self.lowered, False)
+        total = []
+        for lumped, curving in ((False, self.curving), (True, replace(self.curving, bent=flat))):
+            chosen = [form for form in forms if (form.name == "lumped") == lumped]
+            functions = {id(f): f for form in chosen for f in (form.w, form.u)}
+            if functions:
+                widths = [f.shape[1] for f in functions.values()]
+                every = torch.cat(list(functions.values()), 1)
+                at_nodes = prolonged(self.fits, fits, curving, mesh, every).split(widths, 1)
+                nodes = dict(zip(functions, at_nodes, strict=True))
+                for form in chosen:
+                    both = [nodes[id(form.w)], nodes[id(form.u)]]
+                    total.append(elements.form(form.name, both, [form.w, form.u], form.c))
+        return torch.stack(total).sum()
 
     @property
     def counts(self) -> Int[Tensor, "4 N"]:

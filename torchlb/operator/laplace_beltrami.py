@@ -11,7 +11,7 @@ from torch import Tensor
 
 from torchlb.certified.certificate import Certificate
 from torchlb.cloud.surface import SurfaceSummary
-from torchlb.errors import DerivativeError, InputError, InputTypeError
+from torchlb.errors import InputError, InputTypeError
 from torchlb.fits.rules import WeightsName
 from torchlb.geometry.frames import Projection
 from torchlb.linalg.csr import Csr, Record
@@ -31,7 +31,7 @@ from torchlb.operator.parts import Modes, PairMatrices
 from torchlb.operator.plan import Plan, evaluate
 from torchlb.operator.stencil_methods import StencilMethods
 from torchlb.operator.storage import FIT_FIELDS, ROW_FIELDS
-from torchlb.operator.through import known, refused
+from torchlb.operator.through import carrying, through_product
 from torchlb.spectral.eigenbasis import (
     stack_eigenbases,
     unstack_eigenbases,
@@ -144,7 +144,7 @@ class LaplaceBeltrami(StencilMethods, PairMethods):
             given = {"normals": normals, "boundary": boundary, "reconstruction": reconstruct}
             built = build_cloud(points, dim, options, **given, progress=progress)
             lb = cls._from_assembled(built, points)
-        return lb._carrying(points)
+        return carrying(lb, points)
 
     @classmethod
     def from_mesh(
@@ -190,7 +190,7 @@ class LaplaceBeltrami(StencilMethods, PairMethods):
         with torch.inference_mode(False):
             built = build.build_mesh(vertices, faces, options, boundary=boundary, progress=progress)
             lb = cls._from_assembled(built, vertices)
-        return lb._carrying(vertices)
+        return carrying(lb, vertices)
 
     @classmethod
     def from_cotangent(cls, vertices: ArrayLike, faces: ArrayLike) -> LaplaceBeltrami:
@@ -290,24 +290,7 @@ class LaplaceBeltrami(StencilMethods, PairMethods):
         with torch.inference_mode(False):
             built = replace(evaluate(self.plan, there), surface=self.surface, plan=self.plan)
             lb = self._from_assembled(built, points).to(self.device)
-        return lb._carrying(points)
-
-    def _carrying(self, points: ArrayLike) -> LaplaceBeltrami:
-        """Itself; where points require a gradient, it comes by what has one, and errors by all else."""
-        if not (isinstance(points, Tensor) and points.requires_grad and torch.is_grad_enabled()):
-            return self
-        if not self.has_weak_form or len(self.weak.near.values) > 3 or len(self.plan.moved):
-            raise DerivativeError(
-                "points: they require gradients, which there are none of without a weak pair, with a Robin condition, "
-                "and of noisy curves, whose points are moved; pass points.detach() if results may be constants of them"
-            )
-        ones = torch.ones(self.num_points, 1, dtype=torch.float64)
-        self.points = points.to(self.points).view_as(self.points)  # a buffer is no Parameter
-        self.mass = known(points, self.mass, self.plan, lambda g: {"lumped": (ones, g[:, None])})
-        self.stencil.values = refused(points, self.stencil.values, "rows of Δ and ∇")
-        self.frames = refused(points, self.frames, "frames")
-        self.normals = refused(points, self.normals, "normals")
-        return self
+        return carrying(lb, points)
 
     def product(self, name: MatrixName, f: Tensor) -> Tensor:
         """A matrix of the operator times f, of the shape of f, differentiable in f any number of times.
@@ -326,17 +309,7 @@ class LaplaceBeltrami(StencilMethods, PairMethods):
         """
         matrices, channel = self._channel(name)
         result = matrices.product(channel, f)
-        if not self.points.requires_grad:
-            return result
-        if name == "boundary_mass":
-            return result + refused(self.points, torch.zeros_like(result), name)
-        other = f.detach().cpu().double()
-        other = other[:, None] if f.ndim == 1 else other.transpose(0, -2).flatten(1)
-
-        def forms(g: Tensor) -> dict[Any, Any]:
-            return {name: (g[:, None] if g.ndim == 1 else g.transpose(0, -2).flatten(1), other)}
-
-        return result + known(self.points, torch.zeros_like(result), self.plan, forms)
+        return through_product(self, name, f, result) if self.points.requires_grad else result
 
     def unbatch(self) -> list[LaplaceBeltrami]:
         """The operators of the shapes of a `batch`, with all that they had: certificates, spectral radii, eigenbases.

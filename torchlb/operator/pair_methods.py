@@ -9,6 +9,7 @@ from scipy import sparse
 from torch import Tensor
 
 from torchlb.errors import InputError
+from torchlb.galerkin.pair import BilinearForm
 from torchlb.linalg.csr import Csr
 from torchlb.linalg.sparse import to_scipy
 from torchlb.linalg.threads import threads_for
@@ -133,8 +134,10 @@ class PairMethods(OperatorStorage):
 
         squares = basis.eigenvalues.cpu().double()
 
-        def forms(g: Tensor) -> dict[Any, Any]:
-            return {"stiffness": (g * vectors, vectors), "mass": (-g * squares * vectors, vectors)}
+        def forms(g: Tensor) -> list[BilinearForm]:
+            functions = vectors, vectors
+            of_mass = BilinearForm("mass", *functions, -g * squares)
+            return [BilinearForm("stiffness", *functions, g), of_mass]
 
         values = known(points, basis.eigenvalues, self.plan, forms)
         sides = (refused(points, t, "eigenvectors") for t in (basis.eigenvectors, basis.left))

@@ -7,7 +7,9 @@ points that the plan was made from those of the operator, at points that moved a
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cache
 
 import torch
 from jaxtyping import Float, Int
@@ -15,7 +17,7 @@ from torch import Tensor
 
 from torchlb.errors import InputError, renumbered
 from torchlb.galerkin.forms import Forms
-from torchlb.galerkin.pair import FormName, PairPlan
+from torchlb.galerkin.pair import BilinearForm, PairPlan
 from torchlb.geometry.numbering import Numbering
 from torchlb.linalg.threads import threads_for
 from torchlb.operator.assembled import AssembledOperator
@@ -73,17 +75,15 @@ class Plan:
         return self.pair.forms(fits).restored(self.numbering, self.order, len(self.faces))
 
     def gradient(
-        self, points: Float[Tensor, "N n"], forms: dict[FormName, tuple[Tensor, Tensor]]
+        self, points: Float[Tensor, "N n"], forms: Sequence[BilinearForm]
     ) -> Float[Tensor, "N n"]:
-        """The derivative in the user's points of the sum of bilinear forms of constant functions (w, u), (N, C)."""
+        """The derivative in the user's points of the sum of bilinear forms of functions at the user's points."""
+        sort = cache(self.numbering.sorted)  # a function that stands in two forms is one
+        forms = [form._replace(w=sort(form.w), u=sort(form.u)) for form in forms]
         with torch.enable_grad():
             x = points.requires_grad_()
             _, fits = self.shape.at(self._sorted(x))
-            parts = [
-                self.pair.bilinear(name, fits, *(self.numbering.sorted(f) for f in pair))
-                for name, pair in forms.items()
-            ]
-            return torch.autograd.grad(torch.stack(parts).sum(), x)[0]
+            return torch.autograd.grad(self.pair.bilinear(fits, forms), x)[0]
 
     def _sorted(self, points: Float[Tensor, "N n"]) -> Float[Tensor, "N n"]:
         if len(self.moved):

@@ -15,12 +15,12 @@ from jaxtyping import Float
 from torch import Tensor
 
 from torchlb.errors import DerivativeError
-from torchlb.galerkin.pair import FormName
+from torchlb.galerkin.pair import BilinearForm
 from torchlb.linalg.once import once_differentiable
 from torchlb.operator.plan import Plan
 
-Forms = Callable[[Float[Tensor, "..."]], dict[FormName, tuple[Tensor, Tensor]]]
-"""From the gradient of a result functions w and u, (N, C), of bilinear forms whose sum has its derivative."""
+Forms = Callable[[Float[Tensor, "..."]], list[BilinearForm]]
+"""From the gradient of a result the bilinear forms whose sum has its derivative."""
 
 
 class _Known(torch.autograd.Function):
@@ -65,3 +65,48 @@ class _Refused(torch.autograd.Function):
 def refused(points: Tensor, value: Tensor, what: str) -> Tensor:
     """The value, which raises DerivativeError where its derivative in the points is asked for."""
     return _Refused.apply(points, value.detach(), what)  # pyright: ignore[reportReturnType]
+
+
+def carrying(lb: Any, points: Any) -> Any:
+    """The operator; where points require a gradient, it comes by what has one, and errors by all else.
+
+    Raises
+    ------
+    DerivativeError
+        Where nothing of the operator has a derivative.
+    """
+    if not (isinstance(points, Tensor) and points.requires_grad and torch.is_grad_enabled()):
+        return lb
+    if not lb.has_weak_form or len(lb.weak.near.values) > 3 or len(lb.plan.moved):
+        raise DerivativeError(
+            "points: they require gradients, which there are none of without a weak pair, with a Robin condition, "
+            "and of noisy curves, whose points are moved; pass points.detach() if results may be constants of them"
+        )
+    one = torch.ones(lb.num_points, 1, dtype=torch.float64)
+
+    def forms(g: Tensor) -> list[BilinearForm]:
+        return [BilinearForm("lumped", one, g[:, None], one[0])]
+
+    lb.points = points.to(lb.points).view_as(lb.points)  # a buffer is no Parameter
+    lb.mass = known(points, lb.mass, lb.plan, forms)
+    lb.stencil.values = refused(points, lb.stencil.values, "rows of Δ and ∇")
+    lb.frames = refused(points, lb.frames, "frames")
+    lb.normals = refused(points, lb.normals, "normals")
+    return lb
+
+
+def through_product(lb: Any, name: Any, f: Tensor, result: Tensor) -> Tensor:
+    """The product of a matrix and f with its derivative in the points."""
+    if name == "boundary_mass":
+        return result + refused(lb.points, torch.zeros_like(result), name)
+
+    def columns(x: Tensor) -> Tensor:
+        x = x.detach().cpu().double()
+        return x[:, None] if x.ndim == 1 else x.transpose(0, -2).flatten(1)
+
+    other = columns(f)
+
+    def forms(g: Tensor) -> list[BilinearForm]:
+        return [BilinearForm(name, columns(g), other, torch.ones(other.shape[1]).double())]
+
+    return result + known(lb.points, torch.zeros_like(result), lb.plan, forms)
