@@ -1,4 +1,4 @@
-"""What torchlb raises and warns of. Bad input is an `InputError`; everything raised is a `TorchlbError`."""
+"""Errors and warnings of torchlb. Bad input raises an `InputError`; every error is a `TorchlbError`."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ HERE = str(Path(__file__).parent)
 
 
 class TorchlbError(ValueError):
-    """Base of all errors of torchlb; the message says what was expected, what came, where, and what to do."""
+    """Base of all errors of torchlb; messages say what was expected, what came, where, and what to do."""
 
 
 class InputError(TorchlbError):
@@ -39,7 +39,7 @@ class InputError(TorchlbError):
 
 
 class InputTypeError(InputError, TypeError):
-    """An argument of another type than asked for, also a `TypeError`; the message says what makes the right one."""
+    """An argument of the wrong type, also a `TypeError`; the message says how to make one of the right type."""
 
 
 class StencilError(InputError):
@@ -47,23 +47,23 @@ class StencilError(InputError):
 
 
 class StabilityError(TorchlbError):
-    """Nothing can be said of stability: the operator is singular beyond its constants."""
+    """Stability cannot be decided: the operator is singular beyond its constants."""
 
 
 class EigenbasisError(TorchlbError):
-    """The eigenpairs cannot be had: no convergence, a growing mode, or a cut through a cluster."""
+    """The eigenpairs cannot be computed: no convergence, a growing mode, or a cut through a cluster."""
 
 
 class DiffusionError(TorchlbError):
-    """A flow cannot be computed by the method asked for; the message names one that can."""
+    """The flow cannot be computed by this method; the message names one that can."""
 
 
 class DerivativeError(TorchlbError, RuntimeError):
-    """A second derivative of what is differentiable once, also a `RuntimeError`; the message says what to take."""
+    """A second derivative of what is differentiable once, also a `RuntimeError`; the message names a remedy."""
 
 
 class OperatorFileError(TorchlbError):
-    """A file that is no operator, or a damaged one; the message names it and says what to do."""
+    """A damaged file, or one that is no operator; the message names it and says what to do."""
 
 
 class StabilityWarning(UserWarning):
@@ -71,7 +71,7 @@ class StabilityWarning(UserWarning):
 
 
 class CacheWarning(UserWarning):
-    """A file of a cache was damaged, outdated, or could not be written; the message names it."""
+    """A cache file was damaged, outdated, or could not be written; the message names it."""
 
 
 _GIVEN: ContextVar[Any] = ContextVar("given", default=None)
@@ -79,7 +79,7 @@ _GIVEN: ContextVar[Any] = ContextVar("given", default=None)
 
 @contextmanager
 def renumbered(given: Any) -> Iterator[None]:
-    """Within it messages name points by the numbers `given` to them by the user, (N,)."""
+    """Context in which messages name points by the user's numbers `given`, (N,)."""
     token = _GIVEN.set(given)
     try:
         yield
@@ -88,19 +88,19 @@ def renumbered(given: Any) -> Iterator[None]:
 
 
 def as_given(index: Any) -> Any:
-    """The user's numbers of points."""
+    """User's numbers of the points in `index`."""
     given = _GIVEN.get()
     return index if given is None else given[index]
 
 
 def first_few(index: Any, limit: int = 8) -> str:
-    """The smallest of an array of points, by the user's numbers, for a message."""
+    """Smallest of an array of points, in the user's numbers, for a message."""
     names = sorted(as_given(index).tolist())[:limit]
     return ", ".join(map(str, names)) + (", …" if len(index) > limit else "")
 
 
 def warn(message: str, category: type[Warning] = UserWarning) -> None:
-    """Warn of the line outside torchlb from which the call came."""
+    """Issue a warning at the line outside torchlb from which the call came."""
     frame, level = sys._getframe(), 1
     while frame.f_back is not None and frame.f_code.co_filename.startswith(HERE):
         frame, level = frame.f_back, level + 1

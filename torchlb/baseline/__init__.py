@@ -1,4 +1,1 @@
-"""The low-order peer as strong-form rows, analyst's sign; the only import of its library.
-
-`cotangent`: libigl's cotangent operator.
-"""
+"""The low-order peer, libigl's `cotangent` operator, as strong-form rows; the only import of its library."""

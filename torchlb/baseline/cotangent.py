@@ -15,9 +15,9 @@ from torchlb.linalg.sparse import with_diagonal
 def cotangent_laplacian(
     vertices: Float[Tensor, "N n"], faces: Int[Tensor, "F 3"]
 ) -> tuple[sparse.csr_array, Float[Tensor, " N"]]:
-    """libigl's cotangent matrix C (negative semidefinite, weak) and Voronoi mass, as (M⁻¹C, diagonal of M).
+    """(M⁻¹C, diagonal of M), with libigl's cotangent matrix C (negative semidefinite, weak) and Voronoi mass M.
 
-    Units: 1/ℓ² and ℓ². InputError if a vertex has no area, or a triangle around it.
+    Units: 1/ℓ² and ℓ². Raises InputError if a vertex has no area, or a triangle around it.
     """
     import igl
 

@@ -1,15 +1,14 @@
-"""From points to a complex, and what is doubtful about it (`method.md`, sections 4, 6 and 12).
+"""Reconstruction of a complex through a cloud, and what is doubtful about it (`method.md`, sections 4, 6 and 12).
 
-`reconstruct` makes a `Complex` (`complexes`, `reconstruction`): of a `curve` chains of segments, of a `solid`
-Delaunay tetrahedra, of a `surface` in R² and R³ triangles, of all else the stars of the `tangential` Delaunay complex.
+`reconstruct` makes a `Complex` (`complexes`, `reconstruction`): chains of segments for a `curve`, Delaunay tetrahedra
+for a `solid`, triangles for a `surface` in R² and R³, and the stars of the `tangential` Delaunay complex otherwise.
 
-A surface through a cloud of points, `surface`, is found in steps:
-`outliers`, which points lie on none; `frames`, tangent planes and normals; `orientation`, which way is out by
-neighbours; `noise`, where the points belong; `cocone`, tetrahedra and candidates for triangles; `poles`,
-which way is out by Voronoi cells; `manifold`, which triangles hang together; `gaps`, filled and closed; `stars`,
-where no sheet goes through. `doubtful`: what it may join or close in error, and what that does; `doubts`: warnings of
-that, which name the `places`. Where cells overlap the `boundary` is that of a mask, with the sizes of `voronoi`
-cells in the tangent plane.
+The steps of `surface` are: `outliers`, lone points; `frames`, tangent planes and normals; `orientation`, signs of the
+normals by neighbours; `noise`, denoising; `cocone`, Delaunay tetrahedra and candidate triangles; `poles`, inside and
+outside by Voronoi cells; `manifold`, fans, patches and winding; `gaps`, filled and closed; `stars`, local triangles
+where no sheet passes. `doubtful`: triangles that may join or close in error, and their effect; `doubts`: the warnings,
+which name `places`. Where cells overlap, the `boundary` comes from a mask, with the sizes of `voronoi` cells in the
+tangent plane.
 """
 
 from torchlb.cloud.complexes import Complex

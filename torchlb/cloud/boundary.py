@@ -1,4 +1,4 @@
-"""A boundary of a cloud that a user marks, or that is to be detected: its points, and the conormals there."""
+"""Boundary of a cloud, marked by the user or to be detected: its points, and the conormals there."""
 
 from __future__ import annotations
 
@@ -18,27 +18,27 @@ from torchlb.geometry.thresholds import RING
 
 @dataclass(frozen=True)
 class CloudBoundaryPlan(BoundaryPlan):
-    """What is decided about the boundary of a cloud that is marked, and is not that of a complex.
+    """Neighbours of the boundary points of a cloud, where a mask gives the boundary and not a complex.
 
     Attributes
     ----------
     inside
-        (b, q), points off the boundary, on whose side the shape is.
+        (b, q), nearest points off the boundary, which tell the side of the shape.
     near
-        (b, K), the nearest boundary points by their places among `members`, from which the first tangents are.
+        (b, K), nearest boundary points by their position in `members`, for the initial tangents.
     """
 
     inside: Int[Tensor, "_ q"]
     near: Int[Tensor, "_ K"]
 
     def initial(self, points: Float[Tensor, "N n"]) -> Float[Tensor, "b n d_minus_1"]:
-        """The boundary's first tangents."""
+        """Initial tangents of the boundary."""
         return cloud_frames(points[self.members], self.near, self.sides.shape[1] - 1)
 
     def measures(
         self, points: Float[Tensor, "N n"]
     ) -> tuple[Float[Tensor, "b n"], Float[Tensor, " b"], Float[Tensor, " b"]]:
-        """Vectors that leave the shape; volumes of the boundary's own Voronoi cells, and no folds."""
+        """Outward vectors; volumes of the Voronoi cells within the boundary; folds, all 1."""
         own, ends = points[self.members], self.sides.shape[1] == 1
         size = torch.full_like(own[:, 0], float(ends))  # a single point of a boundary has no length
         if self.near.shape[1] > 1:

@@ -1,8 +1,8 @@
-"""Triangles for a cloud (`method.md`, section 12): normals, Delaunay triangles near the surface, the best of them.
+"""Delaunay tetrahedra of a cloud, and the triangles among them that may form its surface (`method.md`, section 12).
 
-A triangle of the Delaunay tetrahedra belongs to the surface where one of the two beside it is outside and the other
-inside, or else where its dual edge, between their circumcentres, comes close to the tangent planes of its corners:
-leaves their double cone, the *cocone*.
+A triangle belongs to the surface if one of the two tetrahedra beside it is outside and the other inside; or else if its
+dual edge, between their circumcentres, reaches into the *cocone* at each corner, which is the complement of the double
+cone around the normal (Amenta, Choi, Dey and Leekha 2000).
 """
 
 from __future__ import annotations
@@ -21,17 +21,17 @@ from torchlb.geometry.vectors import inner, largest, lengths, smallest
 from torchlb.linalg.precision import LOW, NEGLIGIBLE, ROUNDING, SINGLE, TINY
 
 COCONE = np.sqrt((1 - LEVEL) / 2)
-"""Sine of the half-angle, 22.5°, between a tangent plane and the double cone that a dual edge has to leave."""
+"""Sine of the largest angle, 22.5°, between the tangent plane and a direction in the cocone."""
 REACH = 2.0
-"""The reach of a point is so many times the distance to its eighth neighbour; so wide a loop is closed."""
+"""Reach of a point over the distance to its eighth neighbour; and width of a loop that is closed, over the reach."""
 RAISED = 1e-2
-"""Points are moved at random before they are triangulated, and along the normals by this share of it: those on a circle
-then have one layer of triangles, not several that mix."""
+"""Share of the random displacements before a triangulation that is kept along the normals: points on a circle then have
+one layer of triangles, not several that mix."""
 
 
 @dataclass(frozen=True)
 class Cloud:
-    """What triangles are made from.
+    """Points with normals and neighbours, from which triangles are made.
 
     Attributes
     ----------
@@ -42,7 +42,7 @@ class Cloud:
     neighbors
         (N, K), nearest points, itself first.
     reach
-        (N,), ℓ: of a triangle the circumradius is no larger than those of its corners; half if all are on the boundary.
+        (N,), ℓ, largest circumradius of a triangle at each point; half of it if all corners are on the boundary.
     boundary
         (N,), points of a declared boundary.
     """
@@ -64,9 +64,9 @@ class Cloud:
         return one * two * three / (2 * twice), normal / twice[:, None]
 
     def limits(self, faces: Faces) -> Float[np.ndarray, " F"]:
-        """Their largest circumradii, ℓ: the least reach of the corners, or the largest where density changes at once.
+        """Largest circumradii of triangles, ℓ: the least reach of the corners, or the largest where the density jumps.
 
-        All the nearest of a dense point at such a place are on its own side. Triangles across it have to lie level.
+        All neighbours of a point on the dense side of a jump lie on that side. Triangles across it have to be level.
         """
         reach = self.reach.take(faces)
         limit, widest = smallest(reach), largest(reach)
@@ -77,34 +77,34 @@ class Cloud:
         return limit / np.where(smallest(self.boundary.take(faces)), 2, 1)
 
     def alignment(self, normal: Float[np.ndarray, "F 3"], faces: Faces) -> Float[np.ndarray, " F"]:
-        """The least cosine between a triangle's normal and those of its corners, on either side."""
+        """Least |cosine| between the normal of each triangle and those of its corners."""
         return smallest(np.abs(inner(normal[:, None], self.normals.take(faces, 0))))
 
     @cached_property
     def around(self) -> Float[np.ndarray, " N"]:
-        """The reach of each point by all its neighbours, ℓ."""
+        """Reach of each point by all its neighbours, ℓ."""
         far = lengths(self.points[self.neighbors[:, -1]] - self.points)
         return np.maximum(self.reach, REACH * far)
 
     def small(self, faces: Faces) -> Faces:
-        """Those within the reach of their corners."""
+        """Triangles within the reach of their corners."""
         return faces[self.circles(faces)[0] <= self.limits(faces)]
 
 
 @dataclass(frozen=True)
 class Tetrahedra:
-    """Delaunay tetrahedra of a cloud; their circumcentres are the corners of its Voronoi cells.
+    """Delaunay tetrahedra of a cloud; their circumcentres are the vertices of its Voronoi cells.
 
     Attributes
     ----------
     cells
-        (T, 4).
+        (T, 4), corners.
     centers
-        (T + H, 3), ℓ, of the circumscribed spheres; then, beyond each triangle of the hull, a point far away.
+        (T + H, 3), ℓ, circumcentres; then, beyond each triangle of the hull, a point far away.
     triangles
         (F, 3), each once.
     sides
-        Numbers of the tetrahedra on its two sides, (F,) each; the triangles of the hull have numbers after them.
+        Indices into `centers` for the two sides of each triangle, (F,) each.
     hull
         (F,), which triangles are on the convex hull.
     """
@@ -123,10 +123,10 @@ class Tetrahedra:
         normals: Float[np.ndarray, "N 3"],
         spacing: Float[np.ndarray, " N"],
     ) -> Tetrahedra:
-        """Those of a cloud that lies in no plane; its normals, unit, and `spacing`, ℓ, to the nearest other point.
+        """Triangulate a cloud in no plane, with unit normals; `spacing` is the distance to the nearest point, ℓ.
 
-        Points are moved a little for it, mostly along the surface: many on one sphere are one cell with as many
-        corners, which takes Qhull a time quadratic in their number (7,000: 15 s, moved 0.3 s).
+        Points are perturbed first, mostly along the surface: cospherical points form one cell with as many corners, for
+        which Qhull takes a time quadratic in their number (7,000: 15 s, perturbed 0.3 s).
         """
         random = np.random.default_rng(0).standard_normal(points.shape)
         random -= (1 - RAISED) * inner(random, normals)[:, None] * normals
@@ -159,18 +159,18 @@ class Tetrahedra:
         return cls(points, cells, centers, triangles, (first, second), hull)
 
     def ends(self, triangles: Any = slice(None)) -> tuple[np.ndarray, np.ndarray]:
-        """Centers of the spheres on the two sides of triangles, (F, 3) each, ℓ."""
+        """Circumcentres on the two sides of triangles, (F, 3) each, ℓ."""
         one, two = (self.centers[side[triangles]] for side in self.sides)
         return one, two
 
     def candidates(self, cloud: Cloud, side: Float[np.ndarray, " S"]) -> Candidates:
-        """Small triangles that may be of the surface; `side` tells the spheres outside of it from those inside."""
+        """Candidate triangles of the surface; `side` is 1 for spheres outside of it, −1 for those inside."""
         radius, normal = cloud.circles(self.triangles)
         kept = radius <= cloud.limits(self.triangles)
         triangles, radius, normal = self.triangles[kept], radius[kept], normal[kept]
         ends = self.ends(kept)
         alignment = cloud.alignment(normal, triangles)
-        tangent = alignment > LOW  # walls between two rims have none
+        tangent = alignment > LOW  # walls between two boundaries are not
         for corner in triangles.T:
             left = np.flatnonzero(tangent)
             apex, axis = (x.take(corner[left], 0) for x in (cloud.points, cloud.normals))
@@ -190,20 +190,20 @@ class Tetrahedra:
 
 @dataclass(frozen=True)
 class Candidates:
-    """Triangles for a surface, the best first.
+    """Candidate triangles of a surface, best first.
 
     Attributes
     ----------
     small
-        (P, 3), all that are within the reach of their corners, in no order.
+        (P, 3), all triangles within the reach of their corners, in no order.
     triangles
-        (F, 3), of these the tangent and the parting ones.
+        (F, 3), the tangent and the parting ones among these.
     tangent
-        (F,), which pass the cocone test.
+        (F,), which triangles pass the cocone test.
     parting
-        (F,), which have the outside on one side and the inside on the other.
+        (F,), which triangles have the outside on one side and the inside on the other.
     outward
-        (N, 3), ℓ²: the sum of the normals of the small parting ones at each point, as long as their areas.
+        (N, 3), ℓ²: sum of the outward area vectors of the small parting triangles at each point.
     """
 
     small: Faces
@@ -213,12 +213,12 @@ class Candidates:
     outward: Float[np.ndarray, "N 3"]
 
     def best(self, points: Float[np.ndarray, "N 3"], first: Bool[np.ndarray, " F"]) -> Faces:
-        """The manifold of those that are `first`, and of the others what fits to it."""
+        """Manifold of the triangles that are `first`, with those of the others that fit."""
         return best_manifold(points, self.triangles[np.argsort(~first, kind="stable")])
 
 
 def _bounded_centers(points: np.ndarray, cells: Int[np.ndarray, "T 4"]) -> Float[np.ndarray, "T 3"]:
-    """Circumcentres, those of next to no volume not farther away than 1e6 extents of the cloud."""
+    """Circumcentres; those of nearly flat tetrahedra are at most 1e6 extents of the cloud away."""
     total, volume = circumcenters(points, cells)
     with np.errstate(all="ignore"):
         center = total / volume[:, None]
@@ -231,7 +231,7 @@ def _bounded_centers(points: np.ndarray, cells: Int[np.ndarray, "T 4"]) -> Float
 def _leaves_cone(
     apex: np.ndarray, normal: np.ndarray, ends: tuple[np.ndarray, ...]
 ) -> Bool[np.ndarray, " F"]:
-    """Whether a part of the segment between `ends` lies outside of the double cone around the normal."""
+    """Whether the segment between `ends` reaches into the cocone at the apex."""
     rise = []
     for end in ends:
         offset = end - apex
@@ -246,7 +246,7 @@ def conormals(
     head: Int[np.ndarray, "*batch"],
     tip: Int[np.ndarray, "*batch"],
 ) -> Float[np.ndarray, "*batch 3"]:
-    """Unit vectors at a right angle from the edges tail–head to the points `tip`."""
+    """Unit vectors normal to the edges tail–head, towards the points `tip`."""
     start = points.take(tail, 0)
     along, out = points.take(head, 0) - start, points.take(tip, 0) - start
     along /= np.maximum(lengths(along), TINY)[..., None]
@@ -255,9 +255,9 @@ def conormals(
 
 
 def best_manifold(points: Float[np.ndarray, "N 3"], faces: Faces) -> Faces:
-    """Of triangles, best first, each that leaves no edge with three faces or two that fold back.
+    """Greedy choice of triangles, best first, such that no edge has three faces or two that fold back.
 
-    One by one; but where all at an edge may stay nothing has to be decided.
+    Only triangles at an edge where not all can stay are decided one by one.
     """
     edges = edges_of(faces, len(points))
     tail, head = (end.reshape(-1, 3) for end in edges.ends)

@@ -1,4 +1,4 @@
-"""What a reconstruction hands on."""
+"""The result of a reconstruction."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ class Complex:
     Attributes
     ----------
     points
-        (N, n), ℓ: where the shape is at each point; the point itself if the cloud has no noise.
+        (N, n), ℓ: the points, moved onto the shape if the cloud is noisy.
     cells
         (F, d + 1), segments, triangles or tetrahedra.
     shares
-        (F,), which part of each counts, where they overlap; None where all do, and meet as those of a mesh.
+        (F,), share of each cell that counts where cells overlap; None if all count and meet as those of a mesh.
     """
 
     points: Float[Tensor, "N n"]

@@ -1,8 +1,8 @@
-"""Chains of segments through points of curves in any Rⁿ.
+"""Chains of segments through points of curves in any Rⁿ, by NN-crust.
 
-T. K. Dey and P. Kumar, *A simple provable algorithm for curve reconstruction*, 1999: each point is joined to the
-nearest one and to the nearest on its other side, here where both ends agree. What is left loose is joined by the
-shortest segments. A segment longer than the gaps between random points is no part of the curve, which ends there.
+T. K. Dey and P. Kumar, *A simple provable algorithm for curve reconstruction*, 1999: each point is joined to its
+nearest one and to the nearest on its other side, here if both ends agree. Loose ends are joined by the shortest
+segments. A segment longer than the gaps between random points is left out, and the curve ends there.
 """
 
 from __future__ import annotations
@@ -27,10 +27,10 @@ from torchlb.geometry.vectors import inner, lengths
 from torchlb.linalg.precision import TINY
 
 NEAR = 2 * RING
-"""Nearest points among which those beside a point are; and segments on either side that tell how long one is."""
+"""Number of nearest points that hold those beside a point, and of segments on either side that give the spacing."""
 RANDOM = 2.0
-"""A segment is a gap that is 3 + v (ln N + RANDOM) times as long as those around, with v = 0 of points at even steps
-and 1 of random ones: of exponential gaps one in N e⁵ is, then, so that one curve in 150 is cut."""
+"""A segment is a gap if it is 3 + v (ln N + RANDOM) times as long as those around, where v is 0 for evenly spaced
+points and 1 for random ones: one in N e⁵ exponential gaps is as long, so that one curve in 150 is cut."""
 
 Links = Int[np.ndarray, "N 2"]
 
@@ -46,14 +46,14 @@ def cloud_curve(
     Parameters
     ----------
     normals
-        In R²: which side is out, where most of them agree. Closed curves face outward without.
+        Normals in R², whose side the curve faces where most of them agree; without them closed curves face outward.
     boundary
-        Which points are ends, whatever lies beyond.
+        Mask of the points where the curve ends, whatever lies beyond.
 
     Raises
     ------
     InputError
-        For points that are far from all others.
+        If points are far from all others.
     """
     size = min(NEAR + 1, len(points))
     near, oriented = nearest_neighbors(points, size), False
@@ -84,7 +84,7 @@ def cloud_curve(
 
 
 class Chain(NamedTuple):
-    """Points in turn, the first after the last again if it is closed; and how far those around each are apart, ℓ."""
+    """Points in order, the first after the last again if closed; and the mean spacing around each, ℓ."""
 
     points: Int[np.ndarray, " M"]
     closed: bool
@@ -92,7 +92,7 @@ class Chain(NamedTuple):
 
     @property
     def segments(self) -> Int[np.ndarray, "S 2"]:
-        """Of each its two ends."""
+        """End points of the segments."""
         pairs = np.stack([self.points, np.roll(self.points, -1)], 1)
         return pairs if self.closed else pairs[:-1]
 
@@ -104,9 +104,9 @@ def _links(
     noise: float,
     tangents: Float[np.ndarray, "N n"] | None,
 ) -> Links:
-    """The points beside each, −1 for none, where these say the same; those that are `single` have one at most.
+    """(N, 2) points beside each, −1 for none, where both ends agree; at most one for those that are `single`.
 
-    Noisy points are ordered along the tangent, by those that the noise may have moved off it.
+    Noisy points are ordered along the tangent, among those that the noise may have moved off it.
     """
     rows = np.arange(len(points))
     offset = points[near[:, 1:]] - points[:, None]
@@ -138,7 +138,7 @@ def _links(
 def _joined(
     points: Float[np.ndarray, "N n"], links: Links, single: Bool[np.ndarray, " N"], noise: float
 ) -> Links:
-    """Loose points joined to each other by the shortest segments that do not turn back, but for noise."""
+    """Join loose ends by the shortest segments that do not turn back, but for noise."""
     free = np.where(single, 1, 2) - (links >= 0).sum(1)
     loose = np.flatnonzero(free > 0)
     if len(loose) < 2:
@@ -167,7 +167,7 @@ def _joined(
 def _with_passed_by(
     points: Float[np.ndarray, "N n"], near: Int[np.ndarray, "N K"], links: Links
 ) -> Links:
-    """Points that were passed by are put into the segment of a neighbour that grows least, if it does not double."""
+    """Insert points without segments into the neighbouring segment that grows least, unless its length doubles."""
     for i in np.flatnonzero((links < 0).all(1)).tolist():
         best, ends = 1.0, None
         for a in near[i, 1:].tolist():
@@ -183,9 +183,9 @@ def _with_passed_by(
 
 
 def _in_turn(links: Links) -> list[tuple[np.ndarray, bool]]:
-    """The points of every chain in turn, from an end if there is one, and whether it is closed."""
+    """Points of every chain in order, from an end if there is one, and whether it is closed."""
     beside = links.tolist()
-    first = np.argsort((links >= 0).all(1), kind="stable").tolist()  # ends before all others
+    first = np.argsort((links >= 0).all(1), kind="stable").tolist()  # ends of chains first
     seen, chains = np.zeros(len(links), dtype=bool), []
     for start in first:
         if seen[start]:
@@ -203,7 +203,7 @@ def _in_turn(links: Links) -> list[tuple[np.ndarray, bool]]:
 def _cut(
     points: Float[np.ndarray, "N n"], chains: list[tuple[np.ndarray, bool]], noise: float
 ) -> tuple[list[Chain], Int[np.ndarray, " G"]]:
-    """The chains without gaps; and the ends of those gaps that are hardly longer than what is none."""
+    """(chains cut at their gaps; ends of the gaps that are less than twice as long as the limit)."""
     turns = (np.append(chain, chain[:1]) if closed else chain for chain, closed in chains)
     steps, uneven, found = [np.diff(points[turn], axis=0) for turn in turns], [], []
     for step in steps:
@@ -220,9 +220,9 @@ def _cut(
         turn = np.arccos(np.clip(cosine, -1, 1))
         if not closed:
             turn[:1] = 0
-        # half as long again is a gap, too, where the curve would turn back at its two ends together
+        # a segment half as long again is a gap, too, if the angles at its two ends add up to a turn back
         back = turn + np.append(turn[1:], turn[:1] if closed else 0) > OBTUSE
-        back &= noise == 0  # whose short segments have any direction
+        back &= noise == 0  # short segments of noisy points have any direction
         share = length / np.maximum(np.where(back, WIDER, limit) * usual, TINY)
         gap = np.flatnonzero(share > 1)
         for k in gap[(share[gap] < 2) & ~back[gap]].tolist():
@@ -238,7 +238,7 @@ def _cut(
 
 
 def _usual(length: Float[np.ndarray, " S"], closed: bool) -> Float[np.ndarray, " S"]:
-    """The mean of the segments before each, or of those after it, whichever is larger: density may change at once."""
+    """Mean length of the segments before each or of those after it, whichever is larger: the density may jump."""
     count, width = len(length), min(NEAR, len(length) - 1) if closed else 0
     around = np.concatenate([length[count - width :], length, length[:width]])
     total, place = np.append(0, np.cumsum(around)), np.arange(count) + width
@@ -252,7 +252,7 @@ def _usual(length: Float[np.ndarray, " S"], closed: bool) -> Float[np.ndarray, "
 def _facing_out(
     points: Float[np.ndarray, "N 2"], chain: Chain, normals: Float[np.ndarray, "N 2"] | None
 ) -> Int[np.ndarray, "S 2"]:
-    """Segments of a plane curve so that it faces as the normals do; outward if it is closed, or else up."""
+    """Segments of a plane curve, facing as the normals do; without normals outward if closed, else up."""
     a, b = points[chain.segments].swapaxes(0, 1)
     normal = (b - a)[:, ::-1] * [1, -1]
     if normals is not None:
@@ -269,7 +269,7 @@ def _warn(
     noise: float,
     gaps: Int[np.ndarray, " G"],
 ) -> None:
-    """Warnings with the places where points of two parts are close, and gaps are hardly any; and of noise."""
+    """Warn where parts of the curve are close, or gaps are hardly longer than segments; and of noise."""
     number, place, size, spacing = np.zeros((4, len(points)))
     for k, chain in enumerate(chains):
         steps = lengths(np.diff(points[chain.segments], axis=1)[:, 0])

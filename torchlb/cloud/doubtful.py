@@ -1,8 +1,8 @@
-"""Triangles through a cloud that may join what is apart, or wall up what is open; and what its first modes owe them.
+"""Triangles that may join or close in error, and their effect on the first eigenvalues.
 
-Evidence is local and independent of the triangles: a point that its own sheet surrounds has no edge along its normal,
-and no edge is much longer than the points around it are apart. What it is worth is another matter: on a random cloud a
-few triangles are always in doubt, and most change nothing.
+The evidence is local and independent of the triangles: on a sound surface a point surrounded by its own sheet has no
+edge along its normal, and no edge is much longer than the spacing. On a random cloud a few triangles are always in
+doubt, most of them without effect.
 """
 
 from __future__ import annotations
@@ -28,13 +28,13 @@ from torchlb.geometry.vectors import inner, largest, lengths
 from torchlb.linalg.precision import DENSE, NEGLIGIBLE, ROOT_EPS, SMALL
 
 PAIRS = 11
-"""Number of modes, the constant among them."""
+"""Number of eigenpairs, the constant included."""
 
 
 def _surrounded(
     points: Float[Tensor, "N 3"], normals: Float[Tensor, "N 3"], near: Int[Tensor, "B K"]
 ) -> Bool[np.ndarray, " B"]:
-    """Which first points of the rows have their own sheet all round, in the tangent plane without a gap of 120°."""
+    """Whether the first point of each row is surrounded by its own sheet: no gap of 120° in the tangent plane."""
     good = admissible_neighbors(points, normals, near)[:, 1:]
     good &= good.cumsum(1) <= NEAREST
     flat = (points[near[:, 1:]] - points[near[:, :1]]) @ complete_frames(normals[near[:, 0]])
@@ -46,7 +46,7 @@ def _surrounded(
 
 
 def in_doubt(surface: CloudSurface, faces: Faces) -> Bool[np.ndarray, " F"]:
-    """Which faces have an edge across from a sheet to another, or far longer than the points are apart."""
+    """Triangles with an edge that crosses between sheets, or is far longer than the spacing."""
     points, normals = surface.points.numpy(), surface.normals.numpy()
     near, count = surface.neighbors.numpy(), len(points)
     edges = edges_of(faces, count)
@@ -55,7 +55,7 @@ def in_doubt(surface: CloudSurface, faces: Faces) -> Bool[np.ndarray, " F"]:
     length = lengths(edge)
     spacing, narrow = (spacing_at(points, near, number) for number in (AROUND, AROUND // 2))
     small, large = np.minimum(spacing[i], spacing[j]), np.maximum(spacing[i], spacing[j])
-    # over the larger spacing of their ends, and any over the smaller one
+    # long against the larger spacing of their ends, or against the smaller one
     found = length > np.minimum(REACH * large, FACTOR * small)
     steep_i, steep_j = (np.abs(inner(edge, normals[k])) > LEVEL * length for k in (i, j))
     steep = steep_i | steep_j
@@ -77,10 +77,10 @@ def in_doubt(surface: CloudSurface, faces: Faces) -> Bool[np.ndarray, " F"]:
 
 
 def spectral_change(surface: CloudSurface) -> tuple[float, Bool[np.ndarray, " N"]]:
-    """By how much triangles in doubt raise one of the first eigenvalues over another, to first order; and their points.
+    """(relative rise of one of the first eigenvalues over another by triangles in doubt, to first order; their points).
 
-    An eigenvalue would be lower by their share of the energy ∫|∇φ|² of its mode if they did not conduct: scattered
-    triangles have as much of every mode; a bridge has nearly all of a mode that it alone bounds.
+    Without these triangles an eigenvalue would be lower by their share of the energy ∫|∇φ|² of its mode. Scattered
+    triangles have the same share of every mode; a bridge has nearly all of a mode that it alone bounds.
     """
     points, parts = surface.points.numpy(), (surface.cells.numpy(), surface.stars.numpy())
     faces = np.concatenate(parts)
@@ -91,7 +91,7 @@ def spectral_change(surface: CloudSurface) -> tuple[float, Bool[np.ndarray, " N"
     marked[faces[doubtful]] = True
     stiffness, mass = _elements(points, faces, weight)
     sound, _ = _elements(points, faces, np.where(doubtful, SMALL, 1.0) * weight)
-    used = mass > 0  # in no face at all are none
+    used = mass > 0  # points in no face have none
     stiffness, sound = (sparse.csr_matrix(part[used][:, used]) for part in (stiffness, sound))
     basis = _coarse_space(sound)
     whole, sound, mass = (
@@ -105,7 +105,7 @@ def spectral_change(surface: CloudSurface) -> tuple[float, Bool[np.ndarray, " N"
 
 
 def _coarse_space(sound: sparse.csr_matrix) -> Any:
-    """Smoothed aggregates (Vaněk, Mandel, Brezina 1996), none of which reach across what is in doubt."""
+    """Smoothed aggregates (Vaněk, Mandel, Brezina 1996), none of which reaches across triangles in doubt."""
     import pyamg
 
     hierarchy = pyamg.smoothed_aggregation_solver(
@@ -128,7 +128,7 @@ def _elements(
     faces: Faces,
     weight: Float[np.ndarray, " F"],
 ) -> tuple[sparse.csr_array, Float[np.ndarray, " N"]]:
-    """Stiffness of linear elements and their lumped mass; flat triangles as if a little higher."""
+    """P1 stiffness matrix and lumped mass; the heights of flat triangles are bounded from below."""
     count = len(points)
     side = points[np.roll(faces, -2, 1)] - points[np.roll(faces, -1, 1)]
     longest = largest(lengths(side.reshape(-1, 3)).reshape(-1, 3))

@@ -1,4 +1,4 @@
-"""What may be wrong with the surface through a cloud: warnings that name the points, and what to do."""
+"""Warnings of what may be wrong with the surface through a cloud; they name the points, and what to do."""
 
 from __future__ import annotations
 
@@ -20,17 +20,17 @@ from torchlb.geometry.thresholds import RING, ROUGH, SLIGHT
 from torchlb.linalg.precision import LOW, NEGLIGIBLE, SMALL
 
 CROWD = 256
-"""Neighbour whose distance that to the nearest is compared with where more than the nearest crowd into one place."""
+"""Rank of the neighbour whose distance sets the scale where more points than the nearest crowd into one place."""
 
 
 def warn_of_doubts(surface: CloudSurface, plan: FitPlan, mass: Float[Tensor, " N"]) -> None:
-    """Warnings that name points where a cloud does not resolve its surface, if they are many or hold much of it."""
+    """Warn of points where the cloud does not resolve its surface, if they are many or hold much of its area."""
     apart = ~torch.isin(torch.arange(len(surface.points)), surface.cells)
     doubtful = (plan.reason == REASONS.index("points do not resolve the surface")) | apart
     flat = (plan.degree == 0) | apart
     large = float(mass[flat].sum() / mass.sum()) >= LOW
     doubtful |= flat & large
-    # of a smoothed cloud 0.1 to 0.15 do not at a fifth of the spacing, which leaves eigenvalues within a few per cent
+    # noise of a fifth of the spacing leaves 0.1 to 0.15 unresolved, and eigenvalues within a few per cent
     most = ROUGH if surface.summary.noise else LOW
     if large or float(doubtful.double().mean()) >= most:
         index = doubtful.nonzero()[:, 0]
@@ -41,7 +41,7 @@ def warn_of_doubts(surface: CloudSurface, plan: FitPlan, mass: Float[Tensor, " N
 
 
 def warn_of_joins(surface: CloudSurface) -> None:
-    """A warning where triangles may join what is apart, or close what is open."""
+    """Warn where triangles may join what is apart, or close what is open."""
     points = surface.points
     change, marked = spectral_change(surface)
     if change > LOW:
@@ -55,12 +55,12 @@ def warn_of_joins(surface: CloudSurface) -> None:
 
 
 def on_rim(cells: Int[Tensor, "F corners"], count: int) -> Bool[Tensor, " N"]:
-    """Which points lie on the boundary of a complex."""
+    """Points on the boundary of a complex."""
     return torch.zeros(count, dtype=torch.bool).index_fill(0, boundary_faces(cells).flatten(), True)
 
 
 def warn_of_buried(cells: Int[Tensor, "F corners"], boundary: Bool[Tensor, " N"]) -> None:
-    """A warning where points of a declared boundary lie inside."""
+    """Warn of points of a declared boundary that lie inside the shape."""
     within = torch.isin(torch.arange(len(boundary)), cells) & ~on_rim(cells, len(boundary))
     inside = (boundary & within).nonzero()[:, 0]
     if len(inside) > SLIGHT * int(boundary.sum()):
@@ -74,17 +74,17 @@ def warn_of_buried(cells: Int[Tensor, "F corners"], boundary: Bool[Tensor, " N"]
 def warn_of_near_duplicates(
     points: Float[Tensor, "N n"], neighbors: Int[Tensor, "N K"], dim: int
 ) -> None:
-    """A warning that names points which are closer to another than chance explains, as if scanned twice.
+    """Warn of points that are closer to another than chance explains, as if scanned twice.
 
-    Of points at random the nearest is closer than t times the distance to the one of number m with the probability
-    1 − (1 − t^d)^(m − 1), about (m − 1)t^d, whatever their density.
+    Whatever the density of random points, the nearest is closer than t times the distance of the m-th neighbour with
+    the probability 1 − (1 − t^d)^(m − 1), about (m − 1)t^d.
     """
     last = min(RING, neighbors.shape[1] - 1)
     distance = (points[neighbors[:, 1:]] - points[:, None]).norm(dim=-1)
     nearest, wide = distance.amin(1), distance.amax(1)
     share = (last - 1) * (nearest / distance[:, last - 1]).pow(dim)
     tight = (wide < SMALL * wide.median()).nonzero()[:, 0]
-    if len(tight):  # more than K in one place
+    if len(tight):  # more than K points in one place
         far = min(CROWD, len(points) - 1)
         reach, _ = KDTree(points.numpy()).query(points[tight].numpy(), k=far + 1)
         share[tight] = (far - 1) * (nearest[tight] / torch.from_numpy(reach)[:, -1]).pow(dim)
@@ -105,7 +105,7 @@ def warn_of_near_duplicates(
 
 
 def warn_of_layers(points: Float[Tensor, "N 3"]) -> None:
-    """A warning where much of a cloud is two layers so close that they may be taken for one sheet with noise."""
+    """Warn if much of a cloud lies in two layers so close that they may be taken for one noisy sheet."""
     layered, looked_at = in_two_layers(points.numpy())
     if len(layered) > LOW * looked_at:  # 0.4 and more on plates, 0.001 on noisy shapes
         warn(

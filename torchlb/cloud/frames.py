@@ -18,10 +18,10 @@ from torchlb.linalg.precision import AT_ONCE, ROUNDING, TINY
 def cloud_frames(
     points: Float[Tensor, "N n"], candidates: Int[Tensor, "N K"], dim: int, rounds: int = 3
 ) -> Float[Tensor, "N n d"]:
-    """Initial frames of a cloud: principal components of the nearer half of the candidates, decaying with distance.
+    """Initial frames of a cloud: distance-weighted principal components of the nearer half of the candidates.
 
-    Each further round takes the nearest that the frames before found compatible, so that the other side of a thin
-    sheet drops out. Error O(h) on a smooth surface.
+    Each further round takes the nearest candidates that are compatible by the frames before, so that the other side of
+    a thin sheet drops out. The error is O(h) on a smooth surface.
     """
     planes = None
     frames = torch.empty(0)
@@ -38,9 +38,9 @@ def _principal_directions(
     planes: Float[Tensor, "N n d"] | Float[Tensor, "N n"] | None,
     dim: int,
 ) -> Float[Tensor, "B n d"]:
-    """Leading eigenvectors of the weighted covariance of the nearer half of those that `planes` admit.
+    """Leading eigenvectors of the weighted covariance of the nearer half of the compatible points.
 
-    Where these are too few for a plane, as where those around a corner stand across it, all count.
+    All points count where the compatible ones are too few for a plane, as at a corner whose neighbours stand across it.
     """
     offset = points[index] - points[index[:, :1]]
     distance = offset.norm(dim=-1)
@@ -64,9 +64,9 @@ def refined_normals(
     centers: Int[Tensor, " B"] | None = None,
     rounds: int = 1,
 ) -> Float[Tensor, "N 3"]:
-    """Unit normals, those of `centers` from quadratics through their compatible candidates, error O(h²); not oriented.
+    """Unit normals, at `centers` from quadratics through compatible candidates, with error O(h²); not oriented.
 
-    The quadratics need not go through the point itself, which lessens what noise does to the slope.
+    The quadratics need not pass through the point itself, which lessens the effect of noise on the slope.
     """
     centers = torch.arange(len(points)) if centers is None else centers
     parts = centers.split(AT_ONCE)
@@ -79,7 +79,7 @@ def refined_normals(
 def _slopes_removed(
     points: Float[Tensor, "N 3"], normals: Float[Tensor, "N 3"], index: Int[Tensor, "B K"]
 ) -> Float[Tensor, "B 3"]:
-    """The normals of the first of each row, turned by the slope of a quadratic through the others."""
+    """Normals at the first point of each row, turned by the slope of a quadratic through its neighbours."""
     own = normals[index[:, 0]]
     frames = complete_frames(own)
     offset = points[index] - points[index[:, :1]]

@@ -1,6 +1,6 @@
-"""Gaps of a triangulated cloud: filled from their rims, closed where they are small, and points that were left out.
+"""Gaps of a triangulated cloud: filled from their boundary, closed where they are small, and points in no triangle.
 
-A real boundary stays: no triangle is taken whose circumcircle is larger than the reach of its corners.
+A true boundary stays: no triangle is taken whose circumradius exceeds the reach of its corners.
 """
 
 from __future__ import annotations
@@ -24,12 +24,12 @@ def filled(
     oriented: bool,
     strict: bool,
 ) -> Faces:
-    """The faces and what extends them without folds or overlaps; the very array where there is nothing.
+    """Faces extended by triangles that neither fold nor overlap; the very array if there are none.
 
-    Triangles of the pool, or ears between two boundary edges, best first, in rounds, until nothing fits; no ear has
-    all its corners on a declared boundary. If `oriented`, the faces and normals agree on which way is out, and
-    triangles have to agree with them. If not `strict` they may face away from the normals by nearly a right angle,
-    and overlap what they share no edge with.
+    Triangles of the pool, or ears between two boundary edges, are added best first, in rounds, until none fits; no ear
+    has all its corners on a declared boundary. If `oriented`, faces and normals agree on the outward side, and
+    triangles have to agree with them. If not `strict`, triangles may tilt from the normals by nearly a right angle, and
+    overlap faces with which they share no edge.
     """
     count = len(cloud.points)
     outer = edges_of(faces, count).outer  # only there can anything be added
@@ -60,7 +60,7 @@ def filled(
 
 
 def _ears(edges: Edges, half: Int[np.ndarray, " G"]) -> Faces:
-    """Triangles of two edges of the boundary that meet in a point where no others do."""
+    """Triangles of two boundary edges that meet in a point without further boundary edges."""
     tail, head = (end[half] for end in edges.ends)
     here, there = np.concatenate([tail, head]), np.concatenate([head, tail])
     order = np.argsort(here, kind="stable")
@@ -78,7 +78,7 @@ def _proposals(
     oriented: bool,
     least: float,
 ) -> Faces:
-    """Those of the faces that fit to half-edges of the boundary without a fold or third face, aligned; best first."""
+    """Faces that fit to boundary half-edges without a fold or third face, aligned to the normals; best first."""
     faces = np.unique(np.sort(faces, axis=1), axis=0)
     tail, head = np.roll(faces, -1, 1), np.roll(faces, -2, 1)
     edge, uses = edges.find(tail, head)
@@ -107,7 +107,7 @@ def _proposals(
 
 
 def overlapping(cloud: Cloud, new: Faces, faces: Faces, corners: int = 3) -> Bool[np.ndarray, " T"]:
-    """Which new triangles overlap a face at one of their first corners, seen along the normal there."""
+    """Which new triangles overlap a face at one of their first `corners` corners, seen along the normal there."""
     count = len(cloud.points)
     rows, places = np.nonzero(np.isin(faces, new[:, :corners]))
     point = faces[rows, places]
@@ -135,7 +135,7 @@ def _ranges(sizes: Int[np.ndarray, " n"]) -> Int[np.ndarray, " total"]:
 def _wedges(
     cloud: Cloud, faces: Faces, corner: Int[np.ndarray, " T"]
 ) -> tuple[Float[np.ndarray, "T 3"], ...]:
-    """Unit vectors in the tangent plane of a corner: both sides of the face, its middle, and the normal of the turn."""
+    """(two sides of a face at a corner, their bisector, the normal of the turn): unit, the first three tangential."""
     rows = np.arange(len(faces))
     apex = faces[rows, corner]
     normal = cloud.normals[apex]
@@ -151,7 +151,7 @@ def _wedges(
 
 
 def _meet(one: Float[np.ndarray, "P 4 3"], two: Float[np.ndarray, "P 4 3"]) -> np.ndarray:
-    """Whether a side or the middle of wedge one lies inside of wedge two."""
+    """Whether a side or the bisector of wedge one lies inside wedge two."""
     first, second, turn = two[:, None, 0], two[:, None, 1], two[:, None, 3]
     rays = one[:, :3]
     after = inner(np.cross(first, rays), turn) > SLIGHT
@@ -162,10 +162,10 @@ def _meet(one: Float[np.ndarray, "P 4 3"], two: Float[np.ndarray, "P 4 3"]) -> n
 def closed(
     cloud: Cloud, faces: Faces, kept: Bool[np.ndarray, " N"]
 ) -> tuple[Faces, list[list[int]]]:
-    """The faces with narrow boundary loops closed, ear by ear; and the points of the loops that were.
+    """(faces with narrow boundary loops closed by ear clipping; the loops that were closed).
 
-    A point reaches as far as the triangles at it. Loops stay that have two neighbouring points in the declared
-    boundary, or one in `kept`.
+    The reach of a point is at least that of the triangles at it. A loop stays open if two neighbouring points of it are
+    on the declared boundary, or one is in `kept`.
     """
     count = len(cloud.points)
     edges = edges_of(faces, count)
@@ -188,7 +188,7 @@ def closed(
 
 
 def _clipped(cloud: Cloud, loop: list[int], known: set[int]) -> list[list[int]] | None:
-    """Triangles that close a loop, the best ear first; None where that would use an edge a third time."""
+    """Triangles that close a loop, the best ear first; None if an edge would be used a third time."""
     count, loop, ears = len(cloud.points), list(loop), []
     own: set[int] = set()
     while len(loop) > 3:
@@ -211,7 +211,7 @@ def _clipped(cloud: Cloud, loop: list[int], known: set[int]) -> list[list[int]] 
 
 
 def with_left_points(cloud: Cloud, faces: Faces) -> Faces:
-    """The faces, with each point in none of them put into the one that it stands over, if there is one."""
+    """Faces with each point in no face inserted into the one that it stands over, if there is one."""
     count = len(cloud.points)
     while True:
         outside = np.ones(count, dtype=bool)

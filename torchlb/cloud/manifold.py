@@ -1,4 +1,4 @@
-"""Which triangles of a cloud hang together: fans, patches, boundary loops, and which way round they are wound."""
+"""Fans, patches, winding and boundary loops of the triangles of a cloud."""
 
 from __future__ import annotations
 
@@ -11,18 +11,18 @@ from torchlb.linalg.precision import TINY
 
 
 def patches(faces: Faces, count: int) -> Int[np.ndarray, " F"]:
-    """Number of the patch of each face: faces that hang together by edges of two faces."""
+    """Label of the patch of each face: faces connected by edges of two faces."""
     one, two = edges_of(faces, count).twins
     return components(one // 3, two // 3, len(faces))
 
 
 def with_single_fans(faces: Faces, count: int) -> Faces:
-    """Faces are left out until those around each point are one fan: the closed one, or else the largest.
+    """Prune the faces until those around each point form one fan (umbrella): the closed one, or else the largest.
 
     >>> with_single_fans(np.array([[0, 1, 2], [0, 2, 3], [0, 4, 5]]), 6).tolist()
     [[0, 1, 2], [0, 2, 3]]
     """
-    looked_at = np.ones(count, dtype=bool)  # points; later those alone that have lost a face
+    looked_at = np.ones(count, dtype=bool)  # points; later only those that lost a face
     while len(around := np.flatnonzero(looked_at.take(faces).any(1))):
         part = faces[around]
         one, two = edges_of(part, count).twins
@@ -52,7 +52,7 @@ def with_single_fans(faces: Faces, count: int) -> Faces:
 
 
 def face_vectors(points: Float[np.ndarray, "N 3"], faces: Faces) -> Float[np.ndarray, "F 3"]:
-    """Normals of the faces, as long as their areas, ℓ²."""
+    """Area vectors of the faces: normals as long as the areas, ℓ²."""
     a, b, c = (points.take(corner, 0) for corner in faces.T)
     return np.cross(b - a, c - a) / 2
 
@@ -60,9 +60,9 @@ def face_vectors(points: Float[np.ndarray, "N 3"], faces: Faces) -> Float[np.nda
 def wound_alike(
     points: Float[np.ndarray, "N 3"], faces: Faces
 ) -> tuple[Faces, Bool[np.ndarray, " F"]]:
-    """The faces turned so that neighbours agree, carried along the flattest edges; and which lie at a seam.
+    """(faces wound consistently, carried along the flattest edges; which faces lie at a seam).
 
-    At a seam two neighbours still disagree: the surface has one side only, or a wrong triangle makes it seem so.
+    At a seam neighbours still disagree: the surface is one-sided, or a wrong triangle makes it seem so.
     """
     edges = edges_of(faces, len(points))
     one, two = edges.twins
@@ -82,7 +82,7 @@ def wound_alike(
 def facing_out(
     points: Float[np.ndarray, "N 3"], faces: Faces, outward: Float[np.ndarray, "N 3"]
 ) -> Faces:
-    """The faces turned to the side of the outward vectors at their corners: those of a patch all the same way."""
+    """Faces turned so that every patch as a whole faces the outward vectors at its corners."""
     if len(faces) == 0:
         return faces
     vectors, patch = face_vectors(points, faces), patches(faces, len(points))
@@ -92,7 +92,7 @@ def facing_out(
 
 
 def boundary_loops(faces: Faces, count: int) -> list[list[int]]:
-    """The points of every boundary loop in turn, each walked round from face to face.
+    """Points of every boundary loop in order, each walked round from face to face.
 
     >>> [sorted(loop) for loop in boundary_loops(np.array([[0, 1, 2], [1, 3, 2]]), 4)]
     [[0, 1, 2, 3]]
@@ -109,7 +109,7 @@ def boundary_loops(faces: Faces, count: int) -> list[list[int]]:
         half, at, loop = start, int(head[start]), [int(tail[start])]
         while half not in seen:
             seen.add(half)
-            while True:  # the other side of the face at this point, until nothing lies beyond
+            while True:  # rotate about the point, across faces, up to the next boundary edge
                 face = half - half % 3
                 half = face + next(
                     k for k in range(3) if face + k != half and faces[face // 3, k] != at

@@ -1,4 +1,4 @@
-"""Whether a cloud is noisy, and where its surface lies then (`method.md`, section 12)."""
+"""Noise of a cloud: its detection, and denoising by local quadratics (`method.md`, section 12)."""
 
 from __future__ import annotations
 
@@ -15,15 +15,15 @@ from torchlb.geometry.vectors import dot
 from torchlb.linalg.precision import AT_ONCE, LOW, NEGLIGIBLE, ROUNDING
 
 SMOOTH = 4.0
-"""From this F on what quadratics miss is taken for shape: of clean clouds F is 6 and more, with noise of a twentieth of
-the spacing 1.5 to 4, of pure noise 1."""
+"""F from which on the residual of quadratics is taken for shape: 6 and more of clean clouds, 1.5 to 4 with noise of a
+twentieth of the spacing, 1 of pure noise."""
 SAMPLE = 2000
-"""Points by which a cloud is judged."""
+"""Number of points by which a cloud is judged."""
 PATCH = 40
-"""Points around each whose heights are looked at for two layers."""
+"""Number of points around each whose heights are tested for two layers."""
 UNIMODAL = 1.6
-"""Kurtosis of the residuals of quadratics below which they are of two layers: it is 1 for two values, 9/5 and more for
-whatever has one mode and is symmetric, 3 for a normal law."""
+"""Kurtosis of the residuals of quadratics below which they form two layers: 1 for two values, at least 9/5 for a
+symmetric unimodal distribution, 3 for a normal one."""
 
 
 def denoised(
@@ -31,11 +31,11 @@ def denoised(
     planes: Float[Tensor, "N n"] | Float[Tensor, "N n d"],
     candidates: Int[Tensor, "N K"],
 ) -> tuple[Float[Tensor, "N n"], float]:
-    """Where the shape is, and how far the points are from it, root mean square, ℓ; the points and 0 if it is clean.
+    """(points on the shape; root mean square distance of the cloud from it, ℓ); the points and 0 if it is clean.
 
-    A smooth shape that quadratics do not follow is followed by quartics: F, the variance that the quartic terms take
-    out over that which they leave, is large. Noise has as much in every term. Noisy points move across the shape, along
-    the normals of a surface or orthogonally to tangent frames, onto the quadratics through their neighbourhoods.
+    Quartics follow a smooth shape where quadratics do not: F, the variance removed by the quartic terms over that which
+    remains, is large. Noise has as much in every term. Noisy points move onto the quadratics through their
+    neighbourhoods, along the normals of a surface or orthogonally to tangent frames.
     """
     dim = points.shape[1] - 1 if planes.ndim == 2 else planes.shape[2]
     size, terms = candidates.shape[1], [num_monomials(dim, degree) for degree in (2, 4)]
@@ -61,11 +61,11 @@ def denoised(
 
 
 def in_two_layers(points: Float[np.ndarray, "N 3"]) -> tuple[Int[np.ndarray, " M"], int]:
-    """Of a sample of points those around which points lie in two layers, a spacing apart or closer; and its size.
+    """(sampled points around which points lie in two layers, a spacing apart or closer; size of the sample).
 
-    Noise has one mode: heights over the surface in its midst are the most frequent. Of two layers these are the rarest,
-    and the kurtosis of what quadratics through the nearest points leave tells them apart. Nothing is said of fewer
-    than twice as many points.
+    Noise makes heights over the surface unimodal, most frequent in the middle; of two layers the middle is the rarest,
+    which shows in the kurtosis of the residuals of local quadratics. Clouds of fewer than 2 `PATCH` points are not
+    tested.
     """
     some = np.arange(0, len(points), -(-len(points) // SAMPLE))
     if len(points) < 2 * PATCH:
@@ -88,7 +88,7 @@ def _residuals(
     centers: Int[Tensor, " B"],
     degree: int,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Radius, number of compatible neighbours, sum of squares that polynomials through them leave, height at 0."""
+    """(radius; number of compatible neighbours; sum of squared residuals of polynomials; their offset at 0)."""
     index, plane = candidates[centers], planes[centers]
     offset = points[index] - points[centers, None]
     good = admissible_neighbors(points, planes, index)

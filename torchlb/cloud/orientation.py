@@ -1,8 +1,8 @@
-"""Which way is out: normals made consistent, so that the two sides of a thin shape are told apart.
+"""Consistent orientation of normals, by which the two sides of a thin shape are told apart.
 
-Across an edge a surface is taken for an arc: the normal at one end is the mirror image of that at the other in the
-plane that bisects the edge. So the sign is carried round a crease, where the normals turn, and straight through a thin
-sheet, whose two sides face away from each other.
+Signs are propagated along a spanning tree (Hoppe et al. 1992). Across an edge a surface is taken for an arc: the normal
+at one end is the mirror image of that at the other in the plane that bisects the edge. So the sign is carried round a
+crease, where the normals turn, and straight through a thin sheet, whose two sides face away from each other.
 """
 
 from __future__ import annotations
@@ -19,11 +19,11 @@ from torchlb.geometry.vectors import at, dot
 from torchlb.linalg.precision import LOW
 
 ASTRAY = 3 / 4
-"""Share of the nearest that contradict at a point, from which on it is turned; a half in a field without a side."""
+"""Share of contradicting neighbours above which a normal is flipped; a half suffices where the field has no side."""
 
 
 def nearest_pairs(candidates: Int[Tensor, "N K"]) -> tuple[Int[Tensor, " P"], Int[Tensor, " P"]]:
-    """Pairs (i, j), i < j, of points one of which is among the nearest of the other, each pair once.
+    """Pairs (i, j), i < j, of points one of which is among the candidates of the other, each pair once.
 
     >>> [end.tolist() for end in nearest_pairs(torch.tensor([[0, 1], [1, 0], [2, 1]]))]
     [[0, 1], [1, 2]]
@@ -32,7 +32,7 @@ def nearest_pairs(candidates: Int[Tensor, "N K"]) -> tuple[Int[Tensor, " P"], In
     i = torch.arange(num_points).repeat_interleave(size - 1)
     j = candidates[:, 1:].reshape(-1)
     code = (torch.minimum(i, j) * num_points + torch.maximum(i, j)).numpy()
-    code.sort()  # in a quarter of the time of `torch.unique`
+    code.sort()  # takes a quarter of the time of `torch.unique`
     code = torch.from_numpy(code[np.flatnonzero(np.diff(code, prepend=-1))])
     low, high = code // num_points, code % num_points
     return low[low != high], high[low != high]
@@ -44,10 +44,10 @@ def _across(
     i: Int[Tensor, " P"],
     j: Int[Tensor, " P"],
 ) -> tuple[Float[Tensor, " P"], Bool[Tensor, " P"]]:
-    """(cosine of n_j to the mirror image of n_i; if on an arc).
+    """(cosine between n_j and the mirror image of n_i; whether the edge is the chord of an arc).
 
-    Along an arc that the edge spans it falls under one plane and rises to the other, if the normals agree. Where it
-    does not, the ends may lie on the two sides of a thin sheet.
+    The chord of an arc falls below one tangent plane and rises to the other, if the normals agree. Where it does not,
+    the ends may lie on the two sides of a thin sheet.
     """
     edge, ends = at(points, j) - at(points, i), [at(normals, end) for end in (i, j)]
     edge = edge / edge.norm(dim=1, keepdim=True)
@@ -61,9 +61,9 @@ def _carried(
     normals: Float[Tensor, "N n"],
     candidates: Int[Tensor, "N K"],
 ) -> tuple[Float[Tensor, " N"], Int[Tensor, " N"]]:
-    """(signs that make normals consistent with that of the root of their component, by a spanning tree; these roots).
+    """(signs that make normals consistent with that of the root of their component, along a spanning tree; the roots).
 
-    The root is the extreme point of a component (largest last coordinate); the surest edges of the tree come first.
+    The root is the extreme point of a component (largest last coordinate); the most certain edges enter the tree first.
     """
     pairs = nearest_pairs(candidates)
     cosine, _ = _across(points, normals, *pairs)
@@ -83,11 +83,11 @@ def mended_normals(
     normals: Float[Tensor, "N n"],
     candidates: Int[Tensor, "N K"],
 ) -> tuple[Float[Tensor, "N n"], Bool[Tensor, " N"]]:
-    """Normals of a user with the signs that those around them have, and where these have no side.
+    """(normals of a user with the signs of those around them; points where these have no side).
 
-    Points are turned that most around them contradict, again and again; or signs are carried along a spanning tree, to
-    the side that most of a component have, if fewer neighbours contradict each other then, also of those within 20°.
-    Where many do, and the two sides are as even as chance makes them (three deviations), the component faces out.
+    Normals that most neighbours contradict are flipped, repeatedly; or signs are propagated along a spanning tree, to
+    the side of the majority of a component, if that leaves fewer contradictions, also among normals within 20°. If many
+    contradict, and the sides are as even as chance makes them (three deviations), the component faces outward.
     """
     i, j = nearest_pairs(candidates[:, : RING + 1])
     cosine, arc = _across(points, normals, i, j)
@@ -99,7 +99,7 @@ def mended_normals(
     def contradicted(
         told: Float[Tensor, " P"], side: Float[Tensor, " N"], group: Int[Tensor, " N"]
     ) -> Float[Tensor, " N"]:
-        """Share of the pairs at the points of each group that contradict."""
+        """Share of contradicting pairs at the points of each group."""
         wrong = told * (cosine * side[i] * side[j] < 0)
         total = torch.zeros(2, len(points), dtype=points.dtype)
         for end in (i, j):
@@ -128,7 +128,7 @@ def settled_normals(
     normals: Float[Tensor, "N n"],
     candidates: Int[Tensor, "N K"],
 ) -> tuple[Float[Tensor, "N n"], bool]:
-    """Given normals so that neighbours agree, and whether their side is the user's; warnings say what was changed."""
+    """(normals consistent with their neighbours; whether their side is the user's). Warnings say what was changed."""
     mended, even = mended_normals(points, normals, candidates)
     turned = (((mended * normals).sum(1) < 0) & ~even).nonzero()[:, 0]
     if even.any():

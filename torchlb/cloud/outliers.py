@@ -1,6 +1,6 @@
-"""Lone points of a cloud, as scanners leave them in mid-air: they lie on no surface, and must not join what is apart.
+"""Lone points, which scanners leave in mid-air: they lie on no surface, and must not join what is apart.
 
-At the edges of what a depth camera sees, pixels hang between the front and the back; other scanners leave points about.
+At the edges of a depth image pixels hang between the front and the back; other scanners leave points about.
 """
 
 from __future__ import annotations
@@ -13,24 +13,24 @@ from torchlb.geometry.thresholds import AROUND, RING, ROUGH
 from torchlb.geometry.vectors import inner, lengths
 
 LONE = 2.5
-"""Spacing of a lone point over the lower quartile of its neighbours', at least."""
+"""Least spacing of a lone point, over the lower quartile of its neighbours'."""
 HIGH = 0.2
-"""Sine of the angle at which a lone point stands above the plane of its neighbours, seen from their midst, at least."""
+"""Least sine of the angle at which a lone point stands above the plane of its neighbours, seen from their centroid."""
 
 
 def spacing_at(
     points: Float[np.ndarray, "N 3"], near: Int[np.ndarray, "N K"], number: int = AROUND
 ) -> Float[np.ndarray, " N"]:
-    """How far the points around each are apart: the distance to its neighbour of this number, ℓ."""
+    """Spacing around each point: the distance to its neighbour of this number, ℓ."""
     return lengths(points[near[:, min(number, near.shape[1] - 1)]] - points)
 
 
 def lone_points(
     points: Float[np.ndarray, "N 3"], near: Int[np.ndarray, "N K"]
 ) -> Bool[np.ndarray, " N"]:
-    """Which points are far from all others by the spacing of these, above their plane, and in none with their like.
+    """Points with a far larger spacing than their neighbours, off the plane of these, and in none with their like.
 
-    Where the density of a surface changes at once half a disc of twice the spacing has twelve others of a like spacing.
+    At a jump in density half a disc of twice the spacing holds twelve other points of a like spacing.
     """
     lone = np.zeros(len(points), dtype=bool)
     spacing = spacing_at(points, near)
@@ -56,7 +56,7 @@ def lone_points(
 
 
 def _in_a_plane(offset: Float[np.ndarray, "B K 3"]) -> Bool[np.ndarray, " B"]:
-    """Whether these points and the one that they are given from lie near a plane."""
+    """Whether the points of each row of offsets, and their origin, lie near a plane."""
     offset = np.concatenate([0 * offset[:, :1], offset], 1)
     offset -= offset.mean(1, keepdims=True)
     _, middle, least = np.linalg.svd(offset, compute_uv=False).T
@@ -66,13 +66,13 @@ def _in_a_plane(offset: Float[np.ndarray, "B K 3"]) -> Bool[np.ndarray, " B"]:
 def put_beside(
     points: Float[np.ndarray, "N 3"], lone: Bool[np.ndarray, " N"]
 ) -> Float[np.ndarray, "N 3"]:
-    """The points, but the lone ones on the way from the nearest other point to its neighbours, a third along it."""
+    """All points, the lone ones moved beside the nearest other, at most a third of the way to a neighbour of that."""
     moved, others = points.copy(), np.flatnonzero(~lone)
     tree = KDTree(points[others])
     host = np.asarray(tree.query(points[lone])[1])
     ring = np.asarray(tree.query(points[others[host]], k=min(AROUND + 1, len(others)))[1])
     order = np.argsort(host, kind="stable")
-    turn = np.empty_like(host)  # the number of a lone point among those of its host
+    turn = np.empty_like(host)  # index of a lone point among those of its host
     first = np.searchsorted(host[order], host[order])
     turn[order] = np.arange(len(host)) - first
     size = ring.shape[1] - 1

@@ -11,18 +11,18 @@ from torchlb.linalg.precision import LOW
 
 Places = tuple[tuple[float, ...], ...]
 PLACES = 8
-"""Places that are named where something is in doubt."""
+"""Largest number of places named in a report or a warning."""
 
 
 def in_words(places: Places) -> str:
-    """As (x, y, …), one after the other."""
+    """Coordinates as text: (x, y, …), one after the other."""
     return ", ".join(f"({', '.join(f'{x:g}' for x in place)})" for place in places)
 
 
 def places_of(
     points: Float[np.ndarray, "N n"], near: Int[np.ndarray, "N K"], marked: Bool[np.ndarray, " N"]
 ) -> Places:
-    """Where most of the marked points are, up to `PLACES` points, ℓ."""
+    """Centres of the largest groups of marked points, at most `PLACES` of them, ℓ."""
     i, j = np.arange(len(points)).repeat(near.shape[1] - 1), near[:, 1:].ravel()
     both = marked[i] & marked[j]
     group, width = components(i[both], j[both], len(points))[marked], np.ptp(points, axis=0).max()

@@ -1,7 +1,7 @@
-"""The poles of a point, by which a cloud tells where its inside is (`method.md`, section 12).
+"""Poles of the Voronoi cells of a cloud, which tell its inside (`method.md`, section 12).
 
-The Voronoi cell of a point is long across the surface. Its corners, centres of the Delaunay spheres through the point,
-that are farthest up and down the normal are its two *poles* (Amenta and Bern), and lie on two sides of the surface.
+The Voronoi cell of a point is long across the surface. Of its vertices, the centres of Delaunay spheres through the
+point, those farthest up and down the normal are its two *poles* (Amenta and Bern 1999), on different sides.
 """
 
 from __future__ import annotations
@@ -25,21 +25,21 @@ from torchlb.geometry.vectors import at, dot, inner, lengths
 from torchlb.linalg.precision import LOW, ROUNDING, STEPS, TINY
 
 LONG = 1.4
-"""A Voronoi cell that reaches so many times as far as along the normal has another normal."""
+"""Length of a Voronoi cell over its extent along the normal above which the normal is replaced."""
 SHARP, RESIDUAL = 16.0, 0.01
-"""In a vote on two sides relations weigh exp(SHARP (cosine − 1)); it is solved to this relative residual."""
+"""Relations weigh exp(SHARP (cosine − 1)) in the vote on two sides, which is solved to this relative residual."""
 
 
 @dataclass(frozen=True)
 class Poles:
-    """The corners of the Voronoi cells.
+    """Vertices of the Voronoi cells of all points.
 
     Attributes
     ----------
     tetrahedra
-        Their centres are the corners; beyond the convex hull, the far ends of its triangles are.
+        Tetrahedra whose circumcentres are the vertices; beyond the convex hull, the far points of its triangles are.
     point, ball
-        (R,), a point, and the number of a sphere through it: of a tetrahedron, or of a triangle after them.
+        (R,), point of each ray, and number of a sphere through it: of a tetrahedron, or of a hull triangle after these.
     ray
         (R, 3), ℓ, from the point to the centre.
     """
@@ -51,7 +51,7 @@ class Poles:
 
     @classmethod
     def of(cls, tetrahedra: Tetrahedra) -> Poles:
-        """Those of all points, but for flat tetrahedra."""
+        """Rays of all points, except to flat tetrahedra."""
         points, cells, hull = tetrahedra.points, tetrahedra.cells, tetrahedra.hull
         first = points.take(cells[:, 0], 0)
         u, v, w = (points.take(cells[:, k], 0) - first for k in (1, 2, 3))
@@ -66,7 +66,7 @@ class Poles:
         return cls(tetrahedra, *(torch.from_numpy(x) for x in (point, ball, ray)))
 
     def farthest(self, value: Float[Tensor, " R"]) -> Int[Tensor, " N"]:
-        """Of every point the number of the ray with the largest value."""
+        """Index of the ray with the largest value at every point."""
         count = len(self.tetrahedra.points)
         most = value.new_full((count,), -torch.inf).scatter_reduce(0, self.point, value, "amax")
         rays = (value == at(most, self.point)).nonzero()[:, 0]
@@ -75,7 +75,7 @@ class Poles:
 
     @cached_property
     def _longest(self) -> tuple[Float[Tensor, "N 3"], Float[Tensor, " N"]]:
-        """The longest ray of every point, and its length."""
+        """Longest ray of every point, and its length."""
         length = dot(self.ray, self.ray).sqrt()
         first = self.farthest(length)
         return self.ray[first], length[first]
@@ -83,9 +83,9 @@ class Poles:
     def corrected(
         self, normals: Float[Tensor, "N 3"], where: Bool[Tensor, " N"] | None = None
     ) -> Float[Tensor, "N 3"]:
-        """The normals, but for those along which the Voronoi cell is short: there the direction where it is longest.
+        """Normals, replaced by the direction of the longest ray where the Voronoi cell is short along them.
 
-        Only those of the points `where` are looked at, if that is given.
+        If `where` is given, only its points are looked at.
         """
         seen = slice(None) if where is None else at(where, self.point).nonzero()[:, 0]
         point = self.point[seen]
@@ -98,12 +98,12 @@ class Poles:
         return torch.where(short[:, None], longest / length[:, None], normals)
 
     def sides(self, normals: Float[Tensor, "N 3"]) -> tuple[Float[np.ndarray, " S"], bool]:
-        """(1 for the spheres outside of the surface, −1 for those inside; whether it has two sides at all).
+        """(1 for spheres outside of the surface, −1 for those inside; whether it has two sides at all).
 
-        The two poles of a point lie on two sides, the surer the straighter they are opposed; two spheres that share a
-        triangle lie on one side, the surer the deeper they intersect. Spheres have their sides by a tree of the surest
-        of these, if that contradicts them far less, as on an open surface, or by all with the convex hull outside. On
-        a band with one side that contradicts much, too.
+        The two poles of a point lie on different sides, the more surely the straighter they are opposed; two spheres
+        that share a triangle lie on the same side, the more surely the deeper they intersect. The sides are those of a
+        vote with the convex hull outside; or of a spanning tree of the surest relations if that contradicts far fewer,
+        as on an open surface. On a one-sided surface either contradicts many.
         """
         rise = dot(self.ray, at(normals, self.point))
         up, down = self.farthest(rise), self.farthest(-rise)
@@ -118,9 +118,9 @@ class Poles:
         )
         side, tree = relations.vote(), relations.tree()
         wrong, by_tree = relations.contradicted(side), relations.contradicted(tree)
-        if FACTOR * by_tree < wrong:  # 8 times and more on open surfaces, else 1.4
+        if FACTOR * by_tree < wrong:  # a ratio of 8 and more on open surfaces, else 1.4
             side, wrong = tree, by_tree
-        # 0.13 and more on bands with one side, else 0.04
+        # a share of 0.13 and more on one-sided bands, else 0.04
         two_sided = wrong <= LOW * float(relations.weight[relations.against].sum())
         around = side[first:].mean()
         if abs(around) < 2 * (1 - LOW) - 1:  # an open surface faces up
@@ -129,7 +129,7 @@ class Poles:
         return side if around >= 0 else -side, two_sided
 
     def _touching(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Spheres that share a triangle, or an edge of the convex hull; and the cosine of their radii there."""
+        """Pairs of spheres that share a triangle, or an edge of the hull, and the cosine between their radii there."""
         tetrahedra = self.tetrahedra
         apex, outer = tetrahedra.points[tetrahedra.triangles[:, 0]], tetrahedra.hull
         radii = [torch.from_numpy(end - apex) for end in tetrahedra.ends()]
@@ -149,12 +149,12 @@ class Poles:
 
 @dataclass(frozen=True)
 class _Relations:
-    """Pairs (i, j) of spheres that lie on one side of a surface, or on two, the surest first.
+    """Pairs (i, j) of spheres on the same side of a surface, or on different ones, the surest first.
 
     Attributes
     ----------
     i, j, against, weight
-        (P,), the spheres, whether on two sides, how sure that is.
+        (P,), the spheres, whether they are on different sides, and the weight of that.
     outside
         (S,), which spheres are outside if the surface is closed.
     """
@@ -174,18 +174,18 @@ class _Relations:
         against: Bool[np.ndarray, " R"],
         outside: Bool[np.ndarray, " S"],
     ) -> _Relations:
-        """Without those of a sphere to itself."""
+        """Sort the relations, without those of a sphere to itself."""
         order = torch.from_numpy(cosine).argsort(descending=True, stable=True).numpy()
         order = order[i[order] != j[order]]
         weight = np.exp(SHARP * (cosine[order] - 1))
         return cls(i[order], j[order], against[order], weight, outside)
 
     def tree(self) -> Float[np.ndarray, " S"]:
-        """Sides, 1 or −1, by the surest pairs that close no circle."""
+        """Sides, 1 or −1, along a spanning forest of the surest pairs."""
         return np.where(tree_sides(self.i, self.j, self.against, len(self.outside)), 1.0, -1.0)
 
     def vote(self) -> Float[np.ndarray, " S"]:
-        """Sides, 1 or −1: the signs of x, 1 outside, where Σ w (x_i ∓ x_j)² over all pairs is least; in float32."""
+        """Sides, 1 or −1: signs of the minimiser x of Σ w (x_i ∓ x_j)² over all pairs, x = 1 outside; in float32."""
         count, free = len(self.outside), np.flatnonzero(~self.outside)
         signed = np.where(self.against, -self.weight, self.weight).astype(np.float32)
         ends = self.i.astype(np.int32), self.j.astype(np.int32)
@@ -201,7 +201,7 @@ class _Relations:
         return side
 
     def contradicted(self, side: Float[np.ndarray, " S"]) -> float:
-        """The weight of all pairs that are not as they should be."""
+        """Weight of all pairs that contradict these sides."""
         return float(self.weight @ (self.against ^ (side[self.i] != side[self.j])))
 
 
@@ -216,10 +216,10 @@ def corrected_normals(
     poles: Poles,
     rounds: int = 3,
 ) -> Float[Tensor, "N 3"]:
-    """The normals, refined again around those that the Voronoi cells contradict, which are replaced.
+    """Normals corrected by the Voronoi cells, and refined around each correction.
 
-    A cell is long across the surface. Where points lie on rings or other curves far apart, the planes through the
-    nearest of them are those of the curves, and neither their size nor their fit tells.
+    Where points lie on rings or other curves far apart, the planes through the nearest of them are those of the curves,
+    which shows neither in their extent nor in their fit.
     """
     where = None
     for _ in range(rounds):

@@ -1,4 +1,4 @@
-"""A complex through a cloud, by its dimension and that of the space."""
+"""Reconstruction of a complex through a cloud, by its dimension and that of the space."""
 
 from __future__ import annotations
 
@@ -19,10 +19,10 @@ from torchlb.errors import InputError, first_few
 def reconstruct(
     points: Any, dim: int | None = None, *, normals: Any = None, boundary: Any = None
 ) -> Complex:
-    """Cells through a cloud of points: what `LaplaceBeltrami.from_points` builds on.
+    """Complex through a cloud of points, on which `LaplaceBeltrami.from_points` builds.
 
     Curves become chains of segments (Dey and Kumar 1999), solids Delaunay tetrahedra without those outside (an alpha
-    shape), surfaces in R² and R³ triangles by the cocone and the poles of Amenta and Bern (`method.md`, section 12). Of
+    shape), surfaces in R² and R³ triangles by the cocone and the poles of Amenta and Bern (`method.md`, section 12). In
     other shapes every point has the star of its tangent plane (Boissonnat and Ghosh 2014).
 
     Parameters
@@ -30,21 +30,21 @@ def reconstruct(
     points
         (N, n) tensor or array, ℓ, without duplicates.
     dim
-        d of the shape, n − 1 by default.
+        Dimension d of the shape, n − 1 by default.
     normals
-        (N, n), if known: which way is out. For surfaces in R³ and curves in R².
+        (N, n), if known, to tell the outward side of surfaces in R³ and curves in R².
     boundary
         (N,) mask of points where the shape ends, whatever lies beyond.
 
     Returns
     -------
     Complex
-        Of a surface a `CloudSurface`: with normals, local stars where it has gaps, and how it was found.
+        For a surface a `CloudSurface`, with normals, local stars in its gaps, and a summary.
 
     Raises
     ------
     InputError
-        For points that are not finite, coincide with no shape of this dimension, or are far from all others.
+        If points are not finite, span no shape of this dimension, or are far from all others.
 
     Examples
     --------

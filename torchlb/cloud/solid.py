@@ -1,8 +1,8 @@
 """Delaunay tetrahedra of the points of a solid in R³, without those outside of it.
 
-Of random points with the density ρ a ball of the volume V holds none with the probability e^{−ρV}. So the spheres
-around the tetrahedra of a solid, which hold no point, are no larger than chance makes one in the cloud; those across a
-notch, a hole or a cavity are (an *alpha shape*, Edelsbrunner and Mücke 1994, with a length by the points around).
+Random points of density ρ leave a ball of volume V empty with probability e^{−ρV}. So the empty spheres around the
+tetrahedra of a solid are no larger than chance makes one in the cloud; those across a notch, a hole or a cavity are (an
+*alpha shape*, Edelsbrunner and Mücke 1994, of a radius that follows the local spacing).
 """
 
 from __future__ import annotations
@@ -23,20 +23,20 @@ from torchlb.geometry.vectors import lengths
 from torchlb.linalg.precision import NEGLIGIBLE, TINY
 
 NEAR = 2 * RING
-"""Points by which the density around each is known."""
+"""Number of nearest points that give the density around each."""
 SURE = 5.0
-"""Of so many clouds as e to this power one has a wrong cavity by chance."""
+"""One cloud in e to this power has a wrong cavity by chance."""
 SHEAR = np.eye(3) + 1e-3 * np.array([[0, 0.9, 0.7], [0, 0, 0.8], [0, 0, 0]])
-"""By which points are mapped before they are triangulated: the cells of a grid are then all cut alike."""
+"""Shear of the points before they are triangulated, by which the cells of a grid are all cut alike."""
 
 
 def cloud_solid(points: Float[Tensor, "N 3"]) -> Complex:
-    """The solid that the points fill.
+    """The solid filled by the points.
 
     Raises
     ------
     InputError
-        For points in a plane, and for those that are far from all others.
+        If the points lie in a plane, or some are far from all others.
     """
     places = points.numpy()
     spread = np.linalg.svd(places - places.mean(0), compute_uv=False)
@@ -54,7 +54,7 @@ def cloud_solid(points: Float[Tensor, "N 3"]) -> Complex:
     # random points have 24π²/35 Delaunay tetrahedra each (Meijering 1953)
     chance = (np.log(24 / 35 * np.pi**2 * len(points)) + SURE) / count / max(1.0, even / WIDER)
     kept = ~_outside(flat | (radius <= chance ** (1 / 3) * np.sort(reach[cells], 1)[:, 2]), beside)
-    beyond = np.append(kept, False)  # of the last, which −1 is, nothing is kept
+    beyond = np.append(kept, False)  # index −1 is beyond the hull, where nothing is kept
     while (peeled := kept & flat & ~beyond[beside].all(1)).any():
         kept &= ~peeled
         beyond[:-1] = kept
@@ -70,7 +70,7 @@ def cloud_solid(points: Float[Tensor, "N 3"]) -> Complex:
 def _spheres(
     points: Float[np.ndarray, "N 3"], cells: Int[np.ndarray, "T 4"]
 ) -> tuple[Float[np.ndarray, " T"], Bool[np.ndarray, " T"]]:
-    """Circumradii, ℓ, and which have no volume."""
+    """Circumradii, ℓ, and which tetrahedra have no volume."""
     center, six = circumcenters(points, cells)
     radius = lengths(center) / np.maximum(np.abs(six), TINY)
     edges = [
@@ -82,7 +82,7 @@ def _spheres(
 def _outside(
     kept: Bool[np.ndarray, " T"], beside: Int[np.ndarray, "T 4"]
 ) -> Bool[np.ndarray, " T"]:
-    """Which of those that are not kept hang together in such a number that they are no dent."""
+    """Rejected tetrahedra in components too large for a dent."""
     i, j = np.arange(len(kept)).repeat(4), beside.ravel()
     both = (j >= 0) & ~kept[i] & ~kept[j]
     piece = components(i[both], j[both], len(kept))

@@ -1,6 +1,6 @@
-"""Where a cloud has no surface of one sheet: triangles that each point has by itself, a third of each counting.
+"""Local stars, where a cloud has no surface of one sheet: triangles of each point by itself, each counted by a third.
 
-A Delaunay triangle of the plane belongs to the stars of its three corners, so that a third of each is the whole.
+A Delaunay triangle of the plane belongs to the stars of its three corners, and so counts once.
 """
 
 from __future__ import annotations
@@ -17,9 +17,9 @@ from torchlb.geometry.thresholds import ROUGH
 
 
 def local_stars(cloud: Cloud, centers: Int[np.ndarray, " B"]) -> Faces:
-    """Delaunay triangles around each centre in its tangent plane, of neighbours whose normals are not far from its own.
+    """Delaunay triangles around each centre in its tangent plane, among neighbours with similar normals.
 
-    A gap of half a turn has no triangle, nor has one that is wider than the reach.
+    There is no triangle across a gap of half a turn, nor any wider than the reach.
     """
     near = torch.from_numpy(cloud.neighbors[centers])
     points, normals = torch.from_numpy(cloud.points), torch.from_numpy(cloud.normals)
@@ -39,7 +39,7 @@ def local_stars(cloud: Cloud, centers: Int[np.ndarray, " B"]) -> Faces:
 def gaps_between(
     faces: Faces, pairs: tuple[np.ndarray, np.ndarray], count: int
 ) -> tuple[Int[np.ndarray, " P"], Int[np.ndarray, " P"]]:
-    """The pairs of points of different pieces, one of which has no closed fan of faces: sheets do not grow together."""
+    """Pairs of points in different components, one without a closed fan of faces: sheets do not grow together."""
     i, j = pairs
     piece = pieces_of(faces, count)
     outer = edges_of(faces, count).outer
@@ -48,9 +48,9 @@ def gaps_between(
 
 
 def stars_in_gaps(cloud: Cloud, faces: Faces, pairs: tuple[np.ndarray, np.ndarray]) -> Faces:
-    """Stars of points in no face, and of those at a gap between pieces, where these have none; then bridges.
+    """Stars of points in no face or at a gap between components, unless they overlap faces; then bridges.
 
-    `pairs` are points that belong together: whatever stars leave apart is joined along the shortest of them.
+    `pairs` are edges of the neighbour graph; components still apart are joined along the shortest of them.
     """
     count = len(cloud.points)
     at_gap = np.zeros(count, dtype=bool)
@@ -65,7 +65,7 @@ def stars_in_gaps(cloud: Cloud, faces: Faces, pairs: tuple[np.ndarray, np.ndarra
 
 
 def bridges(cloud: Cloud, faces: Faces, pairs: tuple[np.ndarray, np.ndarray]) -> Faces:
-    """Two triangles, one from either side, at the shortest pair between every two pieces that are still apart."""
+    """Two triangles, one from either side, at the shortest pairs that connect the components still apart."""
     count = len(cloud.points)
     piece = pieces_of(faces, count)
     i, j = (end[piece[pairs[0]] != piece[pairs[1]]] for end in pairs)
@@ -79,7 +79,7 @@ def bridges(cloud: Cloud, faces: Faces, pairs: tuple[np.ndarray, np.ndarray]) ->
 def _beside(
     cloud: Cloud, piece: np.ndarray, here: Int[np.ndarray, " B"], there: Int[np.ndarray, " B"]
 ) -> Faces:
-    """(here, there, the neighbour of `here` that is nearest to both and no end); in its own piece if there is one."""
+    """Triangles (here, there, k) with k the neighbour of `here` nearest to both, in its component if there is one."""
     near = cloud.neighbors[here, 1:]
     ends = cloud.points[here, None], cloud.points[there, None]
     cost = np.sum([np.linalg.norm(cloud.points[near] - end, axis=2) for end in ends], axis=0)

@@ -1,4 +1,4 @@
-"""A surface through a cloud of points in R³ (`method.md`, section 12), for the weak pair, plots and export."""
+"""A triangulated surface through a cloud of points in R³ (`method.md`, section 12)."""
 
 from __future__ import annotations
 
@@ -40,21 +40,21 @@ from torchlb.linalg.precision import LOW, NEGLIGIBLE, ROOT_EPS
 
 @dataclass(frozen=True)
 class SurfaceSummary:
-    """What was found of the surface through a cloud.
+    """Figures of the surface through a cloud.
 
     Attributes
     ----------
     points, reached, stars
-        Number of points, and of those that faces of the surface reach; the others have triangles of local stars alone.
+        Number of points, of points in faces of the surface, and of triangles in local stars, which reach the others.
     holes_closed, boundary_loops
-        Boundary loops that were taken for gaps and closed, and those that are left.
+        Numbers of boundary loops taken for gaps and closed, and of those left.
     components, noise
-        Number of them; distance of the points from the surface, root mean square, ℓ, 0 if there is none to be seen.
+        Number of components; root mean square distance of the points from the surface, ℓ, 0 if no noise is seen.
     contacts, places
-        Points the nearest of which is on another sheet, more than three edges away, where shapes touch or are too thin
-        for their points, and which belong together is a guess; and where most of these are, up to eight points, ℓ.
+        Number of points nearest to one of another sheet, more than three edges away, where shapes touch or are too thin
+        for their points and the sheets are a guess; up to eight places where most of these are, ℓ.
     lone
-        Points in mid-air, as scanners leave them: they lie beside the surface, for all that is computed.
+        Number of points in mid-air, as scanners leave them, which are put beside others for all that is computed.
     """
 
     points: int
@@ -70,13 +70,13 @@ class SurfaceSummary:
 
     @classmethod
     def of(cls, entries: dict[str, Any]) -> SurfaceSummary:
-        """Inverse of `dataclasses.asdict`, also of what JSON makes of it."""
+        """Inverse of `dataclasses.asdict`, also after a round trip through JSON."""
         entries = dict(entries)
         places = tuple(map(tuple, entries.pop("places", ())))
         return cls(**entries, places=places)
 
     def __str__(self) -> str:
-        """Two lines, or three."""
+        """Summary of two lines, or three."""
         noise = f"; noise of {self.noise:.2g} smoothed" if self.noise else ""
         noise += f"; {self.lone} lone points left out" if self.lone else ""
         text = (
@@ -88,7 +88,7 @@ class SurfaceSummary:
 
     @property
     def contact(self) -> str:
-        """Where sheets come closer to each other than the points are, in words."""
+        """Sentence on where sheets are closer to each other than their points."""
         where = in_words(self.places)
         return (
             f"{self.contacts} points are nearest to one of another sheet, most of them near {where}"
@@ -97,20 +97,20 @@ class SurfaceSummary:
 
 @dataclass(frozen=True, kw_only=True)
 class CloudSurface(Complex):
-    """Triangles through a cloud, of one sheet: edges have at most two, and all are wound so that it faces out.
+    """Triangles through a cloud, of one sheet: at most two at an edge, all wound to face outward.
 
     Attributes
     ----------
     stars
-        (S, 3), local triangles where it has gaps, of which a third counts.
+        (S, 3), local triangles in its gaps, each counted by a third.
     normals, frames
-        (N, 3), unit, on the side of the faces; (N, 3, 2), orthonormal, under the normals; they turn with the points.
+        (N, 3), unit, on the side of the faces; (N, 3, 2), orthonormal to them; they turn with the points.
     neighbors
-        (N, K), the nearest points of each, itself first.
+        (N, K), nearest points, itself first.
     lone
-        (N,), points in mid-air, which stand beside others; who is on the surface does not look at them.
+        (N,), points in mid-air, moved beside others, and no neighbours of points on the surface.
     summary
-        How that was found.
+        Figures of the reconstruction.
     """
 
     stars: Int[Tensor, "S 3"]
@@ -127,9 +127,9 @@ def cloud_surface(
     normals: Float[Tensor, "N 3"] | None = None,
     boundary: Bool[Tensor, " N"] | None = None,
 ) -> CloudSurface:
-    """The surface through all points, as far as they resolve one; `boundary` marks points of a real boundary.
+    """The surface through all points, as far as they resolve one.
 
-    Given normals say which side is out where most of them agree.
+    `normals` tell the outward side where most of them agree; `boundary` marks points of a true boundary.
     """
     candidates, oriented = nearest_neighbors(points, min(NEAREST, len(points))), False
     if normals is not None:
@@ -144,7 +144,7 @@ def cloud_surface(
     faces, done = _completed(cloud, faces, found.small, pairs, outward)
     if _single_seams(every, seam, count) and wound_alike(places, faces)[1].any():
         faces, done = _completed(cloud, every, found.small, pairs, outward)
-    # not by the faces where these lead into a mouth from outside
+    # not by the faces, which may lead into a mouth from outside
     cloud = _along(_oriented(cloud, faces), outward)
     if given is None:
         cloud = _righted(cloud, faces)
@@ -164,7 +164,7 @@ def cloud_surface(
 
 
 class _Start(NamedTuple):
-    """What triangles are chosen from: the cloud without its noise, the candidates, and whether they have two sides."""
+    """Input of the choice of triangles: the denoised cloud, the candidates, and whether they have two sides."""
 
     cloud: Cloud
     found: Candidates
@@ -180,7 +180,7 @@ def _start(
     given: Float[Tensor, "N 3"] | None,
     boundary: Bool[Tensor, " N"] | None,
 ) -> _Start:
-    """Normals, those of the plane if the points are in one, else refined; and candidates from Delaunay's triangles."""
+    """Estimate the normals, that of the plane for planar points, and find candidates among Delaunay triangles."""
     lone = lone_points(points.numpy(), candidates.numpy())
     if lone.any():
         points = torch.from_numpy(put_beside(points.numpy(), lone))
@@ -219,7 +219,7 @@ def _start(
 def _reaches(
     points: Float[np.ndarray, "N 3"], near: Int[np.ndarray, "N K"]
 ) -> Float[np.ndarray, " N"]:
-    """The largest circumradius of a triangle at each point, by the `RING` nearest; by all where these lie in a row.
+    """Largest circumradius of a triangle at each point, by the `RING` nearest; by all neighbours if these are in a row.
 
     Rings of a scan may be many times farther apart than the points along them.
     """
@@ -234,7 +234,7 @@ def _reaches(
 def _upright(
     frames: Float[Tensor, "N 3 2"], normals: Float[Tensor, "N 3"]
 ) -> Float[Tensor, "N 3 2"]:
-    """Frames under the normals, from the first direction of those given that is not along the normal."""
+    """Frames orthogonal to the normals, from the first given direction that is not along the normal."""
     first, second = (frames - normals[..., None] * (normals[:, None] @ frames)).unbind(-1)
     first = normalize(torch.where(first.norm(dim=1, keepdim=True) > 0.5, first, second))
     return torch.stack([first, torch.linalg.cross(normals, first)], -1)
@@ -243,10 +243,9 @@ def _upright(
 def _chosen(
     cloud: Cloud, found: Candidates, two_sided: bool, pairs: tuple[np.ndarray, np.ndarray]
 ) -> Faces:
-    """The faces, clean: those first that part the outside from the inside, if there are two sides.
+    """Choose faces with single fans, first those that part the outside from the inside if there are two sides.
 
-    But not where a cavity would be cut off from points that belong to it, as a mouth whose lips touch: there, those
-    that are tangent come first.
+    Tangent faces come first where a cavity would be cut off from points that belong to it, as where lips touch.
     """
     points, (i, j) = cloud.points, pairs
     first = found.parting if two_sided else found.tangent
@@ -272,7 +271,7 @@ def _completed(
     pairs: tuple[np.ndarray, np.ndarray],
     outward: Float[np.ndarray, "N 3"],
 ) -> tuple[Faces, list[list[int]]]:
-    """The faces turned outward, their gaps filled from the pool or closed, all points in them; and the loops closed."""
+    """(faces turned outward, with gaps filled from the pool or closed, and all points; the loops closed)."""
     places, count = cloud.points, len(cloud.points)
     bare = facing_out(places, bare, outward)
     cloud = _oriented(cloud, bare)
@@ -285,16 +284,16 @@ def _completed(
 
 
 def _single_seams(faces: Faces, seam: Bool[np.ndarray, " F"], count: int) -> bool:
-    """Whether pieces with a seam have one each: a band with one side has, wrong triangles make several."""
+    """Whether each component with a seam has one only, as a one-sided band; wrong triangles make several."""
     ends = faces[seam][:, 0]
     seams, pieces = (np.unique(pieces_of(part, count)[ends]) for part in (faces[seam], faces))
     return len(seams) == len(pieces) > 0
 
 
 def _without_gaps(cloud: Cloud, faces: Faces, pool: Faces) -> Faces:
-    """The faces, clean, with all that fits into their gaps, clean again; they themselves where nothing does."""
+    """Faces with all that fits into their gaps, pruned to single fans; they themselves if nothing fits."""
     count, more = len(cloud.points), faces
-    for oriented in (True, False):  # a surface with one side only is closed in the second round
+    for oriented in (True, False):  # a one-sided surface is closed in the second round
         more = filled(cloud, more, pool, oriented=oriented, strict=True)
     faces = faces if more is faces else with_single_fans(more, count)
     more = filled(cloud, faces, pool, oriented=True, strict=False)
@@ -304,7 +303,7 @@ def _without_gaps(cloud: Cloud, faces: Faces, pool: Faces) -> Faces:
 def _at_gaps(
     faces: Faces, pairs: tuple[np.ndarray, np.ndarray], count: int
 ) -> Bool[np.ndarray, " N"]:
-    """Points with a neighbour in another piece of the faces, so that the loop they are on is no hole."""
+    """Points with a neighbour in another component of the faces, so that the loop they are on is no hole."""
     used, result = np.zeros(count, dtype=bool), np.zeros(count, dtype=bool)
     used[faces.ravel()] = True
     both = used[pairs[0]] & used[pairs[1]]
@@ -314,19 +313,19 @@ def _at_gaps(
 
 
 def _oriented(cloud: Cloud, faces: Faces) -> Cloud:
-    """The cloud with its normals on the side of the faces, where there are any."""
+    """Cloud with its normals on the side of the faces, where there are any."""
     points, triangles = torch.from_numpy(cloud.points), torch.from_numpy(faces)
     return _along(cloud, vertex_normals(points, triangles).numpy())
 
 
 def _along(cloud: Cloud, vectors: Float[np.ndarray, "N 3"]) -> Cloud:
-    """The cloud with its normals on the side of the vectors, where these have one."""
+    """Cloud with its normals on the side of the vectors, where these have one."""
     away = (cloud.normals * vectors).sum(1) < 0
     return replace(cloud, normals=np.where(away[:, None], -cloud.normals, cloud.normals))
 
 
 def _righted(cloud: Cloud, faces: Faces) -> Cloud:
-    """The cloud with the normals of its faces where its own are misaligned to them, on the side that these had."""
+    """Cloud with normals realigned to those of its faces where they are misaligned, on their previous side."""
     points, triangles = torch.from_numpy(cloud.points), torch.from_numpy(faces)
     of_faces = vertex_normals(points, triangles).numpy()
     cosine = (cloud.normals * of_faces).sum(1)
@@ -338,7 +337,7 @@ def _righted(cloud: Cloud, faces: Faces) -> Cloud:
 def _planar_triangles(
     points: Float[np.ndarray, "N 3"],
 ) -> tuple[Faces, Float[np.ndarray, " 3"]] | None:
-    """Delaunay triangles of a cloud in a plane and the plane's normal; None if it is in none."""
+    """Delaunay triangles and normal of a planar cloud; None if it is not planar."""
     centered = points - points.mean(0)
     _, spread, axes = np.linalg.svd(centered, full_matrices=False)
     if spread[2] > NEGLIGIBLE * spread[0]:
@@ -347,13 +346,13 @@ def _planar_triangles(
 
 
 def _contacts(cloud: Cloud, faces: Faces) -> Bool[np.ndarray, " N"]:
-    """Which points have their nearest one more than three edges away, or are that."""
+    """Points whose nearest one is more than three edges away, and these nearest ones."""
     count = len(cloud.points)
     graph = sparse.csr_array(mesh_graph(torch.from_numpy(faces), count) + sparse.eye_array(count))
     nearest = cloud.neighbors[:, 1]
     apart = np.flatnonzero(graph[np.arange(count), nearest] == 0)
     beyond = sparse.csr_array(graph[nearest[apart]] @ graph)
-    # a way of three edges: two from the nearest, one from here
+    # a path of three edges: two from the nearest, one from the point
     met = (beyond * graph[apart]).sum(1)
     far, touched = apart[met == 0], np.zeros(count, dtype=bool)
     touched[far] = touched[nearest[far]] = True
@@ -361,7 +360,7 @@ def _contacts(cloud: Cloud, faces: Faces) -> Bool[np.ndarray, " N"]:
 
 
 def _kin(cloud: Cloud) -> tuple[np.ndarray, np.ndarray]:
-    """Pairs of points that belong together: each and its nearest compatible ones; all its nearest in a small piece."""
+    """Edges of the graph of the `RING` nearest compatible neighbours, or of all nearest ones in small components."""
     points, normals = torch.from_numpy(cloud.points), torch.from_numpy(cloud.normals)
     i, j, good = mutually_admissible(points, normals, torch.from_numpy(cloud.neighbors))
     near = (good & (good.cumsum(1) <= RING)).view(-1).numpy()
@@ -373,7 +372,7 @@ def _kin(cloud: Cloud) -> tuple[np.ndarray, np.ndarray]:
 
 
 def check_spread(points: Float[Tensor, "N n"]) -> None:
-    """InputError for points of a surface that lie on a line."""
+    """Raise InputError if the points of a surface lie on a line."""
     spread = torch.linalg.svdvals(points - points.mean(0))
     if spread[1] <= ROOT_EPS * spread[0]:
         raise InputError(

@@ -1,11 +1,11 @@
-"""Simplices through a cloud of any codimension, from the star that every point has in its tangent plane.
+"""Simplices through a cloud of any codimension, from the star of every point in its tangent plane.
 
-The star is that of the Delaunay triangulation of its neighbours, projected there: the tangential Delaunay complex
-(Boissonnat, Ghosh 2014). On a surface the stars nearly agree; where they do not, triangles are taken greedily, those of
-more stars first, as long as they neither overlap around a point nor share an edge with two others, and what stays open
-is closed ear by ear. In higher dimensions all simplices count, each by the part of it that lies in the Voronoi cells of
-the points whose stars have it: that is 1 where all do, and cells of points on a sphere do not depend on which of their
-triangulations a star has.
+The star is that of the Delaunay triangulation of the neighbours, projected there: the tangential Delaunay complex
+(Boissonnat and Ghosh 2014). On a surface the stars nearly agree; where they do not, triangles are taken greedily, those
+of more stars first, unless they overlap around a point or share an edge with two others, and remaining loops are closed
+by ear clipping. In higher dimensions all simplices count, each by its share in the Voronoi cells of the points whose
+stars have it: the share is 1 if all do, and cells of cospherical points do not depend on which of their triangulations
+a star has.
 """
 
 from __future__ import annotations
@@ -31,18 +31,18 @@ from torchlb.geometry.vectors import lengths
 from torchlb.linalg.precision import NEGLIGIBLE
 
 CANDIDATES = {2: 24, 3: 64}
-"""Nearest points among which those of a star are, by dimension."""
+"""Number of nearest points that hold those of a star, by dimension."""
 LOOP = 12
-"""Edges of the largest loop that is closed."""
+"""Number of edges of the largest loop that is closed."""
 
 
 def cloud_stars(points: Float[Tensor, "N n"], dim: int) -> Complex:
-    """Cells through a cloud of dimension d ≥ 2 in Rⁿ, n > d: a surface of triangles, or all simplices of the stars.
+    """Complex of dimension d ≥ 2 through a cloud in Rⁿ, n > d: a surface of triangles, or all simplices of the stars.
 
     Raises
     ------
     InputError
-        For points that are in no cell.
+        If points are in no cell.
     """
     near = nearest_neighbors(points, min(CANDIDATES[dim], len(points)))
     frames = cloud_frames(points, near, dim)
@@ -52,7 +52,7 @@ def cloud_stars(points: Float[Tensor, "N n"], dim: int) -> Complex:
     else:
         cells, parts = shared(places, stars)
         shares = torch.from_numpy(parts)
-    # where all stars count, a point far from all others has one of its own
+    # where all stars count, a point far from all others is only in its own
     alone = np.setdiff1d(np.arange(len(places)), cells if shares is None else stars[:, 1:])
     if len(alone):
         raise InputError(
@@ -65,7 +65,7 @@ def cloud_stars(points: Float[Tensor, "N n"], dim: int) -> Complex:
 def delaunay_stars(
     points: Float[Tensor, "N n"], frames: Float[Tensor, "N n d"], candidates: Int[Tensor, "N K"]
 ) -> Int[np.ndarray, "S corners"]:
-    """Simplices of the star of every point, that point first."""
+    """Simplices of the star of every point, the point first."""
     dim, found = frames.shape[2], []
     _, _, good = mutually_admissible(points, planes_of(frames), candidates)
     offset = points[candidates[:, 1:]] - points[:, None]
@@ -78,7 +78,7 @@ def delaunay_stars(
         places = np.concatenate([np.zeros((1, dim)), coords[point][mask]])
         try:
             cells = delaunay(places).simplices
-        except QhullError:  # all in a line, or a plane
+        except QhullError:  # the points are on a line, or in a plane
             continue
         cells = cells[(cells == 0).any(1)]
         cells = cells[cells != 0].reshape(-1, dim)
@@ -96,7 +96,7 @@ def delaunay_stars(
 def shared(
     points: Float[np.ndarray, "N n"], stars: Int[np.ndarray, "S corners"]
 ) -> tuple[Int[np.ndarray, "F corners"], Float[np.ndarray, " F"]]:
-    """The simplices of all stars, and which part of each counts."""
+    """(simplices of all stars; share of each that counts)."""
     cells, number, votes = np.unique(
         np.sort(stars, 1), axis=0, return_inverse=True, return_counts=True
     )
@@ -106,17 +106,17 @@ def shared(
 
 
 def voronoi_shares(corners: Float[np.ndarray, "S corners n"]) -> Float[np.ndarray, " S"]:
-    """Part of each simplex that is in the Voronoi cell of its first corner, with signs; they sum to 1 over its corners.
+    """Signed share of each simplex in the Voronoi cell of its first corner; the shares of all corners sum to 1.
 
-    The cell is made of simplices of that corner, the centre of an edge there, that of the circumcircle of a triangle
-    at the edge, and so on to the circumcentre.
+    The cell consists of simplices from the corner over the midpoint of an edge there, the circumcentre of a triangle at
+    the edge, and so on to the circumcentre.
 
     >>> voronoi_shares(np.array([[[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]]])).tolist()
     [0.5]
     """
     dim = corners.shape[1] - 1
     edges = corners[:, 1:] - corners[:, :1]
-    places = np.linalg.qr(edges.transpose(0, 2, 1))[1].transpose(0, 2, 1)  # in its own space
+    places = np.linalg.qr(edges.transpose(0, 2, 1))[1].transpose(0, 2, 1)  # intrinsic coordinates
     whole = np.linalg.det(places)
     total, sound = np.zeros(len(places)), np.abs(whole) > NEGLIGIBLE * lengths(places).prod(1)
     places, whole = places[sound], whole[sound]
@@ -138,7 +138,7 @@ def voronoi_shares(corners: Float[np.ndarray, "S corners n"]) -> Float[np.ndarra
 def glued(
     points: Float[np.ndarray, "N n"], frames: Float[np.ndarray, "N n 2"], stars: Faces
 ) -> Faces:
-    """Triangles of the stars that make a surface: no edge has more than two, and none overlap around a point."""
+    """Triangles of the stars that form a surface: at most two at an edge, none that overlap around a point."""
     triangles, votes = np.unique(np.sort(stars, 1), axis=0, return_counts=True)
     order = np.lexsort((circumradii(points, triangles), -votes))
     triangles, votes = triangles[order], votes[order]
@@ -153,7 +153,7 @@ def glued(
 
 
 class _Fans:
-    """The triangles around every point, in its tangent plane."""
+    """Triangles around every point, as wedges in its tangent plane."""
 
     def __init__(
         self, points: Float[np.ndarray, "N n"], frames: Float[np.ndarray, "N n 2"], faces: Faces
@@ -167,7 +167,7 @@ class _Fans:
             self._put(face)
 
     def take(self, face: list[int]) -> bool:
-        """Add a triangle if it fits; whether it does."""
+        """Add a triangle if it fits; return whether it does."""
         keys = [min(a, b) * len(self.points) + max(a, b) for a, b in _sides(face)]
         if not self.open[face].all() or any(self.uses.get(key, 0) >= 2 for key in keys):
             return False
@@ -200,7 +200,7 @@ def _sides(face: list[int]) -> list[tuple[int, int]]:
 
 
 def circumradii(points: Float[np.ndarray, "N n"], faces: Faces) -> Float[np.ndarray, " F"]:
-    """Of triangles, ℓ; infinite for those without area."""
+    """Circumradii of triangles, ℓ; infinite for those without area."""
     a, b, c = (
         np.linalg.norm(points[faces[:, k - 1]] - points[faces[:, k]], axis=1) for k in range(3)
     )
@@ -210,7 +210,7 @@ def circumradii(points: Float[np.ndarray, "N n"], faces: Faces) -> Float[np.ndar
 
 
 def _closed(points: Float[np.ndarray, "N n"], faces: Faces) -> Faces:
-    """The faces with short boundary loops closed, by the ear of the least circumradius first."""
+    """Faces with short boundary loops closed by ear clipping, the smallest circumradius first."""
     count, new = len(points), [faces]
     known = set(edges_of(faces, count).keys.tolist())
     for loop in boundary_loops(faces, count):

@@ -1,8 +1,7 @@
 """Voronoi cells in the tangent plane: natural neighbours, a graph and volumes for points in any dimension.
 
-Seen from a point, its Voronoi cell among neighbours at y_j ends in the direction u at
-r(u) = min_j |y_j|² / (2 y_j·u). The neighbours that attain the minimum are its natural neighbours; the mean of r^d
-over all directions is its volume.
+Seen from a point, its Voronoi cell among neighbours at y_j ends in the direction u at r(u) = min_j |y_j|² / (2 y_j·u).
+Neighbours that attain the minimum are its natural neighbours; the mean of r^d over all directions gives its volume.
 """
 
 from __future__ import annotations
@@ -24,13 +23,13 @@ from torchlb.linalg.precision import rows_at_once
 
 @cache
 def unit_directions(dim: int) -> Float[Tensor, "u d"]:
-    """Evenly spread unit vectors: 2, 128 or 1024 of them for d = 1, 2, more."""
+    """Evenly spread unit vectors: 2, 128 or 1024 of them for d = 1, 2 or more."""
     if dim == 1:
         return torch.tensor([[-1.0], [1.0]], dtype=torch.float64)
     if dim == 2:
         angle = 2 * pi * torch.arange(128, dtype=torch.float64) / 128
         return torch.stack([angle.cos(), angle.sin()], dim=1)
-    # Scrambled: the plain sequence holds its centre, which has no direction.
+    # scrambled, since the plain sequence holds its centre, which has no direction
     uniform = torch.quasirandom.SobolEngine(dim, scramble=True, seed=0).draw(1024).double()
     normal = torch.special.ndtri(uniform)
     return normal / normal.norm(dim=1, keepdim=True)
@@ -39,7 +38,7 @@ def unit_directions(dim: int) -> Float[Tensor, "u d"]:
 def _directions(
     coords: Float[Tensor, "B K d"], valid: Bool[Tensor, "B K"]
 ) -> Float[Tensor, "B u d"]:
-    """The table for each point: in the plane it starts at the nearest neighbour, and so turns with the points."""
+    """Directions at each point: in the plane they start at the nearest neighbour, and so turn with the points."""
     table = unit_directions(coords.shape[-1]).to(coords)
     if coords.shape[-1] != 2:
         return table.expand(len(coords), -1, -1)
@@ -57,7 +56,7 @@ def _inverse_radius(
     valid: Bool[Tensor, "B K"],
     directions: Float[Tensor, "B u d"],
 ) -> Float[Tensor, "B K u"]:
-    """2 y_j·u / |y_j|²: the largest over j is 1 / r(u), if it is positive; 0 for those that are not valid."""
+    """2 y_j·u / |y_j|², whose maximum over j is 1 / r(u) if positive; 0 for invalid neighbours."""
     square = coords.square().sum(-1, keepdim=True).clamp_min(torch.finfo(coords.dtype).tiny)
     return (2 * coords / square).masked_fill(~valid[..., None], 0.0) @ directions.mT
 
@@ -65,7 +64,7 @@ def _inverse_radius(
 def natural_neighbors(
     coords: Float[Tensor, "B K d"], valid: Bool[Tensor, "B K"]
 ) -> Bool[Tensor, "B K"]:
-    """Which of the valid neighbours bound the cell; those that show less than 3° of it may be missed.
+    """Which of the valid neighbours bound the cell; those that bound less than 3° of it may be missed.
 
     >>> corners = torch.tensor([[[1.0, 0.0], [0.0, 1.0], [-1.0, 0.0], [0.0, -1.0], [2.0, 0.1]]])
     >>> natural_neighbors(corners, torch.ones(1, 5, dtype=torch.bool)).tolist()
@@ -83,8 +82,8 @@ def cell_volume(
 ) -> Float[Tensor, " B"]:
     """Volume of the cell, ℓ^d: that of the unit ball times the mean of r^d.
 
-    Where a cell is open it ends half-way to the farthest valid neighbour; where none lies within 60°, at the point
-    itself, as at the end of a curve.
+    An open cell ends half-way to the farthest valid neighbour; in directions without one within 60° it ends at the
+    point itself, as at the end of a curve.
 
     >>> around = torch.tensor([[[1.0, 0.0], [0.0, 1.0], [-1.0, 0.0], [0.0, -1.0], [2.0, 0.0]]])
     >>> cell_volume(around, torch.ones(1, 5, dtype=torch.bool)).round(decimals=2).tolist()
@@ -107,16 +106,16 @@ def cell_volume(
 def star_of(
     coords: Float[Tensor, "B K 2"], natural: Bool[Tensor, "B K"]
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """The natural neighbours in turn around the point.
+    """Natural neighbours in angular order around the point.
 
     Returns
     -------
     angle, order
-        (B, K), ascending, of the neighbours by number; infinite after the last.
+        (B, K), ascending angles, infinite after the last, and the numbers of the neighbours.
     following
-        (B, K), the place of the next one in this order.
+        (B, K), position of the next one in this order.
     real
-        (B, K), which places are taken.
+        (B, K), which positions are taken.
     """
     angle = torch.atan2(coords[..., 1], coords[..., 0]).masked_fill(~natural, torch.inf)
     angle, order = angle.sort(dim=1)
@@ -128,7 +127,7 @@ def star_of(
 def unrolled(
     offset: Float[Tensor, "B K n"], frames: Float[Tensor, "B n d"]
 ) -> Float[Tensor, "B K d"]:
-    """Coordinates in the tangent plane, at their true distance: neighbours above one another do not collapse."""
+    """Coordinates in the tangent plane at the true distance, so that neighbours above one another do not collapse."""
     coords = offset @ frames
     length = coords.norm(dim=-1, keepdim=True).clamp_min(torch.finfo(coords.dtype).tiny)
     return coords * (offset.norm(dim=-1, keepdim=True) / length)
@@ -139,11 +138,11 @@ def nearest_graph(
     frames: Float[Tensor, "N n d"],
     candidates: Int[Tensor, "N K"],
 ) -> sparse.csr_array:
-    """A cloud's stand-in for the edges of a mesh, symmetric (N, N).
+    """Neighbour graph of a cloud in place of the edges of a mesh, symmetric (N, N).
 
-    Each point is joined to its 2^(d+1) nearest compatible neighbours (4, 8, 16 for curves, surfaces, solids) and to
-    its natural neighbours in the tangent plane, which bridge the voids of an uneven cloud. `candidates`
-    come from `nearest_neighbors`; an edge must be compatible from both its ends.
+    Each point is joined to its 2^(d+1) nearest compatible neighbours (4, 8, 16 for curves, surfaces, solids) and to its
+    natural neighbours in the tangent plane, which bridge the voids of an uneven cloud. `candidates` come from
+    `nearest_neighbors`; an edge is compatible from both its ends.
     """
     dim = frames.shape[-1]
     wanted = 2 ** (dim + 1)

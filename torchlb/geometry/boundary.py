@@ -1,8 +1,8 @@
-"""The boundary of a shape: which points lie on it, and the conormals there (`method.md`, section 6).
+"""The boundary of a shape: its points, and the conormals there (`method.md`, section 6).
 
-The conormal ν at a boundary point is the unit tangent vector of the shape that leaves it at a right angle to the
-boundary. The boundary is itself a manifold of dimension d − 1, so its tangents come from the same fits; where that of a
-mesh has a crease, or a corner, ν is the mean of the outer normals around.
+The conormal ν at a boundary point is the outward unit vector tangent to the shape and normal to its boundary. The
+boundary is itself a manifold of dimension d − 1, so its tangents come from the same fits; at a crease or a corner of a
+mesh's boundary ν is the mean of the outer normals around.
 """
 
 from __future__ import annotations
@@ -33,12 +33,12 @@ class Boundary:
     mask
         (N,), which points lie on the boundary.
     conormals
-        (N, n), unit and outward there, zero elsewhere.
+        (N, n), unit and outward on the boundary, zero elsewhere.
     sizes
-        (N,), ℓ^{d−1}, a first-order share of the boundary's length or area; 1 at the end of a curve.
+        (N,), ℓ^{d−1}, first-order share of each point in the boundary's length or area; 1 at the end of a curve.
     folds
-        (N,), 1 over the length of the mean of the outer normals around, where ν is that mean; 1 elsewhere. If ∂_n f = g
-        along all of them, ∂_ν f is that times g.
+        (N,), 1 over the length of the mean of the outer normals where ν is that mean, 1 elsewhere: if ∂_n f = g for
+        each of these normals n, ∂_ν f is `folds` times g.
     """
 
     mask: Bool[Tensor, " N"]
@@ -49,20 +49,21 @@ class Boundary:
 
 @dataclass(frozen=True)
 class BoundaryPlan:
-    """What is decided about the boundary of a mesh.
+    """Combinatorial data of the boundary of a mesh, from which `at` computes a `Boundary` for given coordinates.
 
     Attributes
     ----------
     mask
-        (N,), where a condition holds.
+        (N,), points where a boundary condition holds.
     members
-        (b,), all points of the boundary.
+        (b,), all boundary points.
     fits
-        Of the boundary's own tangents, points numbered by their places among `members`; None at the ends of curves.
+        Plan of the fits of the boundary's tangents, points numbered by their position in `members`; None at the ends of
+        curves.
     sides, opposite
-        (G, d), (G,): the faces' unpaired sides, and the corners across from them.
+        (G, d), (G,): unpaired sides of the cells, and the corner opposite each.
     crease
-        (b,), where the boundary has one, or a corner.
+        (b,), boundary points at a crease or a corner of the boundary.
     """
 
     mask: Bool[Tensor, " N"]
@@ -73,7 +74,7 @@ class BoundaryPlan:
     crease: Bool[Tensor, " b"]
 
     def at(self, points: Float[Tensor, "N n"], frames: Float[Tensor, "N n d"]) -> Boundary:
-        """The boundary at these points, of a shape with these frames."""
+        """Boundary at these coordinates, of a shape with these frames."""
         members, own = self.members, points[self.members]
         tangents = frames.new_zeros(len(members), points.shape[1], 0)
         if self.fits is not None:
@@ -87,13 +88,13 @@ class BoundaryPlan:
         return Boundary(self.mask, conormals * mask[:, None], every[0] * mask, every[1])
 
     def initial(self, points: Float[Tensor, "N n"]) -> Float[Tensor, "b n d_minus_1"]:
-        """The boundary's first tangents."""
+        """Initial tangents of the boundary."""
         return mesh_frames(points[self.members], torch.searchsorted(self.members, self.sides))
 
     def measures(
         self, points: Float[Tensor, "N n"]
     ) -> tuple[Float[Tensor, "b n"], Float[Tensor, " b"], Float[Tensor, " b"]]:
-        """Vectors that leave the shape; sizes and folds, as in `Boundary`."""
+        """Outward vectors, sizes and folds of the boundary points, the last two as in `Boundary`."""
         outward, size = outward_sums(points, self.sides, self.opposite)
         outward, size = outward[self.members], size[self.members]
         length = outward.norm(dim=1)
@@ -103,7 +104,7 @@ class BoundaryPlan:
     def with_fits(
         self, points: Float[Tensor, "N n"], graph: sparse.csr_array, degree: int
     ) -> BoundaryPlan:
-        """The same with fits of the boundary's tangents, of this degree or lower ones."""
+        """Plan with fits of the boundary's tangents, of this degree or lower ones."""
         search = FitSearch(
             GraphNeighborhoods(points[self.members], graph, self.initial(points)), degree
         )
@@ -114,7 +115,7 @@ class BoundaryPlan:
 def sub_simplices(
     cells: Int[Tensor, "F v"], places: Sequence[Sequence[int]]
 ) -> tuple[Int[Tensor, "S size"], Int[Tensor, "F c"], Int[Tensor, " S"]]:
-    """With corners at these places of cells: each once, ascending; which a cell has; how many cells have each."""
+    """(distinct sub-simplices at these corners, ascending; their numbers by cell; number of cells at each)."""
     ascending = cells.sort(1).values
     every = torch.stack([ascending[:, list(corners)] for corners in places], 1)
     base = int(cells.max()) + 1 if len(cells) else 1
@@ -127,7 +128,7 @@ def sub_simplices(
 
 
 def boundary_faces(faces: Int[Tensor, "F v"]) -> Int[Tensor, "G w"]:
-    """Sides of the faces that belong to one face only: edges of triangles, ends of segments.
+    """Sides that belong to one cell only: edges of triangles, ends of segments.
 
     >>> boundary_faces(torch.tensor([[0, 1, 2], [1, 3, 2]])).tolist()
     [[0, 1], [0, 2], [1, 3], [2, 3]]
@@ -136,7 +137,7 @@ def boundary_faces(faces: Int[Tensor, "F v"]) -> Int[Tensor, "G w"]:
 
 
 def open_sides(cells: Int[Tensor, "F v"]) -> tuple[Int[Tensor, "G w"], Int[Tensor, " G"]]:
-    """`boundary_faces`, and of each the corner of its cell that lies opposite."""
+    """(`boundary_faces`; the opposite corner of each in its cell)."""
     count = cells.shape[1]
     sides, of, uses = sub_simplices(cells, list(combinations(range(count), count - 1)))
     cell, place = (uses[of] == 1).nonzero(as_tuple=True)
@@ -145,7 +146,7 @@ def open_sides(cells: Int[Tensor, "F v"]) -> tuple[Int[Tensor, "G w"], Int[Tenso
 
 
 def outer_faces(points: Float[Tensor, "N n"], cells: Int[Tensor, "F 4"]) -> Int[Tensor, "G 3"]:
-    """The boundary of tetrahedra, in R³ wound so that normals point outwards."""
+    """Boundary triangles of tetrahedra, in R³ oriented so that their normals point outwards."""
     sides, opposite = open_sides(cells)
     if points.shape[1] != 3:
         return sides
@@ -157,10 +158,7 @@ def outer_faces(points: Float[Tensor, "N n"], cells: Int[Tensor, "F 4"]) -> Int[
 def boundary_of_mesh(
     vertices: Float[Tensor, "N n"], faces: Int[Tensor, "F v"], degree: int
 ) -> BoundaryPlan | None:
-    """Boundary of a mesh from its unpaired sides; None for a closed one.
-
-    `degree` is that of the fits to the boundary's tangents.
-    """
+    """Boundary of a mesh from its unpaired sides, its tangents fitted up to `degree`; None for a closed mesh."""
     sides, opposite = open_sides(faces)
     if len(sides) == 0:
         return None
@@ -179,7 +177,7 @@ def boundary_of_mesh(
 def boundary_creases(
     vertices: Float[Tensor, "N n"], cells: Int[Tensor, "F v"]
 ) -> Bool[Tensor, " N"]:
-    """Vertices where the boundary of a mesh turns by 60° and more: at the edges and corners of a cube."""
+    """Vertices where the boundary of a mesh turns by 60° or more, as at the edges and corners of a cube."""
     outward, size = outward_sums(vertices, *open_sides(cells))
     return outward.square().sum(1) < (1 + CREASE) / 2 * size.square()
 
@@ -187,7 +185,7 @@ def boundary_creases(
 def outward_sums(
     vertices: Float[Tensor, "N n"], sides: Int[Tensor, "G w"], opposite: Int[Tensor, " G"]
 ) -> tuple[Float[Tensor, "N n"], Float[Tensor, " N"]]:
-    """Sums at every vertex over its boundary sides: of their outer normals, weighted by their sizes, and of these.
+    """(sum over the boundary sides at each vertex of their outer normals, weighted by their sizes; sum of the sizes).
 
     The size of a side is (d − 1)! times its volume.
     """
@@ -210,7 +208,7 @@ def _conormals(
     outward: Float[Tensor, "b n"],
     crease: Bool[Tensor, " b"],
 ) -> Float[Tensor, "b n"]:
-    """The direction of the frame orthogonal to the boundary's, on the side of `outward`; on a crease `outward`."""
+    """Unit tangent vectors normal to the boundary, towards `outward`; on a crease the projection of `outward`."""
     if tangents.shape[-1] == 0:
         conormal = frames[..., 0]
     else:
@@ -223,5 +221,5 @@ def _conormals(
 
 
 def _unit(vectors: Float[Tensor, "G n"]) -> Float[Tensor, "G n"]:
-    """Of length one; zero stays zero."""
+    """Vectors scaled to length one; zero stays zero."""
     return torch.nn.functional.normalize(vectors, dim=-1, eps=torch.finfo(vectors.dtype).tiny)

@@ -17,18 +17,18 @@ from torchlb.linalg.precision import rows_at_once
 
 
 class Candidate(NamedTuple):
-    """A neighbourhood and what to do with it.
+    """Size of a neighbourhood, and the fit to be made in it.
 
     Attributes
     ----------
     degree
-        Of the polynomials.
+        Degree of the polynomials.
     size
         Number of points K, the centre included.
     rule
-        For the weights, a key of `WEIGHT_RULES`.
+        Rule of the weights, a key of `WEIGHT_RULES`.
     factor
-        Points per polynomial that the search has come to; 0 where the user has fixed the size.
+        Points per polynomial, from `SIZE_FACTORS`; 0 where the user has fixed the size.
     """
 
     degree: int
@@ -43,7 +43,7 @@ def list_candidates(
     rules: Sequence[str] = ("least_squares",),
     num_neighbors: int | None = None,
 ) -> list[Candidate]:
-    """Candidates, best first: for each degree every rule, for each rule every size. `num_neighbors` fixes the size.
+    """Candidates, best first: for each degree every rule, for each rule every size, unless `num_neighbors` fixes it.
 
     >>> [candidate.size for candidate in list_candidates(2, [2])]
     [10, 12, 15, 18, 24, 30, 42, 60]
@@ -71,11 +71,11 @@ def stencil_candidates(
     on_mesh: bool,
     triangles: bool,
 ) -> list[Candidate]:
-    """The candidates for a row of order p: degree p + 1, then the even degrees below; then positive weights of order 1.
+    """Candidates for a row of order p: degree p + 1, then the even degrees below, then positive weights of order 1.
 
-    Rows of an even order are no better on evenly spread points than those of the odd order below. Rows of order 1 are
-    no better on a mesh than its triangles, and positive ones no better than those of a surface through a cloud: there
-    they are tried only if asked for. Least squares follow splines.
+    On evenly spread points rows of even order are no better than rows of the odd order below. Rows of order 1 are no
+    better than the triangles of a mesh, and positive ones no better than those of a surface through a cloud: there they
+    are tried only if asked for. Least squares follow any other `weights`.
 
     >>> [c.degree for c in stencil_candidates(2, 5, "least_squares", 60, on_mesh=False, triangles=False)]
     [6, 4, 2, 2]
@@ -91,11 +91,11 @@ def stencil_candidates(
 
 
 class Search:
-    """Every centre tries the candidates in turn, until one settles it.
+    """Search in which every centre tries the candidates in turn until one is accepted.
 
-    Iterating gives (number of the candidate, rows of `centers` that try it, their neighbourhoods (b, K)), so many rows
-    at a time that a (b, K, M) array stays below `BYTES`; who has tried it is settled, or turned away from more
-    than this candidate, before the next.
+    Iteration yields (number of the candidate, rows of `centers` that try it, their neighbourhoods (b, K)), in chunks
+    whose (b, K, M) arrays stay below `BYTES`. Rows are to be settled, or turned away from further candidates, before
+    the next chunk.
 
     Parameters
     ----------
@@ -114,16 +114,16 @@ class Search:
         self._next = torch.zeros_like(centers) if start is None else start.clone()
 
     def settle(self, rows: Int[Tensor, " b"]) -> None:
-        """These rows are done."""
+        """Mark these rows as done."""
         self._next[rows] = len(self.candidates)
 
     def reject_degree(self, rows: Int[Tensor, " b"], number: int) -> None:
-        """These rows go on with the first candidate of a degree below that of candidate `number`."""
+        """Let these rows go on with the first candidate of a lower degree than that of candidate `number`."""
         degree = self.candidates[number].degree
         self._next[rows] = sum(other.degree >= degree for other in self.candidates)
 
     def __iter__(self) -> Iterator[tuple[int, Int[Tensor, " b"], Int[Tensor, "b K"]]]:
-        """Candidates that somebody can try; neighborhoods are gathered small at first, since most rows settle early."""
+        """Yield the candidates that some rows can try; neighbourhoods start small, since most rows settle early."""
         pending, dim = torch.arange(len(self.centers)), self.neighborhoods.frames.shape[-1]
         held = 0
         index = count = torch.empty(0)

@@ -1,4 +1,4 @@
-"""Who may enter a point's stencil (`method.md`, section 4)."""
+"""Compatibility of neighbours: which may enter a point's stencil (`method.md`, section 4)."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def _smallest_singular_value(
 
 
 def planes_of(frames: Float[Tensor, "N n d"]) -> Float[Tensor, "N n d"] | Float[Tensor, "N n"]:
-    """What `compatible` takes: the unit normals of a surface in R³, else the frames."""
+    """Tangent planes as `compatible` takes them: unit normals of a surface in R³, else the frames."""
     return torch.linalg.cross(*frames.unbind(-1)) if frames.shape[1:] == (3, 2) else frames
 
 
@@ -52,9 +52,9 @@ def compatible(
 ) -> Bool[Tensor, " P"]:
     """Whether `others[j]` may enter the stencil of `centers[j]`.
 
-    It may if their tangent planes are less than 60° apart (σ_min(E_kᵀE_i) ≥ 0.5) and it does not stand above or
-    below the centre's plane (height ≤ 0.5 of the distance). `planes` are frames E, or the unit normals of a
-    hypersurface, which tell the same in less time: σ_min(E_kᵀE_i) = |n_k·n_i|. Orientation is irrelevant.
+    Tangent planes of compatible points are less than 60° apart (σ_min(E_kᵀE_i) ≥ 0.5), and the height of the neighbour
+    over the centre's plane is at most 0.5 of its distance. `planes` are frames E, or the unit normals of a
+    hypersurface, for which σ_min(E_kᵀE_i) = |n_k·n_i| takes less time. Orientation is irrelevant.
     """
     parts = zip(centers.split(AT_ONCE), others.split(AT_ONCE), strict=True)
     return torch.cat([_admissible_part(points, planes, *part) for part in parts])
@@ -79,7 +79,7 @@ def admissible_neighbors(
     planes: Float[Tensor, "N n d"] | Float[Tensor, "N n"],
     index: Int[Tensor, "B K"],
 ) -> Bool[Tensor, "B K"]:
-    """Which points of each row may enter the stencil of its first, see `compatible`."""
+    """Which points of each row are compatible with its first, see `compatible`."""
     centers = index[:, 0].repeat_interleave(index.shape[1])
     return compatible(points, planes, centers, index.flatten()).view(index.shape)
 
@@ -89,7 +89,7 @@ def mutually_admissible(
     planes: Float[Tensor, "N n d"] | Float[Tensor, "N n"],
     candidates: Int[Tensor, "N K"],
 ) -> tuple[Int[Tensor, " P"], Int[Tensor, " P"], Bool[Tensor, "N others"]]:
-    """Each point with all other candidates of its row, (i, j) in turn; and which of them are compatible both ways."""
+    """Pairs (i, j) of each point with its candidates, row by row, and which of them are compatible both ways."""
     others = candidates[:, 1:]
     i, j = torch.arange(len(points)).repeat_interleave(others.shape[1]), others.reshape(-1)
     good = compatible(points, planes, i, j) & compatible(points, planes, j, i)
@@ -99,10 +99,10 @@ def mutually_admissible(
 def thin_sides(
     points: Float[Tensor, "N n"], oriented: Float[Tensor, "N n"], candidates: Int[Tensor, "N K"]
 ) -> Float[Tensor, "N n"]:
-    """The oriented normals in and next to thin places, zero elsewhere.
+    """Oriented normals in and next to thin places, zero elsewhere.
 
-    Points whose sides have a negative product lie on different sides. It is thin where a near point stands above or
-    below the tangent plane and yet has nearly the same one. Elsewhere a shape may have one side only.
+    Points are on different sides if their normals have a negative product. A place is thin where a near point stands
+    above or below the tangent plane and yet has nearly the same one. Elsewhere a shape may be one-sided.
     """
     i, j, good = mutually_admissible(points, oriented, candidates)
     refused = ~good.view(-1)

@@ -1,4 +1,4 @@
-"""Which triangles meet where: edges, fans, patches, boundary loops, and which way round triangles are wound.
+"""Delaunay simplices, edges, connected components and orientations of a simplicial complex.
 
 Half-edge 3f + k is the side of face f opposite its corner k; it runs from corner k + 1 to corner k + 2.
 """
@@ -22,7 +22,7 @@ Faces = Int[np.ndarray, "_ 3"]
 
 
 def delaunay(points: Float[np.ndarray, "N n"]) -> Delaunay:
-    """Delaunay's simplices by Qhull, whose tolerances are lengths: around the origin, and of a size of about one."""
+    """Delaunay simplices by Qhull, of centred points of size about one, since its tolerances are lengths."""
     centered = points - points.mean(0)
     return Delaunay(np.ldexp(centered, -np.frexp(np.abs(centered).max())[1]))
 
@@ -30,7 +30,7 @@ def delaunay(points: Float[np.ndarray, "N n"]) -> Delaunay:
 def circumcenters(
     points: Float[np.ndarray, "N 3"], cells: Int[np.ndarray, "T 4"]
 ) -> tuple[Float[np.ndarray, "T 3"], Float[np.ndarray, " T"]]:
-    """(c, v) of tetrahedra: the circumcentre is the first corner + c/v; v is six times the volume, with a sign.
+    """(c, v) of tetrahedra: the circumcentre is the first corner + c/v, and v six times the signed volume.
 
     >>> corners = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]])
     >>> [x.tolist() for x in circumcenters(corners, np.array([[0, 1, 2, 3]]))]
@@ -47,18 +47,18 @@ def circumcenters(
 
 @dataclass(frozen=True)
 class Edges:
-    """The edges of triangles on `count` points.
+    """Edges of triangles on `count` points.
 
     Attributes
     ----------
     keys
         (E,), low · count + high of the two ends, ascending.
     of
-        (3F,), number of the edge that each half-edge lies on.
+        (3F,), number of the edge of each half-edge.
     uses
-        (E,), how many faces meet there.
+        (E,), number of faces at each edge.
     order
-        (3F,), the half-edges by the number of their edge.
+        (3F,), half-edges sorted by the number of their edge.
     """
 
     faces: Faces
@@ -75,18 +75,18 @@ class Edges:
 
     @cached_property
     def boundary(self) -> Int[np.ndarray, " G"]:
-        """Half-edges of edges that have one face."""
+        """Half-edges whose edge has one face."""
         return np.flatnonzero(self.uses[self.of] == 1)
 
     @cached_property
     def twins(self) -> tuple[Int[np.ndarray, " T"], Int[np.ndarray, " T"]]:
-        """The two half-edges of every edge that has two faces."""
+        """The two half-edges of each edge with two faces."""
         first = (np.cumsum(self.uses) - self.uses)[self.uses == 2]
         return self.order[first], self.order[first + 1]
 
     @cached_property
     def outer(self) -> Bool[np.ndarray, " N"]:
-        """Which points lie on the boundary or in no face."""
+        """Points on the boundary or in no face."""
         result = np.ones(self.count, dtype=bool)
         result[self.faces.ravel()] = False
         for end in self.ends:
@@ -96,7 +96,7 @@ class Edges:
     def find(
         self, tail: np.ndarray, head: np.ndarray
     ) -> tuple[Int[np.ndarray, "*batch"], Int[np.ndarray, "*batch"]]:
-        """(number of the edge between two points, how many faces it has; 0 if there is no such edge)."""
+        """(number of the edge between two points; number of its faces, 0 if there is no such edge)."""
         key = np.minimum(tail, head) * self.count + np.maximum(tail, head)
         place = np.searchsorted(self.keys, key)
         place[place == len(self.keys)] = 0
@@ -105,12 +105,12 @@ class Edges:
 
 
 def _order(key: Int[np.ndarray, " K"], count: int) -> Int[np.ndarray, " K"]:
-    """The stable order of keys below `count`: transposing a sparse matrix counts, which is quicker than sorting.
+    """Stable order of keys below `count`, by the counting sort that transposes a sparse matrix.
 
     >>> _order(np.array([5, 3, 5, 0]), 6).tolist()
     [3, 1, 0, 2]
     """
-    size, narrow = len(key), key.astype(np.int32)  # which SciPy would look through wide ones for
+    size, narrow = len(key), key.astype(np.int32)  # SciPy would scan wide indices to narrow them
     ends = np.arange(size + 1, dtype=np.int32)
     rows = sparse.csr_array((np.ones(size, np.int8), narrow, ends), (size, count))
     return rows.tocsc().indices.astype(np.int64)
@@ -119,7 +119,7 @@ def _order(key: Int[np.ndarray, " K"], count: int) -> Int[np.ndarray, " K"]:
 def _joined(
     i: np.ndarray, j: np.ndarray, data: Shaped[np.ndarray, " P"], count: int
 ) -> sparse.csr_array:
-    """The graph of the pairs (i, j), those that are there twice apart."""
+    """Graph of the pairs (i, j), in which repeated pairs stay separate entries."""
     order = _order(i, count)
     ends = np.append(0, np.bincount(i, minlength=count).cumsum()).astype(np.int32)
     return sparse.csr_array((data[order], j.astype(np.int32)[order], ends), (count, count))
@@ -144,13 +144,13 @@ def edges_of(faces: Faces, count: int) -> Edges:
 
 
 def components(i: np.ndarray, j: np.ndarray, count: int) -> Int[np.ndarray, " count"]:
-    """Number of the connected component of each of `count` nodes joined by the pairs (i, j); that of node 0 is 0."""
+    """Label of the connected component of each of `count` nodes, joined by the pairs (i, j); that of node 0 is 0."""
     graph = _joined(i, j, np.ones(len(i)), count)
     return csgraph.connected_components(graph, directed=False)[1].astype(np.int64)
 
 
 def spanning_pairs(i: np.ndarray, j: np.ndarray, count: int) -> Int[np.ndarray, " T"]:
-    """Numbers of the pairs (i, j), best first, that join `count` nodes as far as all do, without a circle.
+    """Numbers of the pairs (i, j), sorted best first, in the minimum spanning forest of `count` nodes.
 
     >>> spanning_pairs(np.array([0, 0, 1, 2]), np.array([1, 1, 2, 0]), 4).tolist()
     [0, 2]
@@ -162,9 +162,10 @@ def spanning_pairs(i: np.ndarray, j: np.ndarray, count: int) -> Int[np.ndarray, 
 def two_orientations(
     i: np.ndarray, j: np.ndarray, against: Bool[np.ndarray, " P"], count: int
 ) -> tuple[Int[np.ndarray, " F"], Int[np.ndarray, " F"]]:
-    """Component of each face as it is and turned round, where faces i and j agree, or are wound against each other.
+    """Components of the orientation double cover: labels of (face, +) and of (face, −).
 
-    An orientable component falls into its two orientations; one that has one side only stays in one piece.
+    `against` marks the pairs (i, j) of faces that are wound against each other. The cover of an orientable component
+    has two components, that of a one-sided one is connected.
     """
     turned, plain = np.where(against, j + count, j), np.where(against, j, j + count)
     both = components(np.concatenate([i, i + count]), np.concatenate([turned, plain]), 2 * count)
@@ -175,9 +176,7 @@ def two_orientations(
 def tree_sides(
     i: np.ndarray, j: np.ndarray, against: Bool[np.ndarray, " P"], count: int
 ) -> Bool[np.ndarray, " count"]:
-    """Which of `count` nodes are on the second side, by the pairs (i, j), best first, that close no circle.
-
-    The first node of each component is on the first.
+    """Side of each node along the spanning forest of the pairs (i, j), best first; False for the first of a component.
 
     >>> against = np.array([True, False, False])
     >>> tree_sides(np.array([0, 1, 2]), np.array([1, 2, 0]), against, 3).tolist()
@@ -189,13 +188,13 @@ def tree_sides(
 
 
 def pieces_of(faces: Faces, count: int) -> Int[np.ndarray, " N"]:
-    """Number of the piece of each point: points that hang together by triangles."""
+    """Label of the component of each point, in which triangles join their corners."""
     i, j = faces[:, [0, 1, 1, 2]].reshape(-1, 2).T
     return components(i, j, count)
 
 
 def consistently_wound(faces: Int[Tensor, "F v"]) -> bool:
-    """Whether neighbouring triangles (or segments) agree on which way is out: no directed edge is used twice.
+    """Whether neighbouring triangles (or segments) are consistently oriented: no directed edge is used twice.
 
     >>> [consistently_wound(torch.tensor([[0, 1, 2], other])) for other in ([2, 1, 3], [1, 2, 3])]
     [True, False]

@@ -1,4 +1,4 @@
-"""The search for fits: of which degree, and through which neighbours (`method.md`, sections 4 and 9)."""
+"""Choice of the degree and the neighbours of every local fit (`method.md`, sections 4 and 9)."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from torchlb.geometry.vectors import at
 from torchlb.linalg.precision import AT_ONCE, NEGLIGIBLE, rows_at_once
 
 MAX_LEBESGUE = 10.0
-"""Largest Lebesgue constant of a fit in the middles of the edges of its point; below 2 of good ones."""
+"""Largest Lebesgue constant of a fit at the midpoints of the edges of its vertex; that of good fits is below 2."""
 REASONS = (
     "reached",
     "too few compatible neighbours",
@@ -29,9 +29,9 @@ IN_ROWS = REASONS.index("neighbours too close to a line or conic")
 
 
 class _Buffer:
-    """Rows of several tensors, in large pieces, of which only what is filled takes memory.
+    """Append-only rows of several tensors, in large chunks of which only the filled rows take memory.
 
-    Thousands of arrays that stay, between those that come and go, would scatter the memory.
+    Thousands of small arrays kept between temporary ones would fragment the memory.
     """
 
     def __init__(self, room: int) -> None:
@@ -39,7 +39,6 @@ class _Buffer:
         self.pieces: list[list[Tensor]] = []
 
     def add(self, *rows: Tensor) -> None:
-        """Further rows."""
         count = len(rows[0])
         if not self.pieces or self.filled + count > len(self.pieces[-1][0]):
             self._close()
@@ -55,22 +54,22 @@ class _Buffer:
             self.pieces[-1] = [column[: self.filled] for column in self.pieces[-1]]
 
     def rows(self) -> list[list[Tensor]]:
-        """All of them."""
+        """All chunks, cut to the rows that are filled."""
         self._close()
         return self.pieces
 
 
 class FitSearch:
-    """Fits of heights, of the first of the degrees q, q − 1, … that is regular; and of functions, likewise.
+    """Search for the first of the degrees q, q − 1, … whose fit of heights is regular, and likewise for functions.
 
     Parameters
     ----------
     neighborhoods
-        Neighbourhoods, and the frames that the fits are over.
+        Neighbourhoods of the points, and the initial frames of the fits.
     frame_degree
-        q of the tangent planes; 0 leaves them alone.
+        Highest degree q of the fits of tangent planes; 0 keeps the initial ones.
     degrees
-        m of the fits of functions, best first; none asks for no such fits, and no graphs.
+        Degrees m of the fits of functions, best first; without any there are neither such fits nor graphs.
     num_neighbors
         Number of points of the fits of heights, if the user has fixed it.
     """
@@ -97,9 +96,9 @@ class FitSearch:
         self._functions: dict[int, dict[int, _Buffer]] = {}
 
     def refine(self, centers: Int[Tensor, " B"]) -> None:
-        """Find tangent planes at `centers`; fits of functions try the neighbourhoods that are looked at anyway.
+        """Find the tangent planes at `centers`, and try the same neighbourhoods for fits of functions.
 
-        Each centre takes the first candidate whose fit is regular, and has a tilt below 60°.
+        Each centre takes the first candidate whose fit is regular and tilted by less than 60°.
         """
         middles = self.neighborhoods.middles(centers)
         search = Search(self.neighborhoods, centers, self.candidates)
@@ -117,9 +116,10 @@ class FitSearch:
             search.settle(rows[passed])
 
     def finish(self) -> tuple[FitPlan, LocalFits]:
-        """The plan, and what follows from it where it was made.
+        """The plan, and the fits that were made for it.
 
-        Vertices without a fit of functions have tried the degrees, with more neighbours in turn, or with all of few.
+        Vertices still without a fit of functions try each degree with more and more neighbours, then with all if they
+        are few.
         """
         dim = self.neighborhoods.dim
         for degree in self.degrees:
@@ -153,7 +153,7 @@ class FitSearch:
     def _offer(
         self, block: Neighborhoods, fit: CenteredFit, heights: Tensor, graph: Tensor
     ) -> None:
-        """Try the nearest points of the neighbourhoods first for functions, by the same fit if it is that."""
+        """Try the nearest of these points for functions, by the same fit if it is the first candidate."""
         first = list_candidates(self.neighborhoods.dim, self.degrees)[0]
         size = block.points.shape[1]
         if size < first.size:
@@ -165,7 +165,7 @@ class FitSearch:
             self._try(_block(first.degree, block.vertices, block.points[:, : first.size]))
 
     def _try(self, block: Neighborhoods) -> Bool[Tensor, " b"]:
-        """Make fits of functions, and keep those that pass; which do."""
+        """Make fits of functions and keep those that pass; return which do."""
         if len(block.vertices) == 0:
             return torch.zeros(0, dtype=torch.bool)
         return self._keep(block, *self.fits.fitted(block))
@@ -173,7 +173,7 @@ class FitSearch:
     def _keep(
         self, block: Neighborhoods, fit: CenteredFit, heights: Tensor, graph: Tensor
     ) -> Bool[Tensor, " b"]:
-        """Keep the fits of functions that pass; which do."""
+        """Keep the fits of functions that pass; return which do."""
         degree = min(block.degree, self.jet)
         terms = num_monomials(self.neighborhoods.dim, degree) - 1
         regular = is_regular(fit, self.neighborhoods.middles(block.vertices), degree)
@@ -197,10 +197,7 @@ class FitSearch:
         regular: Bool[Tensor, " b"],
         frame: Bool[Tensor, " b"],
     ) -> Bool[Tensor, " b"]:
-        """Keep tangent planes, and the regular graphs that follow the heights where there was none of their degree.
-
-        Which do follow them.
-        """
+        """Keep tangent planes, and graphs of a higher degree than before that follow the heights; return which do."""
         vertices, good = block.vertices, regular
         new = torch.zeros_like(frame)
         if self.degrees:
@@ -234,7 +231,7 @@ def _block(
     points: Int[Tensor, "b K"],
     keep: Bool[Tensor, "b neighbors"] | None = None,
 ) -> Neighborhoods:
-    """With no flag set; without `keep` all points count."""
+    """Neighbourhoods with no flag set; without `keep` all points count."""
     keep = torch.ones_like(points[:, 1:], dtype=torch.bool) if keep is None else keep
     none = torch.zeros(2, len(vertices), dtype=torch.bool)
     return Neighborhoods(degree, vertices, points, keep, *none)
@@ -245,6 +242,6 @@ def _kept(degree: int, columns: list[Tensor], rows: Bool[Tensor, " b"]) -> Neigh
 
 
 def is_regular(fit: CenteredFit, middles: Tensor, degree: int) -> Bool[Tensor, " B"]:
-    """Whether neighbours determine a fit, and terms up to a degree well in the middles (B, E, d) of the edges, ℓ."""
+    """Whether a fit's slope is exact, and its Lebesgue constant up to `degree` small at edge midpoints (B, E, d), ℓ."""
     exact = fit.residual(middles.shape[2]) <= NEGLIGIBLE
     return exact & (fit.lebesgue(middles, degree) <= MAX_LEBESGUE)

@@ -1,8 +1,8 @@
-"""Tangent frames, and the way from space to the tangent plane (`method.md`, section 3).
+"""Tangent frames, and coordinates in the tangent plane (`method.md`, section 3).
 
-A frame E_i (n × d, orthonormal) is *initial* at first: principal components of the nearest neighbours, or the faces
-around a vertex. A fit of degree q to the heights over it gives the slope, and [I; ∇H], orthonormalised, is the frame
-of order q.
+The *initial* frame E_i (n × d, orthonormal) comes from principal components of the nearest neighbours, or from the
+faces around a vertex. A fit of degree q to the heights over it gives the slope ∇H, and [I; ∇H], orthonormalised, is the
+frame of order q.
 """
 
 from __future__ import annotations
@@ -21,10 +21,10 @@ from torchlb.linalg.precision import ROUNDING
 def mesh_frames(
     vertices: Float[Tensor, "N n"], faces: Int[Tensor, "F v"]
 ) -> Float[Tensor, "N n d"]:
-    """Initial frames of a mesh of d-simplices: the plane closest to those of the faces around a vertex.
+    """Initial frames of a mesh of d-simplices: at each vertex the plane closest to those of its faces.
 
-    Leading eigenvectors of the projectors onto the faces' planes, averaged by area: the orientation of the faces is
-    irrelevant, and so is the codimension. Error O(h) on a smooth surface.
+    The frame spans the leading eigenvectors of the area-weighted mean of the projectors onto the faces' planes,
+    whatever their orientation and the codimension. The error is O(h) on a smooth surface.
     """
     dim = faces.shape[1] - 1
     edges = _edges(vertices, faces)
@@ -57,7 +57,7 @@ class _Leading(torch.autograd.Function):
 
 
 def orthonormalized(frames: Float[Tensor, "B n d"]) -> Float[Tensor, "B n d"]:
-    """The columns made orthonormal in turn (Gram and Schmidt); they are far from dependent.
+    """Columns orthonormalised by Gram–Schmidt; they are far from dependent.
 
     >>> orthonormalized(torch.tensor([[[2.0, 1.0], [0.0, 3.0]]])).tolist()
     [[[1.0, 0.0], [0.0, 1.0]]]
@@ -79,8 +79,9 @@ def local_offsets(
 ) -> Float[Tensor, "B K d"]:
     """Coordinates y of the neighbours in the centre's tangent plane, in its frame.
 
-    `"tangent"`: y = E_iᵀ e, straight down. `"normal"`: y = (E_kᵀ E_i)⁻¹ E_kᵀ e, along the neighbour's own normals, as
-    in the note (with its sign corrected). Both give order p; see `method.md`, section 3.
+    `"tangent"`: y = E_iᵀ e, the orthogonal projection of the offset e. `"normal"`: y = (E_kᵀ E_i)⁻¹ E_kᵀ e, the
+    projection along the neighbour's normals, as in the note (with its sign corrected). Both give order p; see
+    `method.md`, section 3.
     """
     return PROJECTIONS[projection](points, frames, centers, neighbors)
 
@@ -92,7 +93,7 @@ def local_heights(
     neighbors: Int[Tensor, "B K"],
     coords: Float[Tensor, "B K d"],
 ) -> Float[Tensor, "B K n"]:
-    """e − E_i y, from the points y of the centre's tangent plane to the neighbours, as vectors of space."""
+    """Heights e − E_i y of the neighbours over their coordinates y in the centre's tangent plane, as vectors in Rⁿ."""
     return at(points, neighbors) - at(points, centers)[:, None] - coords @ at(frames, centers).mT
 
 
@@ -110,11 +111,10 @@ def _normal_offsets(points: Tensor, frames: Tensor, centers: Tensor, neighbors: 
 
 Projection = Literal["tangent", "normal"]
 PROJECTIONS = {"tangent": _tangent_offsets, "normal": _normal_offsets}
-"""The values of the option `projection`."""
 
 
 def complete_frames(normals: Float[Tensor, "N n"]) -> Float[Tensor, "N n d"]:
-    """Orthonormal frames of the hyperplanes orthogonal to `normals` (of any length but zero)."""
+    """Orthonormal frames of the hyperplanes orthogonal to `normals`, of any length but zero."""
     if normals.shape[1] != 3:
         return torch.linalg.qr(normals[..., None], mode="complete")[0][..., 1:]
     steep = normals[:, :1].abs() < normals[:, 2:].abs()
@@ -124,7 +124,7 @@ def complete_frames(normals: Float[Tensor, "N n"]) -> Float[Tensor, "N n d"]:
 
 
 def normals_of_frames(frames: Float[Tensor, "N n d"]) -> Float[Tensor, "N n"]:
-    """The unit normal of each frame with d = n − 1, on the side that makes [frame, normal] right-handed."""
+    """Unit normal of each frame with d = n − 1, such that [frame, normal] is right-handed."""
     if frames.shape[1] == 3:
         return torch.linalg.cross(*frames.unbind(-1))
     basis, _ = torch.linalg.qr(frames, mode="complete")
@@ -135,15 +135,15 @@ def normals_of_frames(frames: Float[Tensor, "N n d"]) -> Float[Tensor, "N n"]:
 
 
 def _edges(vertices: Float[Tensor, "N n"], faces: Int[Tensor, "F v"]) -> Float[Tensor, "F edges n"]:
-    """From the first corner of each face to the others."""
+    """Edges from the first corner of each face to the others."""
     corners = at(vertices, faces)
     return corners[:, 1:] - corners[:, :1]
 
 
 def face_normals(vertices: Float[Tensor, "N n"], faces: Int[Tensor, "F n"]) -> Float[Tensor, "N n"]:
-    """Area-weighted sum at every vertex of the normals of its faces (segments in R², triangles in R³).
+    """Area-weighted sum of the normals of the faces at every vertex (segments in R², triangles in R³).
 
-    Counter-clockwise triangles point at the viewer, counter-clockwise polygons outward.
+    Counter-clockwise triangles face the viewer, counter-clockwise polygons outward.
     """
     edges = _edges(vertices, faces)
     if vertices.shape[1] == 3:
@@ -159,7 +159,7 @@ def face_normals(vertices: Float[Tensor, "N n"], faces: Int[Tensor, "F n"]) -> F
 def vertex_normals(
     vertices: Float[Tensor, "N n"], faces: Int[Tensor, "F n"]
 ) -> Float[Tensor, "N n"]:
-    """`face_normals` of length one; zero where a vertex has none but for the rounding of its faces."""
+    """Unit `face_normals`; zero where they vanish up to the rounding of the faces."""
     total = face_normals(vertices, faces)
     size, product = torch.zeros_like(vertices[:, 0]), _edges(vertices, faces).norm(dim=-1).prod(1)
     for corner in faces.T:

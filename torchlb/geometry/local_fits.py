@@ -1,7 +1,7 @@
 """Polynomials over the initial frame of every vertex: its tangent plane, the surface around it, functions on it.
 
-`FitSearch` decides of which degree they are, and through which neighbours. What it has decided is a `FitPlan`, of
-integers alone; `LocalFits` are the numbers that follow from a plan at given points.
+`FitSearch` chooses their degrees and neighbours. The choice is a `FitPlan`, without coordinates; `LocalFits` holds the
+numbers that follow from a plan at given points.
 """
 
 from __future__ import annotations
@@ -22,21 +22,20 @@ from torchlb.linalg.precision import rows_at_once
 
 
 class Neighborhoods(NamedTuple):
-    """Of fits of one degree through as many points each.
+    """Neighbourhoods of fits of the same degree and number of points.
 
     Attributes
     ----------
     degree
-        m of the fits.
+        Degree m of the fits.
     vertices
-        (b,).
+        (b,), centres of the fits.
     points
         (b, K), the vertex first; padded by the vertex.
     keep
-        (b, K − 1), which of its neighbours are none of the padding.
+        (b, K − 1), which neighbours are no padding.
     frame, surface
-        (b,), whether the tangent plane, and the graph of the surface, is that of this fit; all false where the fit is
-        one of functions.
+        (b,), whether the fit provides the tangent plane, and the graph of the surface; False for fits of functions.
     """
 
     degree: int
@@ -47,7 +46,7 @@ class Neighborhoods(NamedTuple):
     surface: Bool[Tensor, " b"]
 
     def parts(self, dim: int) -> Iterator[tuple[slice, Neighborhoods]]:
-        """So many at a time that an array of all monomials stays below `BYTES`."""
+        """Yield chunks, with their slices, whose arrays of all monomials stay below `BYTES`."""
         size = rows_at_once(self.points.shape[1] * num_monomials(dim, self.degree))
         for first in range(0, len(self.vertices), size):
             part = slice(first, first + size)
@@ -56,28 +55,28 @@ class Neighborhoods(NamedTuple):
 
 @dataclass(frozen=True)
 class FitPlan:
-    """What is decided about the fits of a shape.
+    """Degrees and neighbourhoods of all fits of a shape.
 
     Attributes
     ----------
     surface, functions
-        The neighbourhoods of the fits of heights, and of functions.
+        Neighbourhoods of the fits of heights, and of functions.
     order
-        (N,), degree of the fit behind each tangent plane; 0 where it stays the initial one.
+        (N,), degree of the fit behind each tangent plane; 0 for the initial plane.
     surface_degree
         (N,), degree of the graph around each vertex; 0 where there is none.
     degree
         (N,), degree m of the fit of functions; 0 where none passed, which leaves the vertex flat.
     reason
-        (N,), why the highest degree was not reached, a place in `REASONS`.
+        (N,), why the highest degree was not reached, an index into `REASONS`.
     size
-        (N,), number of points of the fit of functions, the vertex among them.
+        (N,), number of points of the fit of functions, the vertex included.
     highest
         Degree up to which graphs are kept.
     jet, reach
-        Degree up to which fits of functions are kept, and the part of the way to a node where they are asked. Of fits
-        of degree 2 and 3 that is the gradient, half of the way: the cubic Hermite interpolant in the middle of an edge,
-        (u_a + u_b)/2 + (∂u_a − ∂u_b)/8 with ∂ along it, is the mean of u_a + ∇u_a·y there.
+        Degree up to which fits of functions are kept, and fraction of the offset to a node at which they are evaluated.
+        Fits of degree 2 and 3 keep the gradient, at half of the offset: the cubic Hermite interpolant in the middle of
+        an edge, (u_a + u_b)/2 + (∂u_a − ∂u_b)/8 with ∂ along it, is the mean of u_a + ∇u_a·y over its ends.
     """
 
     surface: list[Neighborhoods]
@@ -92,32 +91,32 @@ class FitPlan:
     reach: float
 
     def flattened(self, vertices: Bool[Tensor, " N"]) -> FitPlan:
-        """The same without fits of functions at these vertices, which makes the surface flat there."""
+        """Plan without fits of functions at these vertices, where the surface is then flat."""
         return replace(self, degree=torch.where(vertices, 0, self.degree))
 
 
 class LocalFits:
-    """What fits say at given points.
+    """Tangent planes, graphs and coefficients of the fits at given points.
 
     Parameters
     ----------
     points
         (N, n), ℓ.
     initial
-        (N, n, d), the frames that the fits are over.
+        (N, n, d), initial frames.
     degree
-        Up to which graphs are kept.
+        Degree up to which graphs are kept.
 
     Attributes
     ----------
     frames
-        (N, n, d), of the tangent planes.
+        (N, n, d), frames of the tangent planes.
     heights
-        (N, M − 1, n), ℓ: graphs of the surface over the initial frames, as vectors; zero beyond a fit's own monomials.
+        (N, M − 1, n), ℓ: graphs of the surface over the initial frames, as vectors; zero beyond the monomials of a fit.
     surface_radius, radius
-        (N,), ℓ, of the fits of heights and of functions.
+        (N,), ℓ, radii of the fits of heights and of functions.
     coefficients
-        Of the fits of functions, in the order of `FitPlan.functions`, as in `CenteredFit`.
+        Coefficients of the fits of functions, in the order of `FitPlan.functions`, as in `CenteredFit`.
     """
 
     def __init__(
@@ -133,7 +132,7 @@ class LocalFits:
     def at(
         cls, plan: FitPlan, points: Float[Tensor, "N n"], initial: Float[Tensor, "N n d"]
     ) -> LocalFits:
-        """Those of a plan."""
+        """Compute the fits of a plan at these points."""
         found, dim = cls(points, initial, plan.highest), initial.shape[2]
         for block in plan.surface:
             for _, part in block.parts(dim):
@@ -150,11 +149,11 @@ class LocalFits:
         return found
 
     def let_go(self) -> None:
-        """Of the graphs and the fits of functions, which nothing asks once there is a pair."""
+        """Release the graphs and the fits of functions, which are not needed once there is a pair."""
         self.heights, self.coefficients = self.heights[:0].clone(), []
 
     def fit(self, block: Neighborhoods) -> tuple[CenteredFit, Tensor, Tensor]:
-        """The fits; vectors to the neighbours, (b, K − 1, n), and their components in the initial planes."""
+        """(fits; offsets of the neighbours, (b, K − 1, n); their coordinates in the initial planes)."""
         frame, places = at(self.initial, block.vertices), at(self.points, block.points)
         offset = places[:, 1:] - places[:, :1]
         coords, keep = offset @ frame, None if block.keep.all() else block.keep
@@ -163,7 +162,7 @@ class LocalFits:
     def fitted(
         self, block: Neighborhoods
     ) -> tuple[CenteredFit, Float[Tensor, "b neighbors n"], Float[Tensor, "b M n"]]:
-        """The fits, the heights over the initial planes that they are to follow, and the graphs that they make."""
+        """(fits; heights over the initial planes, to which they are made; the resulting graphs)."""
         fit, offset, coords = self.fit(block)
         heights = offset - coords @ at(self.initial, block.vertices).mT
         if not block.keep.all():
@@ -173,7 +172,7 @@ class LocalFits:
     def take_surface(
         self, block: Neighborhoods, fit: CenteredFit, graph: Float[Tensor, "b M n"]
     ) -> None:
-        """Keep the tangent planes and the graphs of these fits."""
+        """Store the tangent planes and the graphs of these fits."""
         on = block.frame
         if on.any():
             tilted = (
@@ -189,5 +188,5 @@ class LocalFits:
 def slope_of(
     fit: CenteredFit, graph: Float[Tensor, "b M n"], frames: Float[Tensor, "N n d"]
 ) -> Float[Tensor, "b d n"]:
-    """First derivatives of the heights, in the normal space."""
+    """First derivatives of the fitted heights, vectors in the normal space."""
     return graph[:, : frames.shape[2]] / fit.radius[:, None, None]

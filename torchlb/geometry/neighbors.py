@@ -1,9 +1,9 @@
-"""Neighbourhoods: who may enter a point's stencil, and in which order (`method.md`, section 4).
+"""Neighbourhoods: which points form a stencil, and in which order (`method.md`, section 4).
 
-A plain ball of the nearest points mixes the two sides of a thin sheet, whose tangent planes agree. So a stencil is
-drawn from a *k-hop neighbourhood*: walk the edges of a mesh, or of the graph of each point's few nearest compatible
-neighbours on a cloud, and step only on points that are compatible from the centre. The `size` nearest of what was
-reached are the pool, ordered by distance. A path across a crease is cut there, where the tangent planes turn away.
+A Euclidean ball mixes the two sides of a thin sheet, whose tangent planes agree. So a stencil is drawn from a *k-hop
+neighbourhood*: a breadth-first walk along the edges of a mesh, or of the graph of each point's few nearest compatible
+neighbours on a cloud, restricted to points compatible with the centre. The `size` nearest points reached are the pool,
+ordered by distance. At a crease, where the tangent planes turn away, the walk ends.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from torchlb.geometry.vectors import at
 
 
 def nearest_neighbors(points: Float[Tensor, "N n"], size: int) -> Int[Tensor, "N K"]:
-    """The `size` nearest points of each point by distance, the point itself first, also where others coincide with it.
+    """The `size` nearest points of each point by distance, itself first even where others coincide with it.
 
     >>> nearest_neighbors(torch.tensor([[0.0], [1.0], [3.0]]), 2).tolist()
     [[0, 1], [1, 0], [2, 1]]
@@ -36,12 +36,12 @@ def nearest_neighbors(points: Float[Tensor, "N n"], size: int) -> Int[Tensor, "N
     found = torch.from_numpy(np.asarray(index, dtype=np.int64).reshape(len(points), size))
     own = torch.arange(len(points))[:, None]
     others = found != own
-    others[:, -1] &= ~others.all(1)  # it was crowded out by points at the same place
+    others[:, -1] &= ~others.all(1)  # the point was crowded out by coincident ones
     return torch.cat([own, found[others].view(len(points), size - 1)], 1)
 
 
 def adjacency(i: np.ndarray, j: np.ndarray, num_points: int) -> sparse.csr_array:
-    """Symmetric 0/1 adjacency with the pairs (i, j), without loops."""
+    """Symmetric 0/1 adjacency matrix of the pairs (i, j), without loops."""
     keep = i != j
     ones = np.ones(int(keep.sum()), dtype=np.float32)
     graph = sparse.csr_array((ones, (i[keep], j[keep])), shape=(num_points, num_points))
@@ -51,7 +51,7 @@ def adjacency(i: np.ndarray, j: np.ndarray, num_points: int) -> sparse.csr_array
 
 
 def mesh_graph(faces: Int[Tensor, "F v"], num_points: int) -> sparse.csr_array:
-    """Edges of a mesh of simplices as a symmetric (N, N) adjacency.
+    """Symmetric (N, N) adjacency matrix of the edges of a mesh of simplices.
 
     >>> mesh_graph(torch.tensor([[0, 1, 2]]), 4).toarray().astype(int).tolist()
     [[0, 1, 1, 0], [1, 0, 1, 0], [1, 1, 0, 0], [0, 0, 0, 0]]
@@ -66,7 +66,7 @@ def mesh_graph(faces: Int[Tensor, "F v"], num_points: int) -> sparse.csr_array:
 def longest_edges(
     points: Float[Tensor, "N n"], graph: sparse.csr_array, count: int
 ) -> Int[Tensor, "N count"]:
-    """The other ends of the longest edges of every point; padded by the point itself.
+    """Neighbours of every point along its longest edges; padded by the point itself.
 
     >>> path = mesh_graph(torch.tensor([[0, 1], [1, 2]]), 3)
     >>> longest_edges(torch.tensor([[0.0], [1.0], [3.0]]), path, 1).tolist()
@@ -85,7 +85,7 @@ def longest_edges(
 
 
 class _Level:
-    """Balls of one size, of those points that have been asked for."""
+    """Neighbourhoods of one size, of the points asked for so far."""
 
     def __init__(self, size: int, num_points: int) -> None:
         self.size, self.held = size, 0
@@ -94,9 +94,8 @@ class _Level:
         self.count = torch.empty(0, dtype=torch.int32)
 
     def add(self, centers: Tensor, index: Tensor, count: Tensor) -> None:
-        """Balls of further points."""
         first, self.held = self.held, self.held + len(centers)
-        if self.held > len(self.count):  # double the room, up to that for all
+        if self.held > len(self.count):  # double the capacity, at most to all points
             room = min(max(2 * len(self.count), self.held), len(self.place))
             for name in ("index", "count"):
                 old = getattr(self, name)
@@ -108,7 +107,7 @@ class _Level:
 
 
 class GraphNeighborhoods:
-    """The nearest points of a k-hop neighbourhood, for any chunk of centres. What has been found is kept.
+    """Nearest points of a k-hop neighbourhood, for any chunk of centres; results are kept.
 
     Parameters
     ----------
@@ -119,7 +118,7 @@ class GraphNeighborhoods:
     frames
         (N, n, d) tangent frames that decide compatibility.
     sides
-        (N, n) from `thin_sides`: also refused is a point on the other side of a thin shape. None if not known.
+        (N, n) from `thin_sides`; points on the other side of a thin shape are refused. None if unknown.
     """
 
     def __init__(
@@ -143,14 +142,14 @@ class GraphNeighborhoods:
     def with_frames(
         self, frames: Float[Tensor, "N n d"], sides: Float[Tensor, "N n"] | None
     ) -> GraphNeighborhoods:
-        """The same neighborhoods for slightly other frames; those not found yet are admitted by the new ones."""
+        """Same neighbourhoods for slightly different frames, which decide those not found yet."""
         neighborhoods = GraphNeighborhoods(self.points, self.graph, frames, sides)
         neighborhoods._kept = self._kept
         return neighborhoods
 
     @cached_property
     def _arrays(self) -> dict[str, np.ndarray]:
-        """What the compiled walk takes."""
+        """Arguments of the compiled walk."""
         sides = torch.zeros_like(self.points) if self.sides is None else self.sides
         shape = {"points": self.points, "normals": normal_frames(self.frames), "sides": sides}
         rows = {"indptr": self.graph.indptr, "indices": self.graph.indices}
@@ -159,11 +158,11 @@ class GraphNeighborhoods:
 
     @cached_property
     def longest(self) -> Int[Tensor, "N edges"]:
-        """The other ends of the longest `AROUND` edges of every point, see `longest_edges`."""
+        """Neighbours of every point along its longest `AROUND` edges, see `longest_edges`."""
         return longest_edges(self.points, self.graph, AROUND)
 
     def middles(self, centers: Int[Tensor, " B"]) -> Float[Tensor, "B edges d"]:
-        """The middles of those edges in the centre's tangent plane, in its frame, ℓ."""
+        """Midpoints of these edges in the centre's tangent plane, in its frame, ℓ."""
         ends = at(self.points, self.longest[centers])
         return (ends - self.points[centers, None]) @ self.frames[centers] / 2
 
@@ -175,9 +174,9 @@ class GraphNeighborhoods:
         Returns
         -------
         index
-            (B, size), padded by the centre itself where the ball holds fewer.
+            (B, size), padded by the centre where the neighbourhood holds fewer.
         count
-            (B,), how many are real.
+            (B,), number of points before the padding.
         """
         level = next((kept for kept in self._kept if kept.size >= size), None)
         if level is None:
@@ -192,9 +191,9 @@ class GraphNeighborhoods:
     def _grown(
         self, centers: Int[Tensor, " B"], size: int
     ) -> tuple[Int[Tensor, "B K"], Int[Tensor, " B"]]:
-        """The neighborhoods, and how many points they hold.
+        """(neighbourhoods; numbers of their points).
 
-        A round ball has about half as many rings as they have at most: what grows along a strip alone is none.
+        The bound on the rings is twice the number in a round neighbourhood, so that none grows along a strip alone.
         """
         from torchlb.linalg import kernels
 

@@ -1,4 +1,4 @@
-"""Points in the order of a k-d tree, so that near ones are near in memory, and back to the user's numbers."""
+"""Numbering of points along a k-d tree, so that near points are near in memory, and back to the user's."""
 
 from __future__ import annotations
 
@@ -15,14 +15,14 @@ from torch import Tensor
 
 @dataclass(frozen=True)
 class Numbering:
-    """A permutation of the points of a shape; all that is built from near points is built faster in it.
+    """Permutation of the points of a shape along a k-d tree, in which operators are built faster.
 
     Attributes
     ----------
     given
-        (N,), of each point, in the order of the tree, the number that the user gave it.
+        (N,), the user's number of each point in the order of the tree.
     here
-        (N,), of each of the user's points the place in that order.
+        (N,), the position of each of the user's points in that order.
 
     >>> numbering = Numbering.along_tree(torch.rand(50, 3))
     >>> numbering.given[numbering.here].equal(torch.arange(50))
@@ -34,14 +34,14 @@ class Numbering:
 
     @classmethod
     def along_tree(cls, points: Float[Tensor, "N n"]) -> Numbering:
-        """The order of the leaves of a k-d tree, the same however the points are numbered: they go in sorted."""
+        """Order of the leaves of a k-d tree of the sorted points, the same however the user numbers them."""
         places = points.numpy()
         first = np.lexsort(places.T)
         given = torch.from_numpy(first[KDTree(places[first]).indices])
         return cls(given, torch.empty_like(given).scatter_(0, given, torch.arange(len(given))))
 
     def sorted(self, values: Tensor) -> Tensor:
-        """Values (N, …) of the user's points, in this order."""
+        """Values (N, …) of the user's points, in the order of the tree."""
         return values[self.given]
 
     def restored(self, values: Tensor) -> Tensor:
@@ -49,7 +49,7 @@ class Numbering:
         return values[self.here]
 
     def faces(self, faces: Int[Tensor, "F v"]) -> tuple[Int[Tensor, "F v"], Int[Tensor, " F"]]:
-        """Faces in the numbers of this order, by their lowest; and of each its place among those given."""
+        """(faces in the numbers of the tree, sorted by their lowest; the position of each among `faces`)."""
         faces = self.here[faces]
         order = faces.amin(1).argsort(stable=True)
         return faces[order], order
@@ -57,11 +57,11 @@ class Numbering:
     def restored_pattern(
         self, crow: Int[Tensor, " N_plus_1"], col: Int[Tensor, " nnz"]
     ) -> tuple[Int[Tensor, " N_plus_1"], Int[Tensor, " nnz"], Int[Tensor, " nnz"]]:
-        """A sparse pattern (N, N) in the user's numbers, columns ascending, and of its entries the places here."""
+        """Sparse (N, N) pattern in the user's numbers, columns ascending, and the position of its entries in `col`."""
         count, given = len(self.given), self.given.int().numpy()
         parts = np.arange(len(col), dtype=np.int32), given[col.numpy()], crow.numpy()
         turned: Any = sparse.csr_array(sparse.csr_array(parts, shape=(count, count)).T)
         turned.indices = given[turned.indices]
-        whole: Any = sparse.csr_array(turned.T)  # sorted as it comes
+        whole: Any = sparse.csr_array(turned.T)  # transposing has sorted the columns
         found = whole.indptr.astype(np.int64), whole.indices.astype(np.int64), whole.data
         return torch.from_numpy(found[0]), torch.from_numpy(found[1]), torch.from_numpy(found[2])

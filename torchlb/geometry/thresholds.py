@@ -1,32 +1,32 @@
-"""The angles, factors and shares by which shapes are judged, each said once."""
+"""Angles, factors and shares by which shapes are judged."""
 
 from __future__ import annotations
 
 from math import acos, cos, pi, radians, sqrt
 
 CREASE = cos(radians(60))
-"""Cosine of the angle between two tangent planes, or two edges, that makes a crease, a fold or a corner."""
+"""Cosine of the least angle between two tangent planes, or two edges, that counts as a crease, a fold or a corner."""
 LEVEL = cos(radians(45))
-"""Cosine, and sine, of the angle that tells level from steep."""
+"""Cosine, and sine, of the angle that separates level from steep."""
 KINK = cos(radians(20))
-"""Cosine of the angle up to which what turns is taken for smooth."""
+"""Cosine of the largest turning angle that counts as smooth."""
 OBTUSE = pi - acos(CREASE)
-"""What the angle of a crease leaves of a straight one, 120° in radians: a gap around a point, and a turn back."""
+"""Supplement of the crease angle, 120° in radians: a gap around a point, or a turn back."""
 HALF_CREASE = sqrt((1 - CREASE) / 2)
-"""Sine of half the angle of a crease: slope of the chord of an arc that turns by so much, 0.5."""
+"""Sine of half the crease angle: slope of the chord of an arc that turns by the crease angle, 0.5."""
 
 FACTOR = 3.0
-"""Times what is usual, of good stencils, of neighbours or of flat triangles, from which on something is out of line."""
+"""Multiple of what is usual (of good stencils, neighbours, flat triangles) from which on something is an outlier."""
 WIDER = 1.5
-"""Times what is needed, or usual, that is safe: half as much again."""
+"""Safety factor on what is needed, or usual."""
 ROUGH = 0.3
-"""Share by which the last resort may miss, and a shape leave its plane: heights over lengths, noise over spacings."""
+"""Share by which a last resort may miss, or a shape leave its plane: heights over lengths, noise over spacings."""
 SLIGHT = 0.05
-"""Share by which a good fit may miss, and good triangles overlap."""
+"""Relative error allowed to a good fit, and overlap allowed to good triangles."""
 
 AROUND = 6
-"""Neighbours of a point in triangles of a plane, on average, by Euler's formula."""
+"""Mean number of neighbours of a vertex in a planar triangulation, by Euler's formula."""
 RING = 8
-"""Nearest points that surround one, and points or cells too few to be a part of their own."""
+"""Number of nearest points that surround a point; groups of fewer points or cells do not count as a component."""
 NEAREST = 24
-"""Nearest points among which those beside one are, also where a cloud is uneven: three rings."""
+"""Number of nearest points that hold the neighbours of a point, also in an uneven cloud: three rings."""

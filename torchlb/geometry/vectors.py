@@ -1,4 +1,4 @@
-"""Many short vectors, of torch and of NumPy: three to twenty times as fast as by their own notation."""
+"""Operations on many short vectors, of torch and of NumPy, three to twenty times as fast as in plain notation."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from torch import Tensor
 
 
 def dot(a: Float[Tensor, "*#batch n"], b: Float[Tensor, "*#batch n"]) -> Float[Tensor, "*batch"]:
-    """a·b along the last axis, summed in order: the same to the bit on every processor, and in compiled loops.
+    """a·b along the last axis, summed in order: bitwise the same on every processor, and in compiled loops.
 
     >>> import torch
     >>> dot(torch.tensor([[3.0, 4.0]]), torch.tensor([[1.0, 2.0]])).tolist()
@@ -24,7 +24,7 @@ def dot(a: Float[Tensor, "*#batch n"], b: Float[Tensor, "*#batch n"]) -> Float[T
 
 
 def at(x: Shaped[Tensor, "N ..."], index: Int[Tensor, "*batch"]) -> Shaped[Tensor, "*batch ..."]:
-    """x[index], the rows of x at the given places.
+    """Rows of x at the given indices, x[index].
 
     >>> import torch
     >>> at(torch.eye(3), torch.tensor([[2, 0]])).tolist()
@@ -34,7 +34,7 @@ def at(x: Shaped[Tensor, "N ..."], index: Int[Tensor, "*batch"]) -> Shaped[Tenso
 
 
 def inner(a: Float[np.ndarray, "*#batch n"], b: Float[np.ndarray, "*#batch n"]) -> np.ndarray:
-    """a·b along the last axis, of arrays.
+    """a·b along the last axis of arrays.
 
     >>> inner(np.array([[3.0, 4.0]]), np.array([[1.0, 2.0]])).tolist()
     [11.0]
@@ -43,7 +43,7 @@ def inner(a: Float[np.ndarray, "*#batch n"], b: Float[np.ndarray, "*#batch n"]) 
 
 
 def lengths(x: Float[np.ndarray, "*batch n"]) -> Float[np.ndarray, "*batch"]:
-    """|x| along the last axis, of an array.
+    """|x| along the last axis of an array.
 
     >>> lengths(np.array([[3.0, 4.0]])).tolist()
     [5.0]
@@ -52,7 +52,7 @@ def lengths(x: Float[np.ndarray, "*batch n"]) -> Float[np.ndarray, "*batch"]:
 
 
 def smallest(x: Shaped[np.ndarray, "*batch n"]) -> Shaped[np.ndarray, "*batch"]:
-    """The least along the last axis, a short one.
+    """Minimum along the last, short axis.
 
     >>> smallest(np.array([[3.0, 4.0]])).tolist()
     [3.0]
@@ -61,7 +61,7 @@ def smallest(x: Shaped[np.ndarray, "*batch n"]) -> Shaped[np.ndarray, "*batch"]:
 
 
 def largest(x: Shaped[np.ndarray, "*batch n"]) -> Shaped[np.ndarray, "*batch"]:
-    """The most along the last axis, a short one.
+    """Maximum along the last, short axis.
 
     >>> largest(np.array([[3.0, 4.0]])).tolist()
     [4.0]
