@@ -38,7 +38,7 @@ class Schedule:
     single
         Number of marks that each skip one candidate; then the number to skip doubles with every second mark.
     most
-        Most rounds, after which the operator is left as it is, with a warning.
+        Largest number of rounds; then the operator is left as it is, with a warning.
     """
 
     single: int = 4
@@ -90,7 +90,7 @@ def certify(
             matrix = to_scipy(rows.crow, rows.col, rows.laplacian, (count, count))
             free = rows.candidate < bottom
             marked, start = _into_closed_classes(matrix) & free, torch.full_like(times, bottom)
-            if not marked.any() or rounds == schedule.most:  # otherwise π is zero outside those classes
+            if not marked.any() or rounds == schedule.most:  # else π is 0 outside those
                 mass, result, feed = check_certificate(matrix, areas, outflow=outflow)
                 marked = _marked(matrix, mass / areas, feed, free, spread=not result.holds)
                 if not marked.any() or rounds == schedule.most:
@@ -170,7 +170,7 @@ def _around_small_weights(
 ) -> Bool[np.ndarray, " N"]:
     """Rows to mark for the points of small π.
 
-    For each such point these are the rows with a considerable negative weight of it; its own row if π is positive,
+    For each such point these are the rows with a considerable negative weight on it; its own row if π is positive,
     since π_i |L_ii| = Σ_{j≠i} π_j L_ji, the inflow, so that a smaller diagonal makes π_i larger and keeps its sign;
     and, if its own is a low-order row, the rows of the points in it, which may not refer back, as across a crease.
     """

@@ -25,7 +25,7 @@ def left_null_vector(
     areas: Float[Tensor, " N"],
     outflow: Float[np.ndarray, " N"] | None = None,
 ) -> tuple[Float[Tensor, " N"], np.ndarray, float]:
-    """π with πᵀL = −q, scaled on each component to the sum of the areas there.
+    """Left null vector π, πᵀL = −q, scaled on each component to the sum of the areas there.
 
     Inverse iteration uses the LU of (AL)ᵀ, A the areas, with a relative shift of each diagonal entry; beyond
     `krylov.LARGEST_FACTORED` points it is GMRES with multigrid of the low-order part.

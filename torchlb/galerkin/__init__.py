@@ -3,7 +3,7 @@
 Decisions (`CurvingPlan`, `PairPlan`) are kept apart from what is evaluated at given points. `elements`: Lagrange
 elements on the reference simplex. `nodes`: the numbering of Lagrange nodes on a complex. `assembly`: K_FE and M_FE.
 `curving`: positions of the nodes on the surface, and which cells stay flat. `coarse`: triangles too coarse for the
-fits; `delaunay`: the intrinsic Delaunay double cover that replaces them. `prolongation`: P, from the vertices to the
+fits; `delaunay`: the intrinsic Delaunay tufted cover that replaces them. `prolongation`: P, from the vertices to the
 nodes. `boundary_curves`: polynomial curves along the boundary of a surface. `boundary`: nodes along a boundary.
 `flips`: edge flips that remove folded triangles and slivers. `forms`: PᵀK_FE P and PᵀM_FE P, for any conductivity.
 `pair`: the matrices of an operator, and the positive lumped mass. `absorption`: the term that Robin conditions add to

@@ -43,8 +43,8 @@ def boundary_nodes(
     degrees
         Degrees of the fits of functions, best first.
     held
-        (N,), vertices with a Dirichlet condition. On the boundary of a solid, values at nodes depend on boundary
-        vertices alone only there; at its creases they are linear.
+        (N,), vertices with a Dirichlet condition. Only there do values on the boundary of a solid depend on its
+        vertices alone; at its creases they are linear.
     """
     outer = (nodes.sides[nodes.dim].uses == 1).nonzero()[:, 0]
     if nodes.dim == 1 or len(outer) == 0:

@@ -125,7 +125,7 @@ class CurvingPlan:
         return CurvedMesh(places, g, lengths, cover, boundary, ends)
 
     def cover(self, lengths: Float[Tensor, "F e"], flips: list[Tensor] | None) -> Cover | None:
-        """Intrinsic Delaunay double cover of the coarse triangles, glued along the free boundary; None without any."""
+        """Intrinsic Delaunay tufted cover of the coarse triangles, glued along the free boundary; None without any."""
         coarse, nodes = self.coarse, self.nodes
         if not coarse.any():
             return None

@@ -1,6 +1,6 @@
-"""Intrinsic Delaunay triangulation of the double cover of flat triangles (Sharp and Crane 2020).
+"""Intrinsic Delaunay triangulation of the tufted cover of flat triangles (Sharp and Crane 2020).
 
-A boundary edge opposite an obtuse angle has a negative cotangent weight, and cannot be flipped. On the double cover,
+A boundary edge opposite an obtuse angle has a negative cotangent weight, and cannot be flipped. On the tufted cover,
 two copies of every triangle glued along the boundary, it is an interior edge like all others.
 """
 
@@ -23,7 +23,7 @@ EDGES = tuple((i, (i + 1) % 3) for i in range(3))
 
 
 class Cover(NamedTuple):
-    """Double cover of a set of triangles.
+    """Tufted cover of a set of triangles.
 
     Attributes
     ----------
@@ -59,7 +59,7 @@ class Cover(NamedTuple):
 
 
 def mollified(sides: Float[Tensor, "F 3"], faces: Int[Tensor, "F 3"]) -> Float[Tensor, "F 3"]:
-    """Mollified edge lengths: one constant per component is added, so that no triangle is degenerate.
+    """Mollified edge lengths (Sharp and Crane 2020): one constant per component leaves no triangle degenerate.
 
     Two edges of a triangle then exceed the third by 1e-5 of the mean length; with 1e-6, flips may not terminate.
     """
@@ -99,7 +99,7 @@ def delaunay_cover(
     fixed: Bool[Tensor, " E"],
     flips: list[Tensor] | None = None,
 ) -> Cover:
-    """Double cover of the triangles, flipped until it is intrinsic Delaunay except at `fixed` edges.
+    """Tufted cover of the triangles, flipped until it is intrinsic Delaunay except at `fixed` edges.
 
     `edge` numbers the edges of the faces. At an edge of any number of faces each face is glued to the back of the next.
     Where `flips` are given, these are repeated instead, whatever the lengths.

@@ -22,7 +22,7 @@ def check_tensor(f: object, what: str = "f") -> None:
 
 
 def check_operator(lb: object) -> None:
-    """Raise InputTypeError unless `lb` is an operator, as where arguments are swapped.
+    """Raise InputTypeError unless `lb` is an operator; swapped arguments are the usual cause.
 
     >>> check_operator(torch.ones(3))  # doctest: +ELLIPSIS
     Traceback (most recent call last):

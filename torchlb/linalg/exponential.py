@@ -166,7 +166,7 @@ def _terms(
     tolerance: float,
     sizes: Sequence[int],
 ) -> Iterator[Term]:
-    """Terms ((rows, columns), v_k, c_k, c_k') of the shorter expansion; the choice takes values, which a trace lacks."""
+    """Terms ((rows, columns), v_k, c_k, c_k') of the shorter expansion; the choice cannot be traced."""
     times = time.detach().double().cpu().numpy()
     if len(times) == 0 or len(x) == 0:
         return iter(())
@@ -275,7 +275,7 @@ def _rational(
 
 
 def poles(times: np.ndarray) -> Iterator[tuple[float, np.ndarray]]:
-    """Yield (γ, indices of the times that share it) for positive times; γ is a power of ten, shared over steps."""
+    """Yield (γ, indices of its times) for positive times; γ is a power of ten, shared by similar times."""
     level = np.floor(np.log10(np.where(times > 0, times / SHORTEST, 1.0)))
     for exponent in np.unique(level[times > 0]).tolist():
         yield 10.0**exponent, np.flatnonzero((level == exponent) & (times > 0))

@@ -18,7 +18,7 @@ NEGLIGIBLE = 1e-6
 SINGLE = 1e-5
 """Accuracy of single precision: error of solves in float32, and relative error of lengths that are rounded to it."""
 SMALL = 1e-3
-"""Relative change with less effect on a result than the mesh has."""
+"""Relative change that affects a result by less than the mesh does."""
 LOW = 0.1
 """Fraction of the usual value below which a quantity is poor, and fraction of a shape from which on a warning is
 issued."""
@@ -34,7 +34,7 @@ LARGEST_FACTORED = 100_000
 ROUNDS = 20
 """Restarts after which an iteration has failed; two or three suffice as a rule."""
 STEPS = 500
-"""Most steps of a Krylov method between restarts; a tenth suffices as a rule."""
+"""Largest number of steps of a Krylov method between restarts; a tenth suffices as a rule."""
 
 
 def rows_at_once(size: int) -> int:

@@ -83,7 +83,7 @@ class Condition:
         centers: Int[Tensor, " B"],
         rows: Rows,
     ) -> Rows:
-        """Adapt the rows of `centers`: those of low order, which have no data, lose a f on their share of it."""
+        """Adapt the rows of `centers`: low-order ones, without data, lose a f over their share of the boundary."""
         if self.share is None or self.conserves:
             return rows
         lost = self.share * boundary.sizes / areas
