@@ -79,8 +79,7 @@ def certify(
     outflow
         Whether rows may have L1 < 0, as beside a Dirichlet boundary.
 
-    Returns the final rows, the mass π, (N,), ℓ^d, and the certificate; a `StabilityWarning` is issued if it does not
-    hold.
+    Returns the rows, the mass π, (N,), ℓ^d, and the certificate; a `StabilityWarning` is issued if it does not hold.
     """
     first, count, rounds = rows, len(areas), 0
     times = torch.zeros(count, dtype=torch.int64)
@@ -149,8 +148,7 @@ def _marked(
 ) -> Bool[Tensor, " N"]:
     """Rows to widen or lower: those that make π small or contribute to S > 0.
 
-    With `spread`, neighbouring rows are marked too until one of them is free, since low-order rows are symmetric only
-    together.
+    With `spread`, neighbours are marked too until one is free, since low-order rows are symmetric only together.
     """
     joined = sparse.csr_array(abs(matrix) + abs(matrix).T)
     joined.data[:] = 1.0

@@ -36,8 +36,7 @@ class Weights:
     radius
         (B,), ℓ: distance ρ of the farthest neighbour in local coordinates.
     condition
-        (B,), condition of √ω V with columns of unit length, as `left_inverse` gives it; above 1e10, or not finite,
-        without full rank.
+        (B,), condition of √ω V with unit columns, by `left_inverse`; above 1e10, or not finite, without full rank.
     residual
         (B,): largest violation of the moment equations, in units of the largest right-hand side.
     height_residual

@@ -6,6 +6,5 @@ elements on the reference simplex. `nodes`: the numbering of Lagrange nodes on a
 fits; `delaunay`: the intrinsic Delaunay tufted cover that replaces them. `prolongation`: P, from the vertices to the
 nodes. `boundary_curves`: polynomial curves along the boundary of a surface. `boundary`: nodes along a boundary.
 `flips`: edge flips that remove folded triangles and slivers. `forms`: PᵀK_FE P and PᵀM_FE P, for any conductivity.
-`pair`: the matrices of an operator, and the positive lumped mass. `absorption`: the term that Robin conditions add to
-K.
+`pair`: an operator's matrices and positive lumped mass. `absorption`: the term that Robin conditions add to K.
 """

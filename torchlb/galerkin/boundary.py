@@ -43,8 +43,8 @@ def boundary_nodes(
     degrees
         Degrees of the fits of functions, best first.
     held
-        (N,), vertices with a Dirichlet condition. Only there do values on the boundary of a solid depend on its
-        vertices alone; at its creases they are linear.
+        (N,), vertices with a Dirichlet condition. Only there do values on a solid's boundary depend on it alone,
+        linearly at creases.
     """
     outer = (nodes.sides[nodes.dim].uses == 1).nonzero()[:, 0]
     if nodes.dim == 1 or len(outer) == 0:
@@ -74,8 +74,8 @@ class WithoutBoundary:
 class OnCurves:
     """Nodes on polynomial curves through the boundary vertices of a surface.
 
-    The displacement over edge (i, j) is blended into its triangle by (b_i + b_j)², b the barycentric coordinates; a
-    quadratic one thus becomes b_i b_j.
+    The displacement over edge (i, j) is blended into its triangle by (b_i + b_j)², b barycentric; a quadratic one
+    becomes b_i b_j.
 
     Attributes
     ----------

@@ -58,7 +58,7 @@ class BoundaryNodes:
     Attributes
     ----------
     displacement
-        (X, n), displacement of every node from its flat position, ℓ.
+        (X, n), displacement of every node from its flat position by the boundary, ℓ.
     nodes
         (A,), nodes along the boundary.
     entries

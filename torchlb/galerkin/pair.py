@@ -243,8 +243,7 @@ def positive_mass(
     """Lumped mass Pᵀw, w = M_FE 1: quadrature weights of high order at the vertices, which sum to the area.
 
     While a weight is below a tenth of that of P1 elements, the rows of P that contribute negatively to it are replaced
-    by linear ones; this terminates, since linear rows contribute nothing negative. Return also these rows, counted from
-    the last vertex on.
+    by linear ones; this terminates, since linear rows contribute nothing negative. Return also the nodes of these rows.
     """
     nodes, count, mass = plan.curving.nodes, p.shape[1], p.T @ weights
     taking, lowered = count + plan.lowered.numpy(), np.zeros(p.shape[0], dtype=bool)

@@ -1,7 +1,6 @@
 r"""e^{tL}x of a symmetric L ≤ 0 for many channels, each with its own time, in one differentiable operation.
 
-The spectrum lies in [−R, 0]. Both expansions e^{tL}x = Σ_k c_k(t) v_k have vectors v_k that all channels and times
-share (`method.md`, section 8):
+The spectrum lies in [−R, 0]. All channels and times share the vectors v_k of e^{tL}x = Σ_k c_k(t) v_k (`method.md`, 8):
 
 - a Chebyshev series, v_k = T_k(1 + 2L/R) x and c_k = 2 e^{−tR/2} I_k(tR/2), about √(2tR ln 1/ε) products;
 - where that would be more than `PRODUCTS`, as slivers make the spectrum long, a Chebyshev series of Z = (1 − γL)⁻¹: in
@@ -43,8 +42,7 @@ Term = tuple[tuple[slice, Any], Tensor, np.ndarray, np.ndarray]
 def spectral_radius(stiffness: sparse.csr_array, mass: Float[np.ndarray, " N"]) -> float:
     """Upper bound of the eigenvalues of D⁻¹K, K positive semidefinite and D the diagonal mass, in 1/ℓ².
 
-    For any x > 0 max_i (|K|x)_i / (Dx)_i is the Collatz–Wielandt bound for D⁻¹|K|, whose spectral radius is not below
-    that of D⁻¹K.
+    It is the Collatz–Wielandt bound max_i (|K|x)_i / (Dx)_i, x > 0, of D⁻¹|K|, whose spectral radius is no smaller.
 
     >>> path = sparse.csr_array([[1.0, -1.0], [-1.0, 1.0]])
     >>> spectral_radius(path, np.ones(2))

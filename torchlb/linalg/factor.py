@@ -88,8 +88,7 @@ class Factor:
         """Raise InputError if the matrix is singular, its entries known to a relative `precision`.
 
         For a random b and any x, b − Ax keeps the component of b along a left null vector, |g|/√N of |b| for a normal
-        g. Where that vector is null only up to rounding, x is so large that the component hides in the rounding of
-        |A||x|.
+        g. Where that vector is null only up to rounding, a large x hides the component in the rounding of |A||x|.
         """
         b = np.random.default_rng(0).standard_normal((len(self._matrix.indptr) - 1, TRIALS))
         x = self.solve(torch.from_numpy(b)).numpy()

@@ -20,8 +20,7 @@ SINGLE = 1e-5
 SMALL = 1e-3
 """Relative change that affects a result by less than the mesh does."""
 LOW = 0.1
-"""Fraction of the usual value below which a quantity is poor, and fraction of a shape from which on a warning is
-issued."""
+"""Fraction of the usual value below which a quantity is poor, and of a shape from which on a warning is issued."""
 
 BYTES = 2**24
 """Size of work arrays: smaller ones are mostly overhead, larger ones exceed the processor's cache."""

@@ -15,8 +15,7 @@ LOWEST = 0.25
 """Lower end of the smoothed part of the spectrum of D⁻¹A; the quarter below is left to the coarse solve."""
 SIZE = 2 * (1 + LOWEST) ** 2 - (1 - LOWEST) ** 2
 FIRST, SECOND = 8 * (1 + LOWEST) / SIZE, -8 / SIZE
-"""Coefficients a, b of the smoother D⁻¹(a + b AD⁻¹): 1 − x(a + bx) is the Chebyshev polynomial T₂ on the smoothed part
-of the spectrum, scaled to 1 at x = 0."""
+"""Coefficients a, b of the smoother D⁻¹(a + b AD⁻¹): 1 − x(a + bx) is T₂ on the smoothed part, scaled to 1 at x = 0."""
 
 
 def two_grid(product: Linear, sums: Float[Tensor, "N _"], coarse: Linear) -> Linear:
@@ -62,8 +61,7 @@ def without_small_entries(
 ) -> Matrix:
     """Drop the entries of a symmetric matrix below a thousandth of √(d_i d_j), d the absolute row sums; in float32.
 
-    They are added to the diagonal, which preserves row sums. A stiffness matrix keeps four of ten entries, enough to
-    smooth.
+    They are added to the diagonal, which preserves row sums. Four of ten entries of a stiffness matrix remain.
 
     >>> crow, col = torch.tensor([0, 2, 4]), torch.tensor([0, 1, 0, 1])
     >>> without_small_entries(crow, col, torch.tensor([1.0, 1e-4, 1e-4, 1.0]))[1:]

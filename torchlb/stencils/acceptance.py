@@ -80,8 +80,8 @@ class Acceptance:
         """Bounds on the height residual: for this candidate, and for every candidate of its degree.
 
         On a mesh the bound shrinks with the number of points beyond 3 per polynomial: a fit to folds does not improve
-        over more of them. On a cloud, noise may shrink by the ratio of the widest stencil to the first, and a size that
-        the user fixed cannot widen.
+        over more of them. On a cloud, noise may shrink by the ratio of the widest stencil to the first; a size fixed by
+        the user cannot widen.
         """
         growth = max(reference(self.dim, m).growth for m in (candidate.degree, RESOLVING_DEGREE))
         if self.on_mesh:

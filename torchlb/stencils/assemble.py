@@ -352,8 +352,7 @@ def _good_slope(weights: Weights) -> Bool[Tensor, " B"]:
 def assemble(stencils: Stencils, *, progress: bool = True) -> Rows:
     """Rows of all points, in chunks.
 
-    Memory beyond the result: about 0.1 GB whatever N (`precision.BYTES`). The result takes 16 + 8 d
-    bytes an entry.
+    Memory beyond the result is about 0.1 GB for any N (`precision.BYTES`); the result takes 16 + 8 d bytes an entry.
     """
     shape = stencils.shape
     parts = torch.arange(len(shape.points)).split(AT_ONCE)

@@ -158,8 +158,7 @@ class RowsPlan:
     Attributes
     ----------
     used
-        (nnz,), entries with weights: the non-zero ones of positive weights, and the points of the gradient's fit where
-        a low-order row has one.
+        (nnz,), entries with weights: the non-zero ones of positive weights, and those of a low-order row's gradient.
     """
 
     length: Int[Tensor, " B"]

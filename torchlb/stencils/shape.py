@@ -131,7 +131,7 @@ def surface_shape(
 ) -> Shape:
     """Shape of a cloud in R² or R³, from the triangles and normals of a surface through it.
 
-    The boundary is that of the surface, except for points of local stars; or the mask `boundary`. Lone points belong to
+    The boundary is that of the surface, except for points of local stars, or the mask `boundary`. Lone points belong to
     no neighbourhood but their own.
     """
     flat, points = given.shape[1] == 2, surface.points[:, : given.shape[1]]
