@@ -1,5 +1,5 @@
-"""On request, proof that diffusion by the stencil contracts (`method.md`, section 5), and what makes it hold.
+"""Proof, on request, that diffusion by the stencil contracts (`method.md`, section 5), and its enforcement.
 
-Only `operator.build` asks for it. `null_vector`: π with πᵀL = 0. `krylov`: for matrices too large to factor.
-`certificate`: π > 0 and S ≤ 0, checked. `enforce`: rows lower their order until it holds.
+Only `operator.build` requests it. `null_vector`: π with πᵀL = 0. `krylov`: Krylov methods for matrices too large to
+factor. `certificate`: check of π > 0 and S ≤ 0. `enforce`: order reduction of rows until the certificate holds.
 """

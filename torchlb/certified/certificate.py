@@ -31,14 +31,14 @@ class Certificate:
     min_pi
         Smallest π_i in units of the point's area; positive if the certificate holds.
     max_s
-        Lower bound of the largest eigenvalue of D^{-1/2} S D^{-1/2}, D the size of each row; 0.0 if there is no
-        positive one, beyond rounding. NaN if π is not positive or no null vector, where S means nothing.
+        Lower bound of the largest eigenvalue of D^{-1/2} S D^{-1/2}, D the size of each row; 0.0 if none is positive
+        beyond rounding. NaN if π is not positive or not a null vector, where S is meaningless.
     components
         Number of connected components, each with its own π.
     rounds
-        Of widening and lowering that it took.
+        Number of rounds of widening and lowering.
     lowered
-        Number of rows of a lower order than the one that they passed at on their own.
+        Number of rows below the order at which they first passed.
     widened
         Number of rows of the same order with more points or another rule of weights.
     """
@@ -64,14 +64,14 @@ class Certificate:
 def check_certificate(
     matrix: sparse.csr_array, areas: Float[Tensor, " N"], *, outflow: bool = False
 ) -> tuple[Float[Tensor, " N"], Certificate, Float[np.ndarray, "N k"]]:
-    """π, the certificate, and what each row contributes to the vᵀSv > 0 that speak against it.
+    """Return π, the certificate, and the contribution of each row to every vᵀSv > 0 that violates it.
 
     Parameters
     ----------
     matrix
         L, (N, N), 1/ℓ².
     areas
-        Of the points, ℓ^d.
+        Areas of the points, ℓ^d.
     outflow
         Whether rows may have L1 < 0, as beside a Dirichlet boundary.
     """
@@ -88,15 +88,15 @@ def check_certificate(
 def dissipation(
     matrix: sparse.csr_array, mass: Float[Tensor, " N"]
 ) -> tuple[bool, float, Float[np.ndarray, "N k"]]:
-    """Whether S ≤ 0, how far it is from that in units of the size of its rows, and what feeds it.
+    """Test S ≤ 0, with the largest violation relative to the size of its rows, and the rows that contribute.
 
     A = εD − S, D the diagonal of the absolute sums of the terms in each row of S, is positive iff A = LDLᵀ has no
-    negative pivot (Sylvester's law of inertia). So each point is judged by its own scale, which may be 1e6 times
-    finer here than there. Each negative pivot d_j brings its own proof, v = L^{-T} e_j with vᵀAv = d_j < 0: what is
-    already eliminated relaxes around j, so v lives where S fails. It is A^{-1} applied to d_j times column j of the
-    factor, one solve. Row i contributes π_i v_i (Lv)_i to vᵀSv > 0.
+    negative pivot (Sylvester's law of inertia). Each point is thus judged by its own scale, which may vary by a factor
+    of 1e6. Each negative pivot d_j has a witness v = L^{-T} e_j with vᵀAv = d_j < 0: eliminated points relax around j,
+    so v is localised where S fails. It is A^{-1} applied to d_j times column j of the factor, one solve. Row i
+    contributes π_i v_i (Lv)_i to vᵀSv > 0.
 
-    Beyond `krylov.LARGEST_FACTORED` points the v are those that conjugate gradients come upon.
+    Beyond `krylov.LARGEST_FACTORED` points the v come from conjugate gradients.
 
     Returns
     -------
@@ -121,7 +121,7 @@ def dissipation(
 
 
 def _negative_pivots(matrix: sparse.csr_array) -> Float[np.ndarray, "N k"]:
-    """For each negative pivot of the symmetric A = LDLᵀ, at most `RESTART`, v = L^{-T}e_j."""
+    """Vectors v = L^{-T}e_j of the negative pivots, at most `RESTART`, of the symmetric A = LDLᵀ."""
     lu = factorized(sparse.csc_array(matrix), 0.0)
     pivots = lu.U.diagonal()
     negative = np.flatnonzero(pivots < 0)[:RESTART]

@@ -1,7 +1,7 @@
-"""Rows are widened or lower their order until the certificate holds: solve, estimate, mark, lower.
+"""Widening and order reduction of rows until the certificate holds: solve, estimate, mark, lower.
 
-Each round solves for π and for directions in which S > 0 (`certificate`), marks the rows that stand in the way, and
-lets each of them take a later one of its candidates (`method.md`, section 5).
+Each round solves for π and for directions in which S > 0 (`certificate`), marks the responsible rows, and moves each of
+them to a later one of its candidates (`method.md`, section 5).
 """
 
 from __future__ import annotations
@@ -25,27 +25,27 @@ from torchlb.linalg.sparse import to_scipy
 from torchlb.stencils.rows import Reason, Rows
 
 MARGIN = 0.02
-"""A point of smaller weight, π below this share of its area, has the rows around it marked while they can change."""
+"""Fraction of a point's area below which its weight π is small, so that rows around it are marked."""
 Lower = Callable[[Int[Tensor, " J"], Int[Tensor, " J"]], Rows]
 
 
 @dataclass(frozen=True)
 class Schedule:
-    """How far a marked row goes on along its candidates, and for how long.
+    """Back-off schedule of marked rows along their candidates.
 
     Attributes
     ----------
     single
-        Times that it goes on by one candidate; from then on its way doubles with every second time.
+        Number of marks that each skip one candidate; then the number to skip doubles with every second mark.
     most
-        Rounds, after which the operator is left as it is, with a warning.
+        Largest number of rounds; then the operator is left as it is, with a warning.
     """
 
     single: int = 4
     most: int = 80
 
     def way(self, times: Int[Tensor, " N"]) -> Int[Tensor, " N"]:
-        """Candidates beyond its first that a row starts from when it is marked for the `times`-th time.
+        """Number of candidates, from its first on, that a row skips when it is marked for the `times`-th time.
 
         >>> Schedule().way(torch.arange(13)).tolist()
         [0, 1, 2, 3, 4, 6, 8, 12, 16, 23, 32, 46, 64]
@@ -69,18 +69,17 @@ def certify(
     Parameters
     ----------
     rows
-        Each at the first of its candidates that passed.
+        Rows, each by the first of its candidates that passed.
     areas
-        Of the points, ℓ^d.
+        Areas of the points, ℓ^d.
     lower
-        (points, first candidates) → their rows, each at the first candidate from there on that passes.
+        Function (points, first candidates) → rows, each by the first candidate from there on that passes.
     bottom
-        Number of candidates: what `Rows.candidate` is for low-order rows, which cannot change any more.
+        Number of candidates, the `Rows.candidate` of low-order rows, which cannot be lowered further.
     outflow
         Whether rows may have L1 < 0, as beside a Dirichlet boundary.
 
-    Returns the rows that it holds for, the mass π, (N,), ℓ^d, and what was reached; a `StabilityWarning` is issued if
-    it does not hold.
+    Returns the rows, the mass π, (N,), ℓ^d, and the certificate; a `StabilityWarning` is issued if it does not hold.
     """
     first, count, rounds = rows, len(areas), 0
     times = torch.zeros(count, dtype=torch.int64)
@@ -90,7 +89,7 @@ def certify(
             matrix = to_scipy(rows.crow, rows.col, rows.laplacian, (count, count))
             free = rows.candidate < bottom
             marked, start = _into_closed_classes(matrix) & free, torch.full_like(times, bottom)
-            if not marked.any() or rounds == schedule.most:  # else π is all in those classes
+            if not marked.any() or rounds == schedule.most:  # else π is 0 outside those
                 mass, result, feed = check_certificate(matrix, areas, outflow=outflow)
                 marked = _marked(matrix, mass / areas, feed, free, spread=not result.holds)
                 if not marked.any() or rounds == schedule.most:
@@ -116,10 +115,10 @@ def certify(
 
 
 def _into_closed_classes(matrix: sparse.csr_array) -> Bool[Tensor, " N"]:
-    """Rows that lead into a closed class: a few points that refer to each other alone.
+    """Rows that lead into a closed class of the directed graph, a few points that refer to each other alone.
 
-    What flows in never leaves, so all of π is there, and nothing can be told from its zeros elsewhere. The largest
-    class of points that refer to each other, on a connected component, is none.
+    What flows in never leaves, so that all of π is there, and its zeros elsewhere carry no information. The largest
+    strongly connected class of each component is exempt.
     """
     matrix = sparse.csr_array(matrix, copy=True)
     matrix.eliminate_zeros()
@@ -147,10 +146,9 @@ def _marked(
     *,
     spread: bool,
 ) -> Bool[Tensor, " N"]:
-    """Rows to widen or lower: those that make π small or feed S > 0.
+    """Rows to widen or lower: those that make π small or contribute to S > 0.
 
-    Where none of them is free, those around them are marked too, as low-order rows are symmetric only together, and
-    so on; only if `spread`.
+    With `spread`, neighbours are marked too until one is free, since low-order rows are symmetric only together.
     """
     joined = sparse.csr_array(abs(matrix) + abs(matrix).T)
     joined.data[:] = 1.0
@@ -170,9 +168,9 @@ def _around_small_weights(
 ) -> Bool[np.ndarray, " N"]:
     """Rows to mark for the points of small π.
 
-    Those with a negative weight into the point, unless slight. Its own if π is positive: π_i |L_ii| = Σ_{j≠i} π_j L_ji
-    is what flows in, so a smaller diagonal makes π_i larger, and cannot change its sign. And where its own is a
-    low-order row, those of its entries, which may leave the point out of theirs, as on both sides of a crease.
+    For each such point these are the rows with a considerable negative weight on it; its own row if π is positive,
+    since π_i |L_ii| = Σ_{j≠i} π_j L_ji, the inflow, so that a smaller diagonal makes π_i larger and keeps its sign;
+    and, if its own is a low-order row, the rows of the points in it, which may not refer back, as across a crease.
     """
     small = np.flatnonzero(density <= MARGIN)
     columns = sparse.coo_array(sparse.csc_array(matrix)[:, small])
@@ -190,9 +188,9 @@ def _around_small_weights(
 def _feeding(
     joined: sparse.csr_array, feed: Float[np.ndarray, "N k"], *, peaks: bool
 ) -> Bool[np.ndarray, " N"]:
-    """Rows that contribute most to a direction with vᵀSv > 0, or with `peaks` most at any place where it is positive.
+    """Rows that contribute most to a direction with vᵀSv > 0; with `peaks`, also local maxima of the contribution.
 
-    Directions from Krylov methods are sums of many local ones, by chance with different weights.
+    Directions from Krylov methods are sums of many local ones, with random weights.
     """
     marked = (feed > LOW * feed.max(axis=0)).any(axis=1)
     for own in feed.T[: feed.shape[1] * peaks]:
@@ -206,7 +204,7 @@ def _feeding(
 def _lowered(
     rows: Rows, first: Rows, marked: Bool[Tensor, " N"], start: Int[Tensor, " N"], lower: Lower
 ) -> Rows:
-    """The marked rows built anew from candidate `start` on, one later at least."""
+    """Rebuild the marked rows from candidate `start` on, and at least one beyond their present one."""
     index = marked.nonzero()[:, 0]
     rebuilt = lower(index, start[index].maximum(rows.candidate[index] + 1))
     reason = torch.where(rebuilt.order < first.order[index], Reason.STABILITY, first.reason[index])

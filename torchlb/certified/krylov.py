@@ -1,7 +1,7 @@
-r"""Null vector and sign of an operator too large to factor, by Krylov methods (`method.md`, section 5).
+r"""Null vector and definiteness of an operator too large to factor, by Krylov methods (`method.md`, section 5).
 
-Both work on nearly symmetric matrices and lean on the same low-order matrix: the M-matrix W of the positive weights,
-whose multigrid cycle B ≈ W⁻¹ makes their number of iterations almost independent of that of the points.
+Both act on nearly symmetric matrices and share a preconditioner: a multigrid cycle B ≈ W⁻¹ for the M-matrix W of the
+positive weights, which makes the number of iterations almost independent of that of the points.
 """
 
 from __future__ import annotations
@@ -31,20 +31,20 @@ from torchlb.linalg.precision import (
 
 Result = TypeVar("Result")
 GROUND = 1e-4
-"""Share of each diagonal entry that B is shifted by for the null vector: 100 iterations instead of 1,000."""
+"""Shift of W for the null vector, relative to each diagonal entry: 100 iterations instead of 1,000."""
 RESTART = 50
-"""Iterations between restarts, and after the first negative curvature, to tell negative directions from each other."""
+"""Iterations between restarts, and after the first negative curvature, to separate negative directions."""
 
 
 def prefers_krylov(size: int) -> bool:
-    """Whether a matrix of so many points is too large to be factored first."""
+    """Whether a matrix of `size` points is too large to be factored first."""
     return size > LARGEST_FACTORED
 
 
 def krylov_or_factors(
     size: int, krylov: Callable[[], Result | None], factors: Callable[[], Result]
 ) -> Result:
-    """By sparse factors; beyond `LARGEST_FACTORED` points only if Krylov methods fail, which a warning says."""
+    """Solve by sparse factors; beyond `LARGEST_FACTORED` points only if Krylov methods fail, with a warning."""
     if prefers_krylov(size):
         found = krylov()
         if found is not None:
@@ -57,14 +57,14 @@ def krylov_or_factors(
 
 
 class LowOrder:
-    """The M-matrix of a symmetric matrix: its positive entries as weights, and what is lost.
+    """M-matrix of a symmetric matrix: its positive off-diagonal entries as weights, and a loss at each point.
 
     Parameters
     ----------
     symmetric
         (N, N).
     loss
-        Of each point, what the diagonal has beyond the weights of its row; negative numbers are rounding.
+        Excess of each diagonal entry over the weights of its row; negative values are rounding.
     """
 
     def __init__(self, symmetric: sparse.csr_array, loss: Float[np.ndarray, " N"]) -> None:
@@ -81,7 +81,7 @@ class LowOrder:
 
     @cached_property
     def inverse(self) -> LinearOperator:
-        """B: one symmetric V-cycle of multigrid by smoothed aggregation, the same in every run."""
+        """B: one symmetric V-cycle of smoothed-aggregation multigrid, the same in every run."""
         import pyamg
 
         hierarchy = pyamg.smoothed_aggregation_solver(
@@ -90,12 +90,12 @@ class LowOrder:
             smooth=("jacobi", {"weighting": "local"}),
             improve_candidates=None,
             max_coarse=500,
-            coarse_solver="cholesky",  # the default leaves out what is 1e-15 of the heaviest, and is blind to it
+            coarse_solver="cholesky",  # the default drops modes at 1e-15 of the largest
         )
         return hierarchy.aspreconditioner(cycle="V")
 
     def noise(self) -> Float[np.ndarray, " N"]:
-        """A Gaussian vector of covariance W, one number for each edge and for each loss."""
+        """Gaussian vector of covariance W, from one random number per edge and per loss."""
         random = np.random.default_rng(0)
         edges = np.sqrt(self.weight) * random.standard_normal(len(self.weight))
         flow = np.bincount(self.row, edges, self.size) - np.bincount(self.col, edges, self.size)
@@ -108,7 +108,7 @@ def rescaled(
     component: np.ndarray,
     free: Bool[np.ndarray, " C"],
 ) -> Float[np.ndarray, " N"]:
-    """The density with a mean of one over the area of each free component, as 1 has: its own scale, its own sign."""
+    """Density scaled to a mean of one over the area of each free component, which fixes its scale and sign."""
     total = np.where(free, np.bincount(component, area * density), np.bincount(component, area))
     return density * (np.bincount(component, area) / total)[component]
 
@@ -118,7 +118,7 @@ def backward_error(
     vector: Float[np.ndarray, " N"],
     lost: Float[np.ndarray, " N"] | float = 0.0,
 ) -> float:
-    """Componentwise backward error, the largest |Ax + lost| / |A||x| of a row: each is judged by its own scale."""
+    """Componentwise backward error: the largest |Ax + lost| / |A||x| of all rows."""
     terms = abs(matrix) @ np.abs(vector)
     left = np.abs(matrix @ vector + lost)
     return float(np.max(left / np.where(terms > 0, terms, 1.0)))
@@ -131,16 +131,16 @@ def null_density(
     component: np.ndarray,
     free: Bool[np.ndarray, " C"],
 ) -> Float[np.ndarray, " N"] | None:
-    """x with (AL)ᵀx = −lost, A the areas, by GMRES with B; None if that does not converge.
+    """Solve (AL)ᵀx = −lost, A the areas, by GMRES with B; None if that does not converge.
 
     Parameters
     ----------
     matrix, area, lost
         L, the diagonal of A, the right-hand side.
     component
-        Of each point.
+        Component of each point.
     free
-        Whether the scale of x on a component is, which `lost` does not fix there; see `rescaled`.
+        Whether the scale of x on a component is free, not fixed by `lost`; see `rescaled`.
     """
     weighted = sparse.csr_array((sparse.diags_array(area) @ matrix).T)
     loss = -area * (matrix.sum(axis=1) + GROUND * matrix.diagonal())
@@ -161,14 +161,14 @@ def null_density(
 
 
 def negative_directions(matrix: sparse.csr_array) -> Float[np.ndarray, "N k"] | None:
-    """Directions v with vᵀAv < 0 of a symmetric A; k = 0 if it has none, None if that could not be told.
+    """Directions v with vᵀAv < 0 of a symmetric A; k = 0 if it has none, None if undecided.
 
-    Conjugate gradients on Ax = b, preconditioned by B, b Gaussian of covariance W ≈ B⁻¹. While every curvature is
+    Conjugate gradients solve Ax = b, preconditioned by B, b Gaussian of covariance W ≈ B⁻¹. While every curvature is
     positive the residual is r(Â)b̂, Â = B^½AB^½ with the signs of A, b̂ = B^½b, and the polynomial r has r(0) = 1 and
-    positive roots, the Ritz values. So |r(λ)| > 1 for λ < 0: the part of b̂ along a negative eigenvector never shrinks,
-    and it is a Gaussian number of deviation about one. Where the residual falls to 1e-6 all the same, there is no such
-    eigenvector, but for a chance of about 1e-6. Once a curvature is negative, `RESTART` iterations and a Rayleigh-Ritz
-    step on all of them tell the directions from each other.
+    positive roots, the Ritz values. So |r(λ)| > 1 for λ < 0: the component of b̂ along a negative eigenvector never
+    shrinks, and it is Gaussian of deviation about one. Where the residual falls to 1e-6 all the same, there is no such
+    eigenvector, except with probability about 1e-6. Once a curvature is negative, `RESTART` iterations and a
+    Rayleigh–Ritz step on all of them separate the directions.
     """
     low = LowOrder(sparse.csr_array(-matrix), matrix.sum(axis=1))
     start = _without_constants(matrix, low.noise())
@@ -192,7 +192,7 @@ def negative_directions(matrix: sparse.csr_array) -> Float[np.ndarray, "N k"] | 
 def _without_constants(
     matrix: sparse.csr_array, vector: Float[np.ndarray, " N"]
 ) -> Float[np.ndarray, " N"]:
-    """The vector less its mean on each component where constants are null vectors of the matrix."""
+    """Subtract from the vector its mean on each component where constants are null vectors of the matrix."""
     _, component = csgraph.connected_components(matrix, directed=False)
     loss, whole = (np.bincount(component, v) for v in (matrix.sum(axis=1), matrix.diagonal()))
     mean = np.bincount(component, vector) / np.bincount(component)
@@ -202,9 +202,9 @@ def _without_constants(
 def _conjugate_gradients(
     matrix: sparse.csr_array, inverse: LinearOperator, right: Float[np.ndarray, " N"]
 ) -> Iterator[tuple[np.ndarray, np.ndarray, float, float]]:
-    """Of each iteration z = B r, the direction p, pᵀAp, and the residual √(rᵀBr), NaN if B is not positive.
+    """Yield z = B r, the direction p, pᵀAp, and the residual √(rᵀBr), NaN if B is not positive, at each iteration.
 
-    It goes on past pᵀAp < 0, and ends where pᵀAp = 0.
+    Iterations continue past pᵀAp < 0, and end where pᵀAp = 0.
     """
     r = right
     z = inverse.matvec(r)

@@ -1,4 +1,4 @@
-"""π with πᵀL = −q, q the outflow: by sparse factors, or by Krylov methods where those would be too large."""
+"""Left null vector π, πᵀL = −q, q the outflow: by sparse factors, or by Krylov methods for large matrices."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from torchlb.linalg.factor import factorized
 from torchlb.linalg.precision import ROOT_EPS
 
 CONSERVED = 1e-11
-"""π is a null vector if what flows in and out of each point agrees to this share."""
+"""Largest relative imbalance of inflow and outflow at a point with which π counts as a null vector."""
 SOLVES = 8
 """Steps of inverse iteration."""
 
@@ -25,10 +25,10 @@ def left_null_vector(
     areas: Float[Tensor, " N"],
     outflow: Float[np.ndarray, " N"] | None = None,
 ) -> tuple[Float[Tensor, " N"], np.ndarray, float]:
-    """π with πᵀL = −q, scaled on each component to the sum of the areas there.
+    """Left null vector π, πᵀL = −q, scaled on each component to the sum of the areas there.
 
-    Inverse iteration with the LU of (AL)ᵀ, A the areas, each diagonal entry shifted by its own share. Beyond
-    `krylov.LARGEST_FACTORED` points GMRES with multigrid of the low-order part.
+    Inverse iteration uses the LU of (AL)ᵀ, A the areas, with a relative shift of each diagonal entry; beyond
+    `krylov.LARGEST_FACTORED` points it is GMRES with multigrid of the low-order part.
 
     Parameters
     ----------
@@ -37,14 +37,14 @@ def left_null_vector(
     areas
         Diagonal of A, ℓ^d.
     outflow
-        q ≥ 0, ℓ^(d−2), of the points where L1 < 0, as `shared_outflow` has it; None where L1 = 0.
+        q ≥ 0, ℓ^(d−2), of the points where L1 < 0, from `shared_outflow`; None where L1 = 0.
 
     Returns
     -------
     mass
         π, ℓ^d.
     component
-        Of each point.
+        Component of each point.
     error
         Componentwise backward error of π; `CONSERVED` is what rounding may leave.
 
@@ -75,14 +75,14 @@ SINGULAR = (
 
 
 def has_outflow(matrix: sparse.csr_array, rounding: float = 0.0) -> Bool[np.ndarray, " N"]:
-    """Rows whose sum is not zero, but for a relative `rounding` of their entries."""
+    """Rows whose sum is not zero, up to a relative `rounding` of their entries."""
     return np.abs(matrix.sum(axis=1)) > max(ROOT_EPS, 64 * rounding) * abs(matrix).sum(axis=1)
 
 
 def shared_outflow(matrix: sparse.csr_array, areas: Float[Tensor, " N"]) -> Float[np.ndarray, " N"]:
-    """What flows out at each row of non-zero sum, in equal parts to those of them that it shares an entry with.
+    """Outflow of the rows of non-zero sum, each shared equally among those of them that it has an entry with.
 
-    Where next to nothing flows out of a row π would be next to nothing, and rows would be lowered for it.
+    Where almost nothing flows out of a row, π would almost vanish, and rows would be lowered for it.
     """
     rows = np.flatnonzero(has_outflow(matrix))
     own = np.maximum(-areas.numpy() * matrix.sum(axis=1), 0)[rows]
@@ -100,7 +100,7 @@ def _factored_density(
     component: np.ndarray,
     free: Bool[np.ndarray, " C"],
 ) -> Float[np.ndarray, " N"]:
-    """What `null_density` finds, by inverse iteration."""
+    """Solve the problem of `null_density` by inverse iteration."""
     weighted = sparse.diags_array(area) @ matrix
     diagonal = np.abs(weighted.diagonal())
     shift = ROOT_EPS * np.where(diagonal > 0, diagonal, 1.0)

@@ -1,4 +1,4 @@
-"""Many small least-squares problems, each with one factorisation for every right-hand side (`method.md`, section 2)."""
+"""Batches of small least-squares problems, each factored once for all right-hand sides (`method.md`, section 2)."""
 
 from __future__ import annotations
 
@@ -14,11 +14,10 @@ from torchlb.linalg.once import once_differentiable
 def left_inverse(
     values: Float[Tensor, "B K M"], root: Float[Tensor, "B K"]
 ) -> tuple[Float[Tensor, "B M K"], Float[Tensor, " B"]]:
-    """C = (VᵀΩV)⁻¹VᵀΩ, with which Cu are the coefficients of the weighted fit to u, and its condition.
+    """C = (VᵀΩV)⁻¹VᵀΩ, for which Cu are the coefficients of the weighted fit to u, and the condition.
 
-    By the modified Gram–Schmidt process on √ω V = QR and back substitution, C = R⁻¹Qᵀ√ω: every row has the accuracy of
-    Householder's QR (`decisions.md`, *Compiled kernels*). Columns that are dependent to the last digit leave what is
-    not finite.
+    Modified Gram–Schmidt on √ω V = QR and back substitution give C = R⁻¹Qᵀ√ω, every row as accurate as by Householder's
+    QR (`decisions.md`, *Compiled kernels*). Columns that are dependent to the last digit give non-finite results.
 
     Parameters
     ----------
@@ -32,8 +31,7 @@ def left_inverse(
     inverse
         C.
     condition
-        ‖R⁻¹‖ in the Frobenius norm, the columns of √ω V scaled to length one: as those of R have length one then, ‖R‖
-        is between 1 and √M.
+        Frobenius norm ‖R⁻¹‖ for columns of √ω V scaled to unit length; ‖R‖ is then between 1 and √M.
 
     >>> left_inverse(torch.ones(1, 4, 1, dtype=torch.float64), torch.ones(1, 4, dtype=torch.float64))[0].tolist()
     [[[0.25, 0.25, 0.25, 0.25]]]

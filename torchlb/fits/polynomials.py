@@ -1,9 +1,9 @@
-"""Monomials in local coordinates, and what a differential functional does to them.
+"""Monomials in local coordinates, and differential functionals of them.
 
 A stencil is exact for polynomials. Their basis is the monomials y^α of the d local coordinates, 1 ≤ |α| ≤ m; the
 constant is left out because the centre of a stencil takes care of it (`method.md`, section 2). A derivative at the
-origin sees exactly one monomial: ∂^β y^α (0) = α! if α = β and 0 otherwise, so a differential functional with
-constant coefficients is a short column of factorials.
+origin sees exactly one monomial: ∂^β y^α (0) = α! if α = β and 0 otherwise, so a differential functional with constant
+coefficients is a short column of factorials.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ def exponents(dim: int, degree: int) -> Int[Tensor, "M d"]:
 def monomials(coords: Float[Tensor, "*batch d"], degree: int) -> Float[Tensor, "*batch M"]:
     """Values y^α of the monomials 1 ≤ |α| ≤ `degree` at the points y, in the order of `exponents`; none of degree 0.
 
-    One after the other in memory where there are many places, as LAPACK wants the columns of a matrix.
+    In a batch each monomial is contiguous in memory, as LAPACK expects the columns of a matrix.
 
     >>> monomials(torch.tensor([2.0, 3.0]), 2).tolist()
     [2.0, 3.0, 4.0, 6.0, 9.0]
@@ -82,7 +82,7 @@ def monomial_derivatives(
 
 @lru_cache(maxsize=64)
 def _lowered(dim: int, degree: int) -> tuple[Float[Tensor, "M d"], Int[Tensor, "M d"]]:
-    """∂_c y^α = α_c y^(α − e_c): α_c, and the place of α − e_c among the constant and the monomials."""
+    """For ∂_c y^α = α_c y^(α − e_c): α_c, and the index of α − e_c among the constant and the monomials."""
     alpha = exponents(dim, degree)
     places = {tuple(beta): number for number, beta in enumerate([[0] * dim, *alpha.tolist()])}
     lowered = (alpha[:, None, :] - torch.eye(dim, dtype=torch.int64)).tolist()

@@ -1,4 +1,4 @@
-"""The rules for weights by name, the sizes of their stencils, and what good stencils have."""
+"""Rules for weights by name, sizes of their stencils, and reference figures of good stencils."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ SIZE_FACTORS = {
 
 
 class Reference(NamedTuple):
-    """What a good stencil has.
+    """Figures of a good stencil.
 
     Attributes
     ----------
@@ -47,7 +47,7 @@ class Reference(NamedTuple):
 def reference(
     dim: int, degree: int, rule: str = "least_squares", one_sided: bool = False
 ) -> Reference:
-    """Figures of the widest stencil of a rule on a cubic lattice; those of any even stencil of its are near them.
+    """Figures of the widest stencil of a rule on a cubic lattice, close to those of its other evenly spaced stencils.
 
     A one-sided stencil is centred on a flat boundary whose Neumann data it uses.
 
@@ -57,7 +57,7 @@ def reference(
     [23, 173, 761, 2367]
     """
     count = ceil(SIZE_FACTORS[rule][-1] * num_monomials(dim, degree))
-    # A ball of so many points of Zᵈ (twice as many where half of them are cut off), to whole shells.
+    # A ball of `count` points of Zᵈ (twice as many where half of them are cut off), to whole shells.
     volume = pi ** (dim / 2) / gamma(dim / 2 + 1)
     reach = ceil(((1 + one_sided) * count / volume) ** (1 / dim)) + 1
     axis = torch.arange(-reach, reach + 1, dtype=torch.float64)

@@ -30,20 +30,19 @@ class Weights:
     Attributes
     ----------
     gradient
-        (B, K, d), 1/ℓ. Entry 0 along K is the centre, as below.
+        (B, K, d), 1/ℓ; entry 0 along K is the centre, here and below.
     laplacian
         (B, K), 1/ℓ²: Δ = Σ_c ∂_c²; zero below degree 2.
     radius
         (B,), ℓ: distance ρ of the farthest neighbour in local coordinates.
     condition
-        (B,), of √ω V with its columns scaled to length one, as `left_inverse` gives it; above 1e10, or not finite,
-        without full rank.
+        (B,), condition of √ω V with unit columns, by `left_inverse`; above 1e10, or not finite, without full rank.
     residual
         (B,): largest violation of the moment equations, in units of the largest right-hand side.
     height_residual
-        (B,): what a polynomial leaves of the heights over the distances; 0 where no heights were given.
+        (B,): residual of the fit to the heights, relative to the distances; 0 without heights.
     slope
-        (B,), degree of the fit of the gradient where that is another one, else 0.
+        (B,), degree of the gradient's fit where it has one of its own, else 0.
     """
 
     gradient: Float[Tensor, "B K d"]
@@ -60,13 +59,13 @@ class Weights:
         return Weights(*(getattr(self, f.name).index_select(0, rows) for f in fields(Weights)))
 
     def updated(self, rows: Tensor, part: Weights) -> Weights:
-        """The same with other stencils in these rows."""
+        """Copy with the stencils of these rows replaced by `part`."""
         names = [f.name for f in fields(Weights)]
         return Weights(*(getattr(self, n).index_put((rows,), getattr(part, n)) for n in names))
 
     @staticmethod
     def stack(parts: Sequence[Weights]) -> Weights:
-        """Batches of stencils of one size, one after the other."""
+        """Concatenate batches of stencils of one size."""
         return Weights(*(torch.cat([getattr(p, f.name) for p in parts]) for f in fields(Weights)))
 
 
@@ -97,7 +96,7 @@ def finish(
     height_residual: Float[Tensor, " B"],
     dim: int,
 ) -> Weights:
-    """Return from scaled coordinates to units of length."""
+    """Rescale weights from scaled coordinates to units of length."""
     rho = radius[:, None, None]
     return Weights(
         gradient=weights[..., :dim] / rho,
@@ -119,7 +118,7 @@ def height_residual(
 ) -> Float[Tensor, " B"]:
     """Scatter of the heights about their fit over root mean square distance, both weighted by ω.
 
-    The scatter is per degree of freedom, so their number does not matter.
+    The scatter is per degree of freedom, thus independent of their number.
     """
     left = root[..., None] * _left_by_fit(values, coefficients @ heights, heights)
     freedom = max(values.shape[1] - values.shape[2], 1) / values.shape[1]
@@ -133,7 +132,7 @@ def _left_by_fit(
     graph: Float[Tensor, "B M n"],
     heights: Float[Tensor, "B neighbors n"],
 ) -> Float[Tensor, "B neighbors n"]:
-    # a few long rows, in half of the time of a few long columns
+    # a product with few long rows takes half the time of one with few long columns
     return heights - (graph.mT @ values.mT).mT
 
 
@@ -142,7 +141,7 @@ def scaled_system(
     degree: int,
     keep: Bool[Tensor, "B neighbors"] | None = None,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """ρ of those that are kept, y/ρ, the monomials V there and √ω."""
+    """Radius ρ of the kept neighbours, scaled coordinates y/ρ, their monomials V, and √ω."""
     distance = coords.norm(dim=-1)
     radius = (distance if keep is None else distance * keep).amax(-1)
     scaled = coords / radius[:, None, None]
@@ -153,12 +152,12 @@ def scaled_system(
 
 @dataclass(frozen=True)
 class CenteredFit:
-    """Fits u(y) = u_i + Σ_α y^α Σ_j coefficients[α, j] (u_j − u_i), y in units of the radius.
+    """Batch of fits u(y) = u_i + Σ_α y^α Σ_j coefficients[α, j] (u_j − u_i), y in units of the radius.
 
     Attributes
     ----------
     coefficients
-        (B, M − 1, K − 1). Their rows of |α| = 1, over the radius, are the weights of the gradient.
+        (B, M − 1, K − 1); rows with |α| = 1, divided by the radius, are the weights of the gradient.
     radius
         (B,), ℓ: distance ρ of the farthest neighbour in local coordinates.
     values
@@ -166,7 +165,7 @@ class CenteredFit:
     root
         (B, K − 1), √ω.
     degree
-        m.
+        Degree m.
     """
 
     coefficients: Float[Tensor, "B M neighbors"]
@@ -181,7 +180,7 @@ class CenteredFit:
         return (self.coefficients[:, :dim] @ self.values - wanted).abs().amax((1, 2))
 
     def lebesgue(self, places: Float[Tensor, "B P d"], degree: int) -> Float[Tensor, " B"]:
-        """Lebesgue constant: by how much its terms up to a degree can exceed the values at these places, ℓ."""
+        """Lebesgue constant, over these places (ℓ), of the terms up to a degree."""
         kept = self.coefficients[:, : num_monomials(places.shape[2], degree) - 1]
         rows = cardinal(kept, places / self.radius[:, None, None], degree)
         return rows.abs().sum(-1).amax(1)
@@ -189,7 +188,7 @@ class CenteredFit:
     def misfit(
         self, heights: Float[Tensor, "B neighbors n"], graph: Float[Tensor, "B M n"]
     ) -> Float[Tensor, " B"]:
-        """Largest weighted distance of the heights from the polynomials `graph` that were fitted to them, over ρ."""
+        """Largest weighted distance of the heights from the polynomials `graph` fitted to them, relative to ρ."""
         left = _left_by_fit(self.values, graph, heights)
         return (self.root * left.norm(dim=-1)).amax(1) / self.radius
 
@@ -199,9 +198,9 @@ def centered_fit(
     degree: int,
     keep: Bool[Tensor, "B neighbors"] | None = None,
 ) -> CenteredFit:
-    """The polynomials behind `least_squares_weights`, as functions of the values.
+    """Polynomials behind `least_squares_weights`, as linear functions of the values.
 
-    Arguments as there; K − 1 ≥ M − 1. Neighbours that are not kept have zero coefficients.
+    Arguments are as there; K − 1 ≥ M − 1. Neighbours outside `keep` have zero coefficients.
 
     >>> line = torch.tensor([[[-1.0], [1.0]]], dtype=torch.float64)
     >>> centered_fit(line, 2).coefficients.round(decimals=12).tolist()
@@ -215,7 +214,7 @@ def centered_fit(
 def cardinal(
     coefficients: Float[Tensor, "B M neighbors"], places: Float[Tensor, "B P d"], degree: int
 ) -> Float[Tensor, "B P K"]:
-    """What each value, the centre's first, adds to a fit with these coefficients at places in units of its radius.
+    """Cardinal functions of a fit, that of the centre first, at places in units of its radius.
 
     >>> line = centered_fit(torch.tensor([[[-1.0], [1.0]]], dtype=torch.float64), 2)
     >>> cardinal(line.coefficients, torch.tensor([[[0.5]]], dtype=torch.float64), 2).round(decimals=12).tolist()
@@ -249,7 +248,7 @@ def least_squares_weights(
     coords
         (B, K − 1, d), ℓ: the neighbours without the centre, K − 1 ≥ M − 1.
     degree
-        m ≥ 1. Δ comes with m ≥ 2.
+        m ≥ 1; Δ needs m ≥ 2.
     keep
         (B, K − 1), neighbours that may have a weight; all by default.
     flux
@@ -257,9 +256,9 @@ def least_squares_weights(
         (centre first), zero at the others. Each adds an unknown v_b: minimise Σ w²/ω + Σ v²/ω subject to Σ w_j y_j^α +
         Σ v_b (∂_ν + a) y^α(y_b) = (D y^α)(0), and w_i = −Σ w_j − a Σ v_b (`method.md`, section 6). Only w is returned.
     share
-        a, 1/ℓ, a number or of each point of the stencil.
+        a, 1/ℓ, a number or one per point of the stencil.
     heights
-        (B, K − 1, n), ℓ, of the neighbours over the tangent plane; not together with `flux`.
+        (B, K − 1, n), heights of the neighbours over the tangent plane, ℓ; not together with `flux`.
 
     >>> line = torch.tensor([[[-1.0], [1.0]]], dtype=torch.float64)
     >>> least_squares_weights(line, 2).laplacian.round(decimals=12).tolist()
@@ -276,7 +275,7 @@ def least_squares_weights(
     rows = functionals.mT @ coefficients
     residual = (rows @ values - functionals.mT).abs().amax((1, 2)) / functionals.abs().max()
     if flux is not None:
-        # What the data add would hide that points on a line, or in one place, say nothing of what is across.
+        # The data would hide that points on a line, or in one place, do not determine derivatives across it.
         spread = torch.linalg.svdvals(scaled.nan_to_num())
         residual = torch.where(spread[:, -1] <= SINGLE * spread[:, 0], torch.inf, residual)
     center = -(constant[..., None] * rows.mT).sum(1, keepdim=True)
@@ -295,9 +294,9 @@ def _with_data(
     share: Float[Tensor, "B K"],
     degree: int,
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """The system with rows (∂_ν + a) y^α for the boundary points of a stencil; what the rows make of 1; and √ω.
+    """Append rows (∂_ν + a) y^α for the boundary points of a stencil; return them, their values for 1, and √ω.
 
-    ω = 0 where a stencil has fewer; `share` is aρ, since coordinates are over ρ.
+    ω = 0 pads stencils with fewer boundary points; `share` is aρ, since coordinates are scaled by ρ.
     """
     nodes = torch.cat([torch.zeros_like(scaled[:, :1]), scaled], dim=1)
     on_boundary = flux.square().sum(-1) > 0
@@ -320,12 +319,12 @@ def positive_weights(
     share: float | Float[Tensor, "B K"] = 0.0,
     heights: Float[Tensor, "B neighbors n"] | None = None,
 ) -> Weights:
-    """Least squares over as many neighbours as can have weights Δ ≥ 0: a row of an M-matrix, and consistent.
+    """Least squares over the neighbours whose weights of Δ are ≥ 0: a consistent row of an M-matrix.
 
-    Neighbours with a negative weight are left out and the rest solved again until none is negative or the rank is
+    Neighbours with a negative weight are dropped and the rest is solved again, until none is negative or the rank is
     lost. This finds a positive stencil nearly wherever one exists (non-negative least squares finds 0–3 % more).
-    Positive weights exist up to degree 3 only, since Σ w |y|⁴ = 0 excludes them beyond. The residual of the heights is
-    that of all neighbours.
+    Positive weights exist up to degree 3 only, since Σ w |y|⁴ = 0 excludes them beyond. The height residual is that of
+    all neighbours.
     """
     keep = torch.ones(coords.shape[:2], dtype=torch.bool)
     weights = least_squares_weights(coords, degree, None, flux, share, heights)

@@ -1,10 +1,10 @@
 """The weak form (`method.md`, section 9): stiffness and mass matrix of a complex of simplices, d = 1, 2, 3, in Rⁿ.
 
-What is decided (`CurvingPlan`, `PairPlan`) stands apart from what follows at given points. `elements`: Lagrange
-elements on the reference simplex. `nodes`: their numbers on a complex. `assembly`: K_FE and M_FE. `curving`: where the
-nodes stand on the surface, and where cells are left flat. `coarse`: triangles that fits have nothing to say about;
-`delaunay`: what stands for these. `prolongation`: P, from the vertices to the nodes. `boundary_curves`: those through
-the boundary of triangles. `boundary`: the nodes along a boundary. `flips`: folded triangles and slivers out of the way.
-`forms`: PᵀK_FE P and PᵀM_FE P, for any conductivity. `pair`: the matrices of an operator, and the positive mass.
-`absorption`: what a condition adds to K.
+Decisions (`CurvingPlan`, `PairPlan`) are kept apart from what is evaluated at given points. `elements`: Lagrange
+elements on the reference simplex. `nodes`: the numbering of Lagrange nodes on a complex. `assembly`: K_FE and M_FE.
+`curving`: positions of the nodes on the surface, and which cells stay flat. `coarse`: triangles too coarse for the
+fits; `delaunay`: the intrinsic Delaunay tufted cover that replaces them. `prolongation`: P, from the vertices to the
+nodes. `boundary_curves`: polynomial curves along the boundary of a surface. `boundary`: nodes along a boundary.
+`flips`: edge flips that remove folded triangles and slivers. `forms`: PᵀK_FE P and PᵀM_FE P, for any conductivity.
+`pair`: an operator's matrices and positive lumped mass. `absorption`: the term that Robin conditions add to K.
 """

@@ -1,6 +1,6 @@
 """Stiffness and mass of finite elements from the metric at their Gauss points, in every dimension d = 1, 2, 3.
 
-A symmetric (d, d) matrix is kept as its upper triangle, row by row.
+A symmetric (d, d) matrix is stored as its upper triangle, row by row.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from torchlb.linalg.precision import AT_ONCE
 def metric(
     places: Float[Tensor, "NX D"], elements: Int[Tensor, "T n"], shape: Element
 ) -> Float[Tensor, "T Q S"]:
-    """G = JᵀJ at the Gauss points of elements with nodes at `places`, its upper triangle, ℓ²."""
+    """Upper triangle of the metric G = JᵀJ, ℓ², at the Gauss points of elements with nodes at `places`."""
     dim = shape.dim
     if dim == 0:
         return places.new_zeros(len(elements), len(shape.weights), 0)
@@ -34,7 +34,7 @@ def metric(
 
 
 def flat_metric(lengths: Float[Tensor, "T e"]) -> Float[Tensor, "T S"]:
-    """The same of flat simplices from the lengths of their edges, in the order of `subsets`, ℓ.
+    """Metric of flat simplices, ℓ², from their edge lengths, ℓ, in the order of `subsets`.
 
     >>> flat_metric(torch.tensor([[1.0, 2.0**0.5, 1.0]])).round(decimals=6).abs().tolist()
     [[1.0, 0.0, 1.0]]
@@ -50,7 +50,7 @@ def flat_metric(lengths: Float[Tensor, "T e"]) -> Float[Tensor, "T S"]:
 
 
 def cofactors(g: Float[Tensor, "*batch S"]) -> Float[Tensor, "*batch S"]:
-    """det(G) G⁻¹, the upper triangle.
+    """Upper triangle of the adjugate det(G) G⁻¹.
 
     >>> cofactors(torch.tensor([2.0, 0.5, 3.0])).tolist()
     [3.0, -0.5, 2.0]
@@ -75,7 +75,7 @@ def cofactors(g: Float[Tensor, "*batch S"]) -> Float[Tensor, "*batch S"]:
 
 
 def area_element(g: Float[Tensor, "*batch S"]) -> Float[Tensor, "*batch"]:
-    """√det G, ℓ^d; zero where rounding makes the determinant negative."""
+    """Volume element √det G, ℓ^d; zero where rounding makes the determinant negative."""
     if g.shape[-1] == 0:
         return g.new_ones(g.shape[:-1])
     if g.shape[-1] == 1:
@@ -88,9 +88,9 @@ def area_element(g: Float[Tensor, "*batch S"]) -> Float[Tensor, "*batch"]:
 def element_matrices(
     g: Float[Tensor, "T Q S"], shape: Element, conductivity: Float[Tensor, "T Q"] | None = None
 ) -> Complex[Tensor, "T n_times_n"]:
-    """K + iM of each element, both symmetric: ∫ κ∇φ_i·∇φ_j, ℓ^{d−2}, and ∫ φ_i φ_j, ℓ^d; κ = 1 unless given.
+    """Element matrices K + iM: K = ∫ κ∇φ_i·∇φ_j, ℓ^{d−2}, and M = ∫ φ_i φ_j, ℓ^d; κ = 1 by default.
 
-    Two real matrices on one pattern, so that they are summed, and later multiplied, at once.
+    Both are real and share a pattern; packed into one complex matrix they are assembled and multiplied together.
     """
     slopes = shape.gradients.unbind(-1)  # (Q, n) each
     products = []
@@ -115,7 +115,7 @@ def element_matrices(
 def assemble_mass(
     size: Float[Tensor, "T Q"], nodes: Int[Tensor, "T n"], shape: Element, num_nodes: int
 ) -> sparse.csr_array:
-    """∫ φ_i φ_j over elements whose area or length element at the Gauss points is `size`."""
+    """Mass matrix ∫ φ_i φ_j of elements with volume element `size` at the Gauss points."""
     return summed((shape.weights * size) @ squares(shape), nodes, num_nodes)
 
 
@@ -133,7 +133,7 @@ def linear_elements(
     shares: Float[Tensor, " T"] | None = None,
     lumped: bool = False,
 ) -> sparse.csr_array:
-    """K + iM of linear elements on flat simplices with these edges, or on shares of them; M lumped if asked."""
+    """K + iM of P1 elements on flat simplices with these edge lengths, weighted by `shares`; M lumped on request."""
     shape, g = simplex(cells.shape[1] - 1, 1), flat_metric(lengths)
     points = len(shape.weights)
     kappa = None if conductivity is None else conductivity[:, None].expand(-1, points)
@@ -148,7 +148,7 @@ def linear_elements(
 def summed(
     blocks: Shaped[Tensor, "T n_times_n"], nodes: Int[Tensor, "T n"], num_nodes: int
 ) -> sparse.csr_array:
-    """The matrix of all elements from the matrix of each, rows by rows."""
+    """Assemble element matrices, each flattened row by row, into one sparse matrix."""
     size, nodes = nodes.shape[1], nodes.int()
     row, col = nodes.repeat_interleave(size, dim=1).flatten(), nodes.repeat(1, size).flatten()
     entries = blocks.flatten().numpy(), (row.numpy(), col.numpy())

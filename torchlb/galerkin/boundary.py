@@ -1,7 +1,6 @@
-"""Nodes along the boundary: on curves through the vertices of an edge loop, on the surface of a solid.
+"""Nodes along the boundary: on curves along the boundary of a surface, or on the boundary surface of a solid.
 
-The boundary of a complex of dimension d is one of dimension d − 1. That of a solid is curved like any other surface;
-that of triangles by polynomials over arc length.
+The boundary surface of a solid is curved like any other surface; boundary curves are polynomials in arc length.
 """
 
 from __future__ import annotations
@@ -37,21 +36,21 @@ def boundary_nodes(
     degrees: tuple[int, ...],
     held: Bool[Tensor, " N"] | None = None,
 ) -> BoundaryNodesPlan:
-    """What the boundary decides of the nodes.
+    """Plan the nodes along the boundary.
 
     Parameters
     ----------
     degrees
-        Those of the fits of functions, best first.
+        Degrees of the fits of functions, best first.
     held
-        (N,), where a Dirichlet condition holds. On the boundary of a solid values follow from it alone only there: at
-        its creases they are linear.
+        (N,), vertices with a Dirichlet condition. Only there do values on a solid's boundary depend on it alone,
+        linearly at creases.
     """
     outer = (nodes.sides[nodes.dim].uses == 1).nonzero()[:, 0]
     if nodes.dim == 1 or len(outer) == 0:
         return WithoutBoundary(len(nodes.shares))
     if nodes.dim == 2:
-        # the curve through as many vertices on either side, two more than a polynomial of that degree needs
+        # as many vertices on either side, and at least two more than a polynomial of degree r needs
         width = 2 * (nodes.degree // 2 + 2)
         return OnCurves(nodes, outer, boundary_curves_plan(points, nodes.edges[outer], width))
     faithful = tuple(degree for degree in degrees if degree > 2) or (3,)  # creases stay flat
@@ -60,12 +59,12 @@ def boundary_nodes(
 
 @dataclass(frozen=True)
 class WithoutBoundary:
-    """Nothing, of so many nodes."""
+    """No boundary nodes, of `count` nodes in all."""
 
     count: int
 
     def at(self, points: Float[Tensor, "N n"]) -> BoundaryNodes:
-        """All stand still."""
+        """No displacements and no entries."""
         index = torch.zeros(0, dtype=torch.int64)
         still = points.new_zeros(self.count, points.shape[1])
         return BoundaryNodes(still, index, (index, index, points.new_zeros(0)))
@@ -73,18 +72,19 @@ class WithoutBoundary:
 
 @dataclass(frozen=True)
 class OnCurves:
-    """Nodes on polynomials through the boundary's vertices.
+    """Nodes on polynomial curves through the boundary vertices of a surface.
 
-    Displacements continue inside by (b_i + b_j)² of the edge (i, j); a quadratic one b_i b_j does so by itself.
+    The displacement over edge (i, j) is blended into its triangle by (b_i + b_j)², b barycentric; a quadratic one
+    becomes b_i b_j.
 
     Attributes
     ----------
     nodes
-        Of the triangles.
+        Lagrange nodes of the triangles.
     outer
-        (G,), the edges along the boundary.
+        (G,), boundary edges.
     curves
-        Through which vertices.
+        Vertices that the curves pass through.
     """
 
     nodes: Nodes
@@ -92,7 +92,7 @@ class OnCurves:
     curves: BoundaryCurvesPlan
 
     def at(self, points: Float[Tensor, "N n"]) -> BoundaryNodes:
-        """Their places and values."""
+        """Positions and values of the boundary nodes."""
         nodes, outer, curves = self.nodes, self.outer, self.curves.at(points)
         within, on_edge = inner(3, nodes.degree), nodes.degree - 1
         steps = inner(2, nodes.degree)[:, 1].to(points).expand(len(outer), -1)
@@ -127,22 +127,22 @@ class OnCurves:
 
 @dataclass(frozen=True)
 class OnSurface:
-    """Nodes on the surface through the boundary's vertices, with the fits of functions on it where values are held.
+    """Nodes on the boundary surface of a solid, with fits of functions on it where values are fixed.
 
     Attributes
     ----------
     nodes
-        Of the tetrahedra.
+        Lagrange nodes of the tetrahedra.
     vertices
-        (b,), those of the boundary, which the numbers of the surface refer to.
+        (b,), boundary vertices, in the surface's own numbering.
     cells
-        (G, 3), the boundary's triangles, wound so that they face out.
+        (G, 3), boundary triangles, oriented outwards.
     fits, curving
-        What is decided about that surface.
+        Plans of that surface.
     here
-        (x,), of the nodes of the surface beyond its vertices, their places among those of the solid.
+        (x,), number among the solid's nodes of each non-vertex node of the surface.
     inside
-        (x,), which of them follow from values of the boundary alone.
+        (x,), whether the value there depends on boundary vertices alone.
     """
 
     nodes: Nodes
@@ -161,7 +161,7 @@ class OnSurface:
         degrees: tuple[int, ...],
         held: Bool[Tensor, " N"] | None,
     ) -> OnSurface:
-        """Decide: the fits are of these degrees."""
+        """Plan the boundary surface, with fits of these degrees."""
         facets, on_edge = nodes.sides[3], nodes.degree - 1
         outer = (facets.uses == 1).nonzero()[:, 0]
         vertices, cells = torch.unique(outer_faces(points, nodes.cells), return_inverse=True)
@@ -185,7 +185,7 @@ class OnSurface:
         return cls(nodes, vertices, cells, plan, curving, here, inside)
 
     def at(self, points: Float[Tensor, "N n"]) -> BoundaryNodes:
-        """Their places and values."""
+        """Positions and values of the boundary nodes."""
         places, own = points[self.vertices], self.curving.nodes
         fits = LocalFits.at(self.fits, places, mesh_frames(places, self.cells))
         surface = self.curving.at(places, self.fits, fits)

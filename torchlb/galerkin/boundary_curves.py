@@ -1,7 +1,7 @@
-"""Curves through the boundary of a mesh, so that the domain is of high order, too (`method.md`, section 9).
+"""Polynomial curves along the boundary of a surface mesh, for a domain of high order (`method.md`, section 9).
 
-Between two boundary vertices the curve is the polynomial through the nearest ones along the boundary, over arc length.
-The same weights give the values of a function there, so that what vanishes at the boundary vertices vanishes on it.
+Over each boundary edge the curve is the polynomial in arc length through the nearest boundary vertices. The same
+Lagrange weights interpolate functions, so a function that vanishes at the boundary vertices vanishes on the curve.
 """
 
 from __future__ import annotations
@@ -18,21 +18,21 @@ from torchlb.geometry.thresholds import CREASE, FACTOR, KINK
 
 @dataclass(frozen=True)
 class BoundaryCurvesPlan:
-    """The vertices that a polynomial curve over each boundary edge goes through.
+    """Vertices that the polynomial curve over each boundary edge passes through.
 
     Attributes
     ----------
     index
-        (G, 2 + 2s): both ends of the edge, then those in turn beyond the second end, and those beyond the first.
+        (G, 2 + 2s): both ends of the edge, then s vertices beyond its second end and s beyond its first, outwards.
     valid
-        (G, 2 + 2s), whether an entry counts.
+        (G, 2 + 2s), whether an entry is used.
     """
 
     index: Int[Tensor, "G S"]
     valid: Bool[Tensor, "G S"]
 
     def at(self, points: Float[Tensor, "N n"]) -> BoundaryCurves:
-        """The curves."""
+        """Evaluate the curves."""
         steps = self.index.shape[1] // 2 - 1
         index, arcs = self.index, [points.new_zeros(len(self.index), 1)]
         for walk in index[:, 1 : 2 + steps], torch.cat([index[:, :1], index[:, 2 + steps :]], 1):
@@ -54,7 +54,7 @@ class BoundaryCurves:
     index, valid
         As in `BoundaryCurvesPlan`.
     arc
-        (G, S), ℓ: their places along the boundary, 0 at the edge's first end.
+        (G, S), arc length of these vertices from the first end of the edge, ℓ.
     """
 
     index: Int[Tensor, "G S"]
@@ -62,11 +62,11 @@ class BoundaryCurves:
     arc: Float[Tensor, "G S"]
 
     def over(self, edges: Int[Tensor, " E"]) -> BoundaryCurves:
-        """Those over some of the edges."""
+        """Curves over a subset of the edges."""
         return BoundaryCurves(self.index[edges], self.valid[edges], self.arc[edges])
 
     def weights(self, share: Float[Tensor, "G q"]) -> Float[Tensor, "G q S"]:
-        """Lagrange weights of the vertices at shares of the edge, 0 at its first end and 1 at its second."""
+        """Lagrange weights of the vertices at relative positions on the edge, 0 at its first end, 1 at its second."""
         size = self.index.shape[1]
         at = share * self.arc[:, 1:2]
         other = self.valid[:, None, :] & self.valid[:, :, None] & ~torch.eye(size, dtype=torch.bool)
@@ -78,7 +78,7 @@ class BoundaryCurves:
 def boundary_curves_plan(
     points: Float[Tensor, "N n"], edges: Int[Tensor, "G 2"], width: int
 ) -> BoundaryCurvesPlan:
-    """Curves through `width` vertices, fewer where corners are near, over the boundary edges `edges`."""
+    """Plan curves through `width` vertices, fewer near corners, over the boundary edges `edges`."""
     mate = _mates(points, edges)
     walks = [_walk(edges, mate, side, width - 2) for side in (0, 1)]
     (left, left_length, wrapped), (right, right_length, _) = walks
@@ -94,7 +94,7 @@ def boundary_curves_plan(
 
 
 def _bound(curves: BoundaryCurves) -> None:
-    """Leave out the farthest vertices of curves whose Lebesgue constant is too large, as where spacings jump."""
+    """Drop the farthest vertices of curves whose Lebesgue constant is too large, as where the spacing jumps."""
     middle = curves.arc[:, 1:2] / 2
     distance = (curves.arc - middle).abs()
     distance[:, :2] = 0
@@ -107,7 +107,7 @@ def _bound(curves: BoundaryCurves) -> None:
 
 
 def _mates(points: Float[Tensor, "N n"], edges: Int[Tensor, "G 2"]) -> Int[Tensor, " two_G"]:
-    """Of end s of edge e, number e + G s, the end of another edge that continues it smoothly; −1 for none."""
+    """Edge end that smoothly continues each edge end, −1 for none; end s of edge e has number e + G s."""
     count = len(edges)
     vertex = torch.cat([edges[:, 0], edges[:, 1]])
     order = vertex.argsort(stable=True)
@@ -130,7 +130,7 @@ def _mates(points: Float[Tensor, "N n"], edges: Int[Tensor, "G 2"]) -> Int[Tenso
 def _walk(
     edges: Int[Tensor, "G 2"], mate: Int[Tensor, " two_G"], side: int, steps: int
 ) -> tuple[Int[Tensor, "G steps"], Int[Tensor, " G"], Bool[Tensor, " G"]]:
-    """(vertices, their number, whether the walk came round) beyond one end of every edge; it stays where it ends."""
+    """Vertices beyond one end of every edge (the last repeated), their number, and whether the walk closed."""
     count = len(edges)
     end, start = edges[:, side], edges[:, 1 - side]
     half = torch.arange(count) + count * side

@@ -1,4 +1,4 @@
-"""Triangles too coarse for fits between their corners: long ones along the boundary, parts without vertices inside."""
+"""Triangles too coarse for polynomial fits: long ones along the boundary, and regions without interior vertices."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from torchlb.linalg.precision import SINGLE, rows_at_once
 
 
 def with_area(points: Float[Tensor, "N n"], faces: Int[Tensor, "F 3"]) -> Bool[Tensor, " F"]:
-    """All triangles but those along the boundary that rounding alone has made, and without which no vertex is alone."""
+    """Mask of triangles that drops boundary slivers of rounding height, unless a vertex would lose its last one."""
     kept, count = torch.ones(len(faces), dtype=torch.bool), len(points)
     corners = at(points, faces)
     sides = (corners.roll(-1, 1) - corners.roll(-2, 1)).norm(dim=2)  # across from the corners
@@ -44,14 +44,14 @@ def coarse_triangles(
     fits: FitPlan,
     free: Bool[Tensor, " E"],
 ) -> Bool[Tensor, " F"]:
-    """Those that lie along the free boundary, and those around which all is edges of the shape or has no fit."""
+    """Triangles that lie along the free boundary, or among creases, boundary and vertices without a fit only."""
     return lying_triangles(points, nodes, free) | _without_inside(points, nodes, fits)
 
 
 def lying_triangles(
     points: Float[Tensor, "N n"], nodes: Nodes, free: Bool[Tensor, " E"]
 ) -> Bool[Tensor, " F"]:
-    """Triangles with an obtuse angle across from a free edge of the boundary, or from an edge of such a triangle."""
+    """Triangles with an obtuse angle opposite a free boundary edge, or opposite an edge of another such triangle."""
     corners = at(points, nodes.cells)
     apex = corners.roll(-2, 1)  # across from the sides of `EDGES`
     one, other = corners - apex, corners.roll(-1, 1) - apex
@@ -66,7 +66,7 @@ def lying_triangles(
 
 
 def _without_inside(points: Tensor, nodes: Nodes, fits: FitPlan) -> Bool[Tensor, " F"]:
-    """Triangles without a fit at any corner, or around each of whose corners nearly all vertices lie on edges."""
+    """Triangles without a fit at any corner, or with almost only crease vertices around every corner."""
     lone = fits.degree == 0
     bound = lone.clone()
     if points.shape[1] == 3:
@@ -83,7 +83,7 @@ def _without_inside(points: Tensor, nodes: Nodes, fits: FitPlan) -> Bool[Tensor,
 
 
 def _cosines(points: Float[Tensor, "N 3"], nodes: Nodes) -> Float[Tensor, " E"]:
-    """Of the angle between the normals of the two triangles at an edge; 1 where there are not two."""
+    """Cosine of the angle between the two triangle normals at each edge; 1 where there are not two triangles."""
     corners = at(points, nodes.faces)
     normal = torch.linalg.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     normal = torch.nn.functional.normalize(normal, eps=torch.finfo(normal.dtype).tiny)
@@ -104,10 +104,10 @@ def _around(nodes: Nodes, values: Shaped[Tensor, " N"]) -> Shaped[Tensor, " N"]:
 def boundary_shares(
     points: Float[Tensor, "N n"], ends: Int[Tensor, "G 2"], cover: Cover
 ) -> Float[Tensor, " N"]:
-    """Lengths of the boundary edges of coarse triangles at the vertices, ℓ, in all those edges' length.
+    """Lumped boundary mass of coarse triangles at the vertices, ℓ; its sum is the length of their boundary edges.
 
-    A side of the cover that joins a vertex to its copy crosses such an edge, the one half of that side away: the
-    vertex has its share there, and the ends have less.
+    An edge of the cover that joins a vertex to its own copy crosses a boundary edge, half its length away from the
+    vertex. That vertex takes a share of the boundary edge there, and the ends of the edge take less.
     """
     start, along = points[ends[:, 0]], points[ends[:, 1]] - points[ends[:, 0]]
     square = along.square().sum(1).clamp_min(torch.finfo(along.dtype).tiny)

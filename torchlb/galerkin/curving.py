@@ -1,6 +1,6 @@
-"""Where the nodes of curved cells stand, and which edges are curved at all (`method.md`, section 9).
+"""Positions of the nodes of curved cells, and which edges are curved (`method.md`, section 9).
 
-Curves along the boundary, mollified lengths and normals are of triangles alone; all else is of any dimension.
+Boundary curves, mollified lengths and normals exist for triangles only; all else holds in any dimension.
 """
 
 from __future__ import annotations
@@ -26,14 +26,14 @@ from torchlb.geometry.vectors import at
 from torchlb.linalg.precision import AT_ONCE, SMALL
 
 ROUNDS = 2
-"""Rounds in which nodes move to the graphs of their vertices."""
+"""Rounds of projecting the nodes onto the fits of their vertices."""
 AGREE = 0.075
-"""How far the graphs of an edge's two ends may be apart at a node, over its length."""
+"""Largest distance of a vertex's fit from the mean of the fits at a node, relative to the edge length."""
 
 
 @dataclass(frozen=True)
 class Ends:
-    """Pairs of a node beyond the vertices and a vertex that it asks, with its share, by vertices; how many of each."""
+    """Pairs (node, vertex) with the node's barycentric coordinate `share` > 0, sorted by vertex; `uses` per vertex."""
 
     node: Int[Tensor, " E"]
     vertex: Int[Tensor, " E"]
@@ -43,9 +43,9 @@ class Ends:
     def of(
         self, vertices: Int[Tensor, " b"]
     ) -> Iterator[tuple[Int[Tensor, " c"], Int[Tensor, "c e"], Bool[Tensor, "c e"]]]:
-        """Some places in `vertices` at a time, the numbers of the ends there, padded, and which are no padding."""
+        """Yield chunks of indices into `vertices`, the pairs of each, padded to equal length, and which are real."""
         start, uses = (self.uses.cumsum(0) - self.uses)[vertices], self.uses[vertices]
-        for part in uses.argsort().split(AT_ONCE):  # of about as many ends each
+        for part in uses.argsort().split(AT_ONCE):  # similar numbers of pairs
             slot = torch.arange(int(uses[part[-1]]))
             own = start[part, None] + slot
             yield part, own.clamp_max(len(self.node) - 1), slot < uses[part, None]
@@ -53,16 +53,16 @@ class Ends:
 
 @dataclass(frozen=True)
 class BoundaryNodes:
-    """Nodes whose place and value follow from the boundary alone, so that what vanishes there vanishes on all of it.
+    """Nodes whose position and value depend on boundary vertices alone: zero at these is zero on the whole boundary.
 
     Attributes
     ----------
     displacement
-        (X, n), ℓ: of every node from its flat place, by the boundary.
+        (X, n), displacement of every node from its flat position by the boundary, ℓ.
     nodes
-        (A,), those along the boundary.
+        (A,), nodes along the boundary.
     entries
-        (node, vertex, weight) of the values of these nodes, by vertices of the boundary.
+        (node, vertex, weight), which interpolate values at these nodes from boundary vertices.
     """
 
     displacement: Float[Tensor, "X n"]
@@ -72,32 +72,31 @@ class BoundaryNodes:
 
 @runtime_checkable
 class BoundaryNodesPlan(Protocol):
-    """What is decided about the nodes along the boundary."""
+    """Plan of the nodes along the boundary."""
 
     def at(self, points: Float[Tensor, "N n"]) -> BoundaryNodes:
-        """What follows at these points."""
+        """Evaluate the plan at these points."""
         ...
 
 
 @dataclass(frozen=True)
 class CurvingPlan:
-    """What is decided about the cells.
+    """Plan of the curved cells.
 
     Attributes
     ----------
     nodes
-        The numbering.
+        Lagrange nodes.
     boundary
-        The nodes along the boundary.
+        Plan of the nodes along the boundary.
     curved
-        (E,), which edges are.
+        (E,), which edges are curved.
     bent
-        (X,), which nodes stand on the surface instead of on a flat cell.
+        (X,), which nodes lie on the surface instead of on a flat cell.
     coarse, fixed
-        (F,), which triangles are flat for the reasons of `coarse_triangles`; and (E,), which of their edges are no
-        mirrors of the cover that stands for them.
+        (F,), triangles that `coarse_triangles` finds; (E,), edges along which the sheets of their cover are not glued.
     flips
-        Those that make that cover Delaunay.
+        Edge flips that make that cover Delaunay.
     """
 
     nodes: Nodes
@@ -109,7 +108,7 @@ class CurvingPlan:
     flips: list[Tensor]
 
     def at(self, points: Float[Tensor, "N n"], plan: FitPlan, fits: LocalFits) -> CurvedMesh:
-        """The cells at these points."""
+        """Evaluate the curved cells at these points."""
         nodes, boundary = self.nodes, self.boundary.at(points)
         ends, flat = node_ends(nodes, len(points)), flat_places(points, nodes)
         standing, _ = _moved(points, plan, fits, nodes, ends, _start(flat, boundary), boundary)
@@ -126,7 +125,7 @@ class CurvingPlan:
         return CurvedMesh(places, g, lengths, cover, boundary, ends)
 
     def cover(self, lengths: Float[Tensor, "F e"], flips: list[Tensor] | None) -> Cover | None:
-        """The Delaunay triangulation of the coarse triangles and their mirror image, glued along the free boundary."""
+        """Intrinsic Delaunay tufted cover of the coarse triangles, glued along the free boundary; None without any."""
         coarse, nodes = self.coarse, self.nodes
         if not coarse.any():
             return None
@@ -136,22 +135,22 @@ class CurvingPlan:
 
 @dataclass(frozen=True)
 class CurvedMesh:
-    """Where the nodes stand.
+    """Curved cells at given points.
 
     Attributes
     ----------
     places
-        (N + X, n), ℓ.
+        (N + X, n), positions of the nodes, ℓ.
     metric
-        (F, Q, S), at the Gauss points of each cell, of flat triangles from mollified lengths.
+        (F, Q, S), metric at the Gauss points of each cell, ℓ²; that of flat triangles is of mollified lengths.
     lengths
-        (F, e) of the edges, mollified, ℓ.
+        (F, e), mollified edge lengths, ℓ.
     cover
-        What stands for the coarse triangles; None if there are none.
+        Cover that replaces the coarse triangles; None if there are none.
     boundary
-        What is known of the nodes along the boundary.
+        Nodes along the boundary.
     ends
-        Which vertices the nodes ask.
+        Vertices whose fits the nodes use.
     """
 
     places: Float[Tensor, "NX n"]
@@ -170,10 +169,10 @@ def curve(
     edge_nodes: BoundaryNodesPlan,
     held: Bool[Tensor, " N"] | None = None,
 ) -> tuple[CurvingPlan, CurvedMesh]:
-    """Stand the nodes on the graphs of their vertices where these agree, and flatten what they would distort.
+    """Move the nodes onto the fits of their vertices where these agree, and flatten cells that this would distort.
 
-    Nodes along the boundary of triangles stay on its curves. `held` are vertices with a Dirichlet condition: boundary
-    edges between them are no mirrors.
+    Nodes along the boundary of a surface stay on its curves. `held` marks vertices with a Dirichlet condition, along
+    whose boundary edges the sheets of a cover are not glued.
     """
     boundary, flat = edge_nodes.at(points), flat_places(points, nodes)
     ends = node_ends(nodes, len(points))
@@ -201,7 +200,7 @@ def curve(
 
 
 def flat_places(points: Float[Tensor, "N n"], nodes: Nodes) -> Float[Tensor, "X n"]:
-    """Where the nodes stand on flat cells."""
+    """Positions of the nodes on flat cells."""
     return torch.einsum("xv,xvn->xn", nodes.shares, at(points, nodes.corners))
 
 
@@ -210,14 +209,14 @@ def _start(flat: Float[Tensor, "X n"], boundary: BoundaryNodes) -> Float[Tensor,
 
 
 def _opposed(points: Tensor, nodes: Nodes) -> Bool[Tensor, " E"]:
-    """Edges whose ends' normals are more than 120° apart, or none."""
+    """Edges whose vertex normals differ by 120° or more, or vanish."""
     if points.shape[1] != 3:
         return torch.zeros(len(nodes.edges), dtype=torch.bool)
     return vertex_normals(points, nodes.faces)[nodes.edges].sum(1).norm(dim=1) <= 1
 
 
 def node_ends(nodes: Nodes, count: int) -> Ends:
-    """The vertices, of so many, with a share in each node."""
+    """Pairs of every node and the vertices, `count` in all, with a positive barycentric coordinate there."""
     node, place = (nodes.shares > 0).nonzero(as_tuple=True)
     vertex = nodes.corners[node, place]
     order = vertex.argsort(stable=True)
@@ -226,7 +225,7 @@ def node_ends(nodes: Nodes, count: int) -> Ends:
 
 
 def _sizes(points: Tensor, nodes: Nodes) -> Float[Tensor, " X"]:
-    """Of every node the length of its edge, or the longest of its triangle or cell."""
+    """Length of each node's edge, or the longest edge of its triangle or cell, ℓ."""
     length = (points[nodes.edges[:, 0]] - points[nodes.edges[:, 1]]).norm(dim=1)
     return nodes.at_nodes(length, *(length[side.edges].amax(1) for side in nodes.beyond))
 
@@ -240,9 +239,9 @@ def _moved(
     start: Float[Tensor, "X n"],
     boundary: BoundaryNodes,
 ) -> tuple[Float[Tensor, "X n"], Bool[Tensor, " X"]]:
-    """Where the graphs of its vertices take every node, in the mean; and whether they agree.
+    """Project every node onto the mean of its vertices' fits; return the positions and whether the fits agree.
 
-    Asked again from there they do so at the same place, but for h⁶. Nodes along the boundary of triangles stay.
+    A further round would move them by O(h⁶). Nodes along the boundary of a surface stay.
     """
     size, place, lots = _sizes(points, nodes), start, list(ends.of(torch.arange(len(points))))
     apart, moves = torch.zeros_like(at(size, ends.node)), torch.zeros_like(at(start, ends.node))
@@ -263,7 +262,7 @@ def _moved(
 def _to_graph(
     fits: LocalFits, degree: int, places: Float[Tensor, "c e n"], vertex: Int[Tensor, " c"]
 ) -> Float[Tensor, "c e n"]:
-    """From places to the graph of the surface at each vertex, orthogonally to its frame."""
+    """Displacement from positions to the fitted graph at each vertex, orthogonal to its frame."""
     frame, offset = at(fits.initial, vertex), places - at(fits.points, vertex)[:, None]
     along = offset @ frame
     powers = monomials(along / fits.surface_radius[vertex, None, None], degree)
@@ -277,10 +276,9 @@ def _flattened(
     curved: Bool[Tensor, " E"],
     whole: list[Bool[Tensor, " _"]],
 ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
-    """Places, curved edges, bent nodes, metric, lengths: edges around distorted cells are flat, until none is.
+    """Flatten edges of distorted cells until none is; return positions, curved edges, bent nodes, metric, lengths.
 
-    `stand` is where nodes are on flat cells and on the surface; `whole`, which triangles and cells may have theirs
-    there.
+    `stand` holds the positions on flat cells and on the surface; `whole` flags triangles and cells that may be curved.
     """
     sides = nodes.lengths(points)
     lengths = sound_lengths(sides, nodes.cells)

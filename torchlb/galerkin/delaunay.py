@@ -1,7 +1,7 @@
-"""Intrinsic Delaunay triangles of what is flat, glued to its mirror image along the boundary (Sharp, Crane 2020).
+"""Intrinsic Delaunay triangulation of the tufted cover of flat triangles (Sharp and Crane 2020).
 
-A boundary edge across from an obtuse angle ties the vertex there to the line between its ends, however long that is. On
-the surface and its mirror image, each triangle twice, it is an edge like all others, and may be flipped as well.
+A boundary edge opposite an obtuse angle has a negative cotangent weight, and cannot be flipped. On the tufted cover,
+two copies of every triangle glued along the boundary, it is an interior edge like all others.
 """
 
 from __future__ import annotations
@@ -19,22 +19,22 @@ from torchlb.geometry.complex import pieces_of
 from torchlb.linalg.precision import EPS, NEGLIGIBLE, SINGLE
 
 EDGES = tuple((i, (i + 1) % 3) for i in range(3))
-"""Ends of the sides of a triangle, in turn, in the order of `subsets`."""
+"""Ends of the edges of a triangle, in the order of `subsets`."""
 
 
 class Cover(NamedTuple):
-    """Triangles that cover others twice.
+    """Tufted cover of a set of triangles.
 
     Attributes
     ----------
     faces
-        (2F, 3); copies of a vertex are one vertex, and sides may join it to itself.
+        (2F, 3); both copies of a vertex have one number, and an edge may join a vertex to itself.
     lengths
-        (2F, 3), ℓ, of the sides in the order of `EDGES`.
+        (2F, 3), edge lengths in the order of `EDGES`, ℓ.
     flips
-        In order, the sides that were flipped at one time: side s of face f has number 3f + s.
+        Batches of simultaneous edge flips, in order; half-edge s of face f has number 3f + s.
     shares
-        Of each of these lots the two triangles, and the share of the first in the area of both.
+        For each batch, the pairs of triangles, and the first one's share of their joint area before the flip.
     """
 
     faces: Int[Tensor, "two_F 3"]
@@ -43,7 +43,7 @@ class Cover(NamedTuple):
     shares: list[tuple[Tensor, Tensor]]
 
     def mixed(self) -> sparse.csr_array:
-        """(2F, F), of each triangle what share of the given ones it has, as far as means over two triangles tell."""
+        """(2F, F), share of each original triangle in each one of the cover, by averages over flipped pairs."""
         count = len(self.faces) // 2
         one: Any = sparse.eye_array(count, format="csr")
         result: Any = sparse.vstack([one, one], format="csr")
@@ -59,9 +59,9 @@ class Cover(NamedTuple):
 
 
 def mollified(sides: Float[Tensor, "F 3"], faces: Int[Tensor, "F 3"]) -> Float[Tensor, "F 3"]:
-    """Lengths of edges, all of a component longer by so much that none of its triangles is without area.
+    """Mollified edge lengths (Sharp and Crane 2020): one constant per component leaves no triangle degenerate.
 
-    Two of a triangle are then longer than the third by 1e-5 of the mean; with a tenth of it flips may not end.
+    Two edges of a triangle then exceed the third by 1e-5 of the mean length; with 1e-6, flips may not terminate.
     """
     spare = sides.sum(1) - 2 * sides.amax(1)
     if bool((spare >= SINGLE * sides.amax()).all()):
@@ -74,9 +74,9 @@ def mollified(sides: Float[Tensor, "F 3"], faces: Int[Tensor, "F 3"]) -> Float[T
 
 
 def shrunk(sides: Float[Tensor, "F 6"]) -> Float[Tensor, "F 6"]:
-    """Lengths of edges, those of tetrahedra without volume next to nothing, so that they count for nothing.
+    """Edge lengths, shrunk to almost zero for tetrahedra without volume, which then contribute nothing.
 
-    Delaunay tetrahedra of a grid have such slivers, four points of a square; what is around them fills the solid.
+    Delaunay tetrahedra of a grid include such slivers, the four corners of a square; the others fill the solid.
     """
     longest = sides.amax(1)
     none = area_element(flat_metric(sides)) <= NEGLIGIBLE * longest**3
@@ -86,7 +86,7 @@ def shrunk(sides: Float[Tensor, "F 6"]) -> Float[Tensor, "F 6"]:
 def sound_lengths(
     sides: Float[Tensor, "F e"], cells: Int[Tensor, "F corners"]
 ) -> Float[Tensor, "F e"]:
-    """Lengths of the edges of cells, as those of cells with an area or a volume, or next to nothing."""
+    """Edge lengths with a positive definite metric in every cell: `mollified` triangles, `shrunk` tetrahedra."""
     if cells.shape[1] == 3:
         return mollified(sides, cells)
     return shrunk(sides) if cells.shape[1] == 4 else sides
@@ -99,10 +99,10 @@ def delaunay_cover(
     fixed: Bool[Tensor, " E"],
     flips: list[Tensor] | None = None,
 ) -> Cover:
-    """Triangles that cover the given ones twice, flipped until they are Delaunay but for the edges that are `fixed`.
+    """Tufted cover of the triangles, flipped until it is intrinsic Delaunay except at `fixed` edges.
 
-    `edge` numbers the edges of the faces. However many faces an edge has, each is glued there to the back of the next.
-    Given `flips` are done again instead, whatever the lengths are now.
+    `edge` numbers the edges of the faces. At an edge of any number of faces each face is glued to the back of the next.
+    Where `flips` are given, these are repeated instead, whatever the lengths.
     """
     sheets = torch.cat([faces, faces.flip(1)])
     sides = torch.cat([lengths, lengths[:, [1, 0, 2]]])
@@ -114,7 +114,7 @@ def delaunay_cover(
 
 
 def _lacking(sheets: Tensor, sides: Tensor, twin: Tensor) -> Iterator[Int[Tensor, " C"]]:
-    """Sides to flip at one time, until all are Delaunay; each lot is flipped before the next is asked for."""
+    """Yield batches of edges to flip until all are Delaunay; the caller flips each before it asks for the next."""
     active = torch.arange(len(twin))
     while True:
         active = active[(twin[active] > active) & (active // 3 != twin[active] // 3)]
@@ -131,12 +131,12 @@ def _lacking(sheets: Tensor, sides: Tensor, twin: Tensor) -> Iterator[Int[Tensor
 
 
 def _glued(faces: Tensor, edge: Tensor, fixed: Tensor) -> Int[Tensor, " six_F"]:
-    """Of side s of face f of the cover, number 3f + s, the side that it is glued to; −1 where it is fixed."""
+    """Twin of half-edge s of face f of the cover, number 3f + s; −1 where it is fixed."""
     count = len(faces)
     front = torch.arange(3 * count)
     back = 3 * (count + front // 3) + torch.tensor([1, 0, 2])[front % 3]
     starts, ends = (faces[:, [pair[i] for pair in EDGES]].flatten() for i in (0, 1))
-    up = torch.where(starts < ends, front, back)  # the copy that runs from the lower vertex on
+    up = torch.where(starts < ends, front, back)  # the copy directed from the lower vertex
     down = front + back - up
     order = edge.flatten().argsort(stable=True)
     number = edge.flatten()[order]
@@ -153,7 +153,7 @@ def _glued(faces: Tensor, edge: Tensor, fixed: Tensor) -> Int[Tensor, " six_F"]:
 def _foot(
     sides: Float[Tensor, "T 3"], slot: Int[Tensor, " H"]
 ) -> tuple[Float[Tensor, " H"], Float[Tensor, " H"]]:
-    """Of the corner across from a side: the place of its foot on the side's line, from its start, and its height, ℓ."""
+    """Foot of the opposite corner on the line of an edge, from the edge's start, and its height, ℓ."""
     face, side = slot // 3, slot % 3
     own, after, before = (sides[face, (side + i) % 3] for i in range(3))
     foot = ((before - after) * (before + after) / own + own) / 2
@@ -161,7 +161,7 @@ def _foot(
 
 
 def _cotangents(sides: Tensor, slot: Tensor) -> Float[Tensor, " H"]:
-    """Of the angles across from sides."""
+    """Cotangents of the angles opposite half-edges."""
     face, side = slot // 3, slot % 3
     own, after, before = (sides[face, (side + i) % 3] for i in range(3))
     _, height = _foot(sides, slot)
@@ -170,7 +170,7 @@ def _cotangents(sides: Tensor, slot: Tensor) -> Float[Tensor, " H"]:
 
 
 def _apart(one: Tensor, other: Tensor, weight: Tensor, num_faces: int) -> Int[Tensor, " C"]:
-    """Of these sides those with the least weight of all that share a face."""
+    """Independent edges: those of least weight among all that share a face with them."""
     order = weight.argsort(stable=True)
     rank = torch.arange(len(order))
     first = torch.full((num_faces,), len(order))
@@ -183,7 +183,7 @@ def _apart(one: Tensor, other: Tensor, weight: Tensor, num_faces: int) -> Int[Te
 def _flip(
     sheets: Tensor, sides: Tensor, twin: Tensor, chosen: Int[Tensor, " C"]
 ) -> tuple[Int[Tensor, "C 2"], Float[Tensor, " C"]]:
-    """Flip sides, in place: of (a, b, c) and (b, a, d) make (c, d, b) and (d, c, a); as in `Cover.shares`."""
+    """Flip edges in place, (a, b, c) and (b, a, d) to (c, d, b) and (d, c, a); return an entry of `Cover.shares`."""
     other = twin[chosen]
     f, g = chosen // 3, other // 3
     (ab, bc, ca), (ba, ad, db) = (

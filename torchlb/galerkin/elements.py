@@ -1,6 +1,6 @@
 """Lagrange elements on the reference simplex of any dimension.
 
-The corners of a cell ascend, so that neighbours agree on the order of the nodes that they share.
+The corners of a cell are ascending, so that neighbours agree on the order of their shared nodes.
 """
 
 from __future__ import annotations
@@ -23,11 +23,11 @@ class Element(NamedTuple):
     Attributes
     ----------
     weights
-        (Q,), their sum is the size of the reference simplex, 1/d!.
+        (Q,), quadrature weights; they sum to the volume of the reference simplex, 1/d!.
     values
         (Q, n), φ_i.
     gradients
-        (Q, n, d), in the reference coordinates: the barycentrics of the corners after the first.
+        (Q, n, d), ∇φ_i in reference coordinates, the barycentric ones of all corners but the first.
     """
 
     weights: Float[Tensor, " Q"]
@@ -55,7 +55,7 @@ def subsets(dim: int, size: int) -> tuple[tuple[int, ...], ...]:
 
 @cache
 def inner(size: int, degree: int) -> Float[Tensor, "n size"]:
-    """Barycentrics of the nodes inside a simplex of `size` corners.
+    """Barycentric coordinates of the nodes inside a simplex with `size` corners.
 
     >>> inner(2, 3).round(decimals=4).tolist()
     [[0.6667, 0.3333], [0.3333, 0.6667]]
@@ -70,7 +70,7 @@ def inner(size: int, degree: int) -> Float[Tensor, "n size"]:
 
 @cache
 def lattice(dim: int, degree: int) -> Float[Tensor, "n corners"]:
-    """Barycentrics of the nodes: the corners, those inside each edge, inside each triangle, and so on.
+    """Barycentric coordinates of all nodes: corners, then nodes inside each edge, inside each triangle, and so on.
 
     >>> lattice(2, 2)[3:].tolist()
     [[0.5, 0.5, 0.0], [0.0, 0.5, 0.5], [0.5, 0.0, 0.5]]
@@ -86,7 +86,7 @@ def lattice(dim: int, degree: int) -> Float[Tensor, "n corners"]:
 
 @cache
 def facet_nodes(dim: int, degree: int) -> Int[Tensor, "facets n"]:
-    """Places in `lattice` of the nodes of each facet, in the order of the lattice of one dimension less.
+    """Indices into `lattice` of the nodes of each facet, in the order of the lattice of dimension d − 1.
 
     >>> facet_nodes(2, 2).tolist()
     [[0, 1, 3], [1, 2, 4], [0, 2, 5]]
@@ -101,10 +101,10 @@ def facet_nodes(dim: int, degree: int) -> Int[Tensor, "facets n"]:
 
 @cache
 def simplex(dim: int, degree: int) -> Element:
-    """The element of dimension d and degree r ≥ 1 with its nodes on `lattice`.
+    """Lagrange element of dimension d and degree r ≥ 1, with its nodes on `lattice`.
 
-    Its rule is the collapsed product rule of (r + 1)^d points; on triangles it is turned to each corner,
-    so that the order of these is irrelevant.
+    The quadrature is the collapsed Gauss–Jacobi product rule with (r + 1)^d points; on triangles it is averaged over
+    the three rotations, so that the order of the corners is irrelevant.
     """
     rules = [roots_jacobi(degree + 1, k, 0) for k in range(dim)]  # weight (1 − y)^k, y in [−1, 1]
     axes = [torch.from_numpy((1 + x) / 2) for x, _ in rules]

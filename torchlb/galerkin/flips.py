@@ -1,7 +1,7 @@
-"""Folded triangles and slivers flipped away (`method.md`, section 9): for the integrals only.
+"""Edge flips that remove folded triangles and slivers, for the integrals only (`method.md`, section 9).
 
-Flipping everything to intrinsic Delaunay would be wrong: good meshes follow the curvature, and lose by it. So would be
-flips that only lessen a fold: a crease of the surface itself has such triangles, and is no better for them.
+Flips to intrinsic Delaunay everywhere would harm good meshes, whose edges follow the curvature. Flips that only reduce
+a fold do not help: creases of the surface itself have such triangles.
 """
 
 from __future__ import annotations
@@ -15,14 +15,14 @@ from torchlb.geometry.vectors import dot
 from torchlb.linalg.precision import LOW, ROOT_EPS
 
 FAIR = 0.5
-"""Least quality of a triangle where the surface is a plane."""
+"""Quality below which a triangle is flipped where the surface is planar."""
 
 
 def flipped(vertices: Tensor, faces: Tensor) -> Tensor:
-    """The faces, with an edge flipped of every folded triangle or sliver that gains by it and is not folded then.
+    """Flip an edge of every folded triangle or sliver that improves by it and is not folded afterwards.
 
-    Only edges of two triangles, and only where the new edge is not there yet. The normals are renewed each round; an
-    edge that was flipped away does not come back, or two flips could gain in turn for ever.
+    Only edges of two triangles are flipped, and only to edges that do not exist yet. Normals are recomputed each round.
+    An edge that was flipped away never returns, since two flips could otherwise alternate for ever.
     """
     faces, normals = faces.clone(), vertex_normals(vertices, faces)
     alignment, quality = _scores(vertices, normals, faces)
@@ -51,19 +51,19 @@ def flipped(vertices: Tensor, faces: Tensor) -> Tensor:
 
 
 def _keys(one: Tensor, other: Tensor, size: int) -> Tensor:
-    """A number for each edge, in either direction."""
+    """Integer key of each undirected edge."""
     return torch.minimum(one, other) * size + torch.maximum(one, other)
 
 
 def _touching(faces: Tensor, corners: Tensor) -> Tensor:
-    """The faces with one of these vertices, ascending."""
+    """Indices of the faces with one of these vertices, ascending."""
     touched = torch.zeros(int(faces.max()) + 1, dtype=torch.bool)
     touched[corners] = True
     return touched[faces].any(1).nonzero()[:, 0]
 
 
 def _scores(vertices: Tensor, normals: Tensor, faces: Tensor) -> tuple[Tensor, Tensor]:
-    """Least cosine between the normal and those of the corners, and quality."""
+    """Least cosine between a triangle's normal and its vertex normals, and the triangle's quality."""
     corners = vertices[faces]
     sides = corners.roll(-1, dims=-2) - corners
     normal = torch.linalg.cross(sides[..., 0, :], sides[..., 1, :])
@@ -74,7 +74,7 @@ def _scores(vertices: Tensor, normals: Tensor, faces: Tensor) -> tuple[Tensor, T
 
 
 def _value(vertices: Tensor, normals: Tensor, pairs: Tensor) -> Tensor:
-    """What a flip is to raise: the lesser alignment of the two, as far as it lacks, then the lesser quality."""
+    """Objective of a flip: the lesser alignment of the two triangles, up to `CREASE`, then the lesser quality."""
     alignment, quality = _scores(vertices, normals, pairs)
     return 1e3 * alignment.amin(1).clamp_max(CREASE) + quality.amin(1)
 
@@ -82,12 +82,12 @@ def _value(vertices: Tensor, normals: Tensor, pairs: Tensor) -> Tensor:
 def _flips(
     faces: Tensor, bad: Tensor, gone: Tensor, size: int
 ) -> tuple[Tensor, Tensor, Tensor] | None:
-    """Flips of the edges of the bad faces: the two faces (a, b, c), (b, a, d) and (c, d, b), (d, c, a) instead.
+    """Flips of edges of the bad faces: the faces (a, b, c) and (b, a, d), and (c, d, b) and (d, c, a) afterwards.
 
-    None that makes an edge which is there, or is gone.
+    Flips to an edge that exists, or was flipped away before, are excluded.
     """
     around = bad
-    for _ in range(2):  # all that the edges of their flips can belong to
+    for _ in range(2):  # every face that may have the new edge of a flip
         around = _touching(faces, faces[around])
     faces, bad = faces[around], torch.searchsorted(around, bad)
     count = len(faces)
@@ -122,7 +122,7 @@ def _independent(
     after: Tensor,
     num_faces: int,
 ) -> Tensor:
-    """Flips that gain, best first, none of which shares a face or makes an edge with a better one."""
+    """Improving flips, best first, that share neither a face nor the new edge with a better one."""
     order = gain.argsort(descending=True, stable=True)
     order = order[gain[order] > 1e-9]
     rank = torch.arange(len(order))

@@ -36,20 +36,20 @@ Density = Callable[[Tensor, Element, Tensor], Tensor]
 
 
 class FlatCells(NamedTuple):
-    """Flat simplices with linear elements, which stand for others.
+    """Flat simplices with P1 elements, in place of curved cells or beside them.
 
     Attributes
     ----------
     cells
         (T, d + 1).
     lengths
-        (T, e), of their edges, ℓ.
+        (T, e), edge lengths, ℓ.
     share
-        How much of each counts.
+        Fraction of each simplex that is integrated.
     lumped
-        Whether their mass is lumped, to equal shares for the corners.
+        Whether the mass is lumped in equal shares to the corners.
     mix
-        (T, F), how much of each face of the mesh is in a cell; None where they stand for none.
+        (T, F), share of each face of the mesh in a cell; None where the cells replace no faces.
     """
 
     cells: Int[Tensor, "T corners"]
@@ -61,28 +61,28 @@ class FlatCells(NamedTuple):
 
 @dataclass(frozen=True)
 class Forms:
-    """The elements of a weak pair: stiffnesses for many conductivities cost an assembly each.
+    """Elements of a weak pair, which assemble its stiffness for any conductivity.
 
     Attributes
     ----------
     cells, lengths
-        (T, d + 1), (T, e), ℓ: simplices, and their edges in the order of `subsets`.
+        (T, d + 1), (T, e), ℓ: simplices, and their edge lengths in the order of `subsets`.
     faces
-        (T,), the face of the mesh that each of them is.
+        (T,), face of the mesh for each simplex.
     num_faces
-        F, of the mesh.
+        Number F of faces of the mesh.
     prolongation
         P, (N + X, N), from the vertices to the nodes.
     nodes
-        (T, n), of each element.
+        (T, n), nodes of each element.
     metric
-        (T, Q, S), at its Gauss points.
+        (T, Q, S), metric at the Gauss points, ℓ².
     element
-        Its shape functions there.
+        Shape functions at the Gauss points.
     shares
-        (T,), which part of each counts; None where all of them do.
+        (T,), fraction of each simplex that is integrated; None for all of it.
     flats
-        Simplices beside these, with linear elements.
+        Flat simplices beside these.
     """
 
     cells: Int[Tensor, "T corners"]
@@ -108,9 +108,9 @@ class Forms:
         *,
         prolong: bool = True,
     ) -> Forms:
-        """Those of curved cells, or shares of them, of the cover that stands for coarse triangles, and of local stars.
+        """Build the elements of curved cells, of the cover that replaces coarse triangles, and of local stars.
 
-        A star's simplex is in those of all its corners, each of which has an equal share of it.
+        A simplex belongs to the stars of all its corners, each of which counts an equal share of it.
         """
         nodes, flats, own = plan.nodes, [], ~plan.coarse
         if mesh.cover is not None:
@@ -131,7 +131,7 @@ class Forms:
 
     @classmethod
     def linear(cls, points: Float[Tensor, "N n"], faces: Int[Tensor, "F corners"]) -> Forms:
-        """Those of linear elements, whose stiffness for κ = 1 is the cotangent's."""
+        """Build P1 elements, whose stiffness for κ = 1 is the cotangent matrix."""
         lengths, element = edge_lengths(points, faces), simplex(faces.shape[1] - 1, 1)
         metric = flat_metric(lengths)[:, None].expand(-1, len(element.weights), -1)
         same: Any = sparse.eye_array(len(points), format="csr")
@@ -139,7 +139,7 @@ class Forms:
         return cls(faces, lengths, every, len(faces), same, faces, metric, element, None, [])
 
     def restored(self, numbering: Numbering, order: Int[Tensor, " G"], num_faces: int) -> Forms:
-        """With the user's numbers of the points and of so many faces, `order` those of the faces here."""
+        """Renumber to the user's points and `num_faces` faces; `order` has the user's numbers of the faces here."""
         given = numbering.given
         flats = [
             flat._replace(
@@ -158,10 +158,10 @@ class Forms:
         )
 
     def conductivities(self, conductivity: Tensor) -> list[Tensor]:
-        """κ at the Gauss points (T, Q), and its means on flat cells; differentiable.
+        """Return κ at the Gauss points, (T, Q), and its means on flat cells; differentiable.
 
-        Of the vertices (N,), whose logarithm is prolonged, or of each face, if F ≠ N. So it is positive, and of high
-        order where the fits are.
+        The conductivity is given per vertex, (N,), or per face, (F,) with F ≠ N. From vertices its logarithm is
+        prolonged, which keeps κ positive, and of high order where the fits are.
         """
         if len(conductivity) != self.prolongation.shape[1]:
             points = conductivity[self.faces, None].expand(-1, len(self.element.weights))
@@ -175,18 +175,18 @@ class Forms:
         return found
 
     def matrix(self, conductivities: list[Tensor] | None = None) -> sparse.csr_array:
-        """K + iM, (N, N), positive semidefinite for every κ > 0, the upper triangle; the rows of K sum to zero."""
+        """Upper triangle of K + iM, (N, N), positive semidefinite for every κ > 0; the rows of K sum to zero."""
         kappa = None if conductivities is None else conductivities[0]
         elements = summed(self.blocks(kappa), self.nodes, self.prolongation.shape[0])
         return upper_congruence(self.prolongation, elements) + self.flat(conductivities)
 
     def blocks(self, conductivity: Float[Tensor, "T Q"] | None = None) -> Tensor:
-        """K_FE + iM_FE of each of the curved elements, (T, n²)."""
+        """Element matrices K_FE + iM_FE of the curved elements, (T, n²)."""
         blocks = element_matrices(self.metric, self.element, conductivity)
         return blocks if self.shares is None else self.shares[:, None] * blocks
 
     def near(self, conductivities: list[Tensor] | None = None) -> sparse.csr_array:
-        """K₁ + iM₁ of linear elements on flat simplices, with the mean of κ on each, the upper triangle."""
+        """Upper triangle of K₁ + iM₁ of P1 elements on flat simplices, with the mean of κ on each."""
         means = None
         if conductivities is not None:
             means = conductivities[0] @ self.element.weights / self.element.weights.sum()
@@ -196,7 +196,7 @@ class Forms:
         return upper + self.flat(conductivities) if self.flats else upper
 
     def flat(self, conductivities: list[Tensor] | None = None) -> sparse.csr_array:
-        """K + iM of the flat cells, the upper triangle."""
+        """Upper triangle of K + iM of the flat cells."""
         count = self.prolongation.shape[1]
         total: Any = sparse.csr_array((count, count), dtype=complex)
         for number, flat in enumerate(self.flats, 1):
@@ -206,7 +206,7 @@ class Forms:
         return total
 
     def sensitivity(self, w: Float[Tensor, "N C"], u: Float[Tensor, "N C"]) -> list[Tensor]:
-        """∂/∂κ of Σ_c w_cᵀK(κ)u_c, of the shapes of `conductivities`: weights times ∇w·∇u."""
+        """∂/∂κ of Σ_c w_cᵀK(κ)u_c, in the shapes of `conductivities`: quadrature weights times ∇w·∇u."""
         at_nodes = [torch.from_numpy(self.prolongation @ x.numpy()) for x in (w, u)]
         own, *flat = self.densities(_slopes, at_nodes, [w, u], torch.ones(w.shape[1]).to(w))
         return [own, *(each.sum(1) for each in flat)]
@@ -222,7 +222,7 @@ class Forms:
     def densities(
         self, density: Density, nodes: list[Tensor], corners: list[Tensor], c: Float[Tensor, " C"]
     ) -> list[Tensor]:
-        """A density of two functions times the weights of the Gauss points, differentiable in all.
+        """A density of two functions times the quadrature weights, differentiable in metric and functions.
 
         Of the curved elements, (T, Q), and of each lot of flat cells, (F, Q).
         """
@@ -250,7 +250,7 @@ def edge_lengths(
 
 
 def upper_congruence(p: Any, matrix: sparse.csr_array) -> sparse.csr_array:
-    """The upper triangle of the symmetric PᵀAP, some rows at a time."""
+    """Upper triangle of the symmetric PᵀAP, computed in blocks of rows."""
     left, parts, count = sparse.csr_array(p.T), [], p.shape[1]
     for first in range(0, count, AT_ONCE):
         part: Any = left[first : first + AT_ONCE] @ matrix @ p
@@ -283,7 +283,7 @@ def _outer(
 def _slopes(
     metric: Float[Tensor, "T Q S"], element: Element, blocks: Float[Tensor, "T n_times_n"]
 ) -> Float[Tensor, "T Q"]:
-    """Weights times ∇w·∇u at the Gauss points."""
+    """Quadrature weights times Σ_k c_k ∇w_k·∇u_k at the Gauss points."""
     total, slopes = metric.new_zeros(metric.shape[:2]), element.gradients.unbind(-1)
     pairs = combinations_with_replacement(slopes, 2)
     for (x, y), entry in zip(pairs, cofactors(metric).unbind(-1), strict=True):
@@ -296,7 +296,7 @@ def _slopes(
 def _products(
     metric: Float[Tensor, "T Q S"], element: Element, blocks: Float[Tensor, "T n_times_n"]
 ) -> Float[Tensor, "T Q"]:
-    """Weights times w u at the Gauss points."""
+    """Quadrature weights times Σ_k c_k w_k u_k at the Gauss points."""
     return element.weights * area_element(metric) * (blocks @ squares(element).T)
 
 

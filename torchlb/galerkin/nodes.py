@@ -1,4 +1,4 @@
-"""The Lagrange nodes of a complex of simplices: their numbers, and where they stand on its flat cells."""
+"""Lagrange nodes of a complex of simplices: their numbering and barycentric coordinates."""
 
 from __future__ import annotations
 
@@ -15,18 +15,18 @@ from torchlb.geometry.vectors import at
 
 @dataclass(frozen=True)
 class Sides:
-    """The sub-simplices of one size of a complex, each once.
+    """Sub-simplices of one dimension of a complex, each listed once.
 
     Attributes
     ----------
     corners
         (S, s), ascending.
     of
-        (F, c), those of each cell, in the order of `subsets`.
+        (F, c), sub-simplices of each cell, in the order of `subsets`.
     edges
-        (S, e), the edges of each.
+        (S, e), edges of each.
     uses
-        (S,), how many cells each belongs to.
+        (S,), number of cells that each belongs to.
     nodes
         Number of nodes inside each.
     """
@@ -47,13 +47,13 @@ class Nodes:
     degree
         r.
     faces
-        (F, d + 1), the cells as they are wound.
+        (F, d + 1), cells with their orientation.
     cells
-        (F, d + 1), the corners of each cell, ascending.
+        (F, d + 1), cells with their corners ascending.
     sides
-        The edges, triangles, … with nodes, by the number of their corners; and the facets.
+        Sub-simplices by number of corners: edges, triangles, …, and the facets.
     corners, shares
-        (X, d + 1), vertices and barycentrics of each node beyond the vertices.
+        (X, d + 1), vertices and barycentric coordinates of each node that is not a vertex.
     elements
         (F, n), nodes of each cell in the order of `lattice`.
     """
@@ -83,27 +83,27 @@ class Nodes:
 
     @property
     def beyond(self) -> list[Sides]:
-        """The triangles, and the cells."""
+        """Sub-simplices of dimension 2 and higher, cells included."""
         return [self.sides[size] for size in range(3, self.dim + 2)]
 
     def lengths(self, points: Float[Tensor, "N n"]) -> Float[Tensor, "F e"]:
-        """Those of the edges of each cell, ℓ."""
+        """Edge lengths of each cell, ℓ."""
         ends = at(points, self.edges)
         return (ends[:, 1] - ends[:, 0]).norm(dim=1)[self.edge]
 
     def at_nodes(self, *values: Tensor) -> Tensor:
-        """Values of the edges, of the triangles, …, at the nodes inside them, in their order."""
+        """Repeat values of the edges, of the triangles, … at the nodes inside them, in node order."""
         parts = zip(values, range(2, self.dim + 2), strict=True)
         return torch.cat([x.repeat_interleave(self.sides[s].nodes, 0) for x, s in parts])
 
     def by_side(self, values: Bool[Tensor, " X"]) -> list[Bool[Tensor, " _"]]:
-        """Whether a flag holds at all nodes inside of an edge, of a triangle, and so on."""
+        """Whether a flag holds at all nodes inside each edge, each triangle, and so on."""
         sides = [self.sides[size] for size in range(2, self.dim + 2)]
         parts = values.split([len(side.uses) * side.nodes for side in sides])
         return [x.view(len(s.uses), s.nodes).all(1) for s, x in zip(sides, parts, strict=True)]
 
     def boundary(self) -> tuple[Int[Tensor, " G"], Int[Tensor, "G n"]]:
-        """The facets that belong to one cell only: that cell, and their nodes in the order of `lattice`."""
+        """Facets of one cell only: that cell, and their nodes in the order of `lattice`."""
         facets = self.sides[self.dim]
         cell, place = (facets.uses[facets.of] == 1).nonzero(as_tuple=True)
         local = facet_nodes(self.dim, self.degree)[place]
@@ -113,7 +113,7 @@ class Nodes:
 def lagrange_nodes(
     cells: Int[Tensor, "F corners"], num_points: int, degree: int, *, closed: bool = False
 ) -> Nodes:
-    """The nodes of degree r on a complex of any topology; without a boundary if it is `closed`.
+    """Number the nodes of degree r on a complex of any topology; `closed` ignores its boundary.
 
     >>> lagrange_nodes(torch.tensor([[0, 1, 2], [1, 3, 2]]), 4, 2).elements.tolist()
     [[0, 1, 2, 4, 6, 5], [1, 2, 3, 6, 8, 7]]
@@ -154,7 +154,7 @@ def _vertices(cells: Int[Tensor, "F corners"], num_points: int) -> Sides:
 
 
 def _sides(cells: Int[Tensor, "F corners"], size: int, degree: int, edges: Sides | None) -> Sides:
-    """The sub-simplices with `size` corners, in the order of their corners; the cells themselves as they are."""
+    """Sub-simplices with `size` corners, sorted by their corners; cells keep their order."""
     dim, nodes = cells.shape[1] - 1, len(inner(size, degree))
     if size == dim + 1:
         corners, of = cells, torch.arange(len(cells))[:, None]

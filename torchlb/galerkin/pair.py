@@ -28,14 +28,14 @@ from torchlb.linalg.precision import LOW
 
 @dataclass(frozen=True)
 class SparsePair:
-    """Symmetric matrices on one pattern: stiffness, without a unit on a surface, mass, ℓ², mass of the boundary, ℓ.
+    """Symmetric matrices on one pattern: on a surface stiffness (no unit), mass (ℓ²) and boundary mass (ℓ).
 
     Attributes
     ----------
     crow, col
         (N + 1,), (nnz,), CSR with ascending columns.
     values
-        (2, nnz), of K and of M; (3, nnz) on a shape with a boundary.
+        (2, nnz), K and M; (3, nnz), also B, on a shape with a boundary.
     """
 
     crow: Int[Tensor, " N_plus_1"]
@@ -45,20 +45,20 @@ class SparsePair:
 
 @dataclass(frozen=True)
 class Pattern:
-    """Where the entries of a symmetric matrix, of which the upper triangle was computed, are in the user's numbers.
+    """Map from a computed upper triangle to the full symmetric CSR pattern in the user's numbers.
 
     Attributes
     ----------
     crow, col
-        As of a `SparsePair`.
+        As in `SparsePair`.
     order
-        (nnz,), of each entry the place in the upper triangle.
+        (nnz,), index of each entry in the upper triangle.
     diagonal
-        (N,), places of the diagonal.
+        (N,), indices of the diagonal entries.
     indptr, indices
-        (N + 1,), (upper,), of that triangle as it was computed.
+        (N + 1,), (upper,), CSR pattern of the upper triangle as computed.
     given
-        (N,), the user's numbers of the rows there.
+        (N,), user's numbers of its rows.
     """
 
     crow: Int[Tensor, " N_plus_1"]
@@ -71,7 +71,7 @@ class Pattern:
 
     @classmethod
     def of(cls, upper: Any, numbering: Numbering | None = None) -> Pattern:
-        """That of a matrix from its upper triangle; without a numbering it is in the user's numbers."""
+        """Full pattern of an upper triangle, which without a numbering is in the user's numbers already."""
         count = upper.shape[0]
         given = np.arange(count) if numbering is None else numbering.given.numpy()
         given = given.astype(np.int32)
@@ -87,15 +87,15 @@ class Pattern:
         return cls(crow, col, whole.data, diagonal, upper.indptr, upper.indices, given)
 
     def is_of(self, upper: Any) -> bool:
-        """Whether it is that of a triangle: products leave out what is zero at some points, but not at others."""
+        """Whether this is the pattern of `upper`: products drop entries that are zero at some points only."""
         ours, theirs = (self.indptr, self.indices), (upper.indptr, upper.indices)
         return all(np.array_equal(x, y) for x, y in zip(ours, theirs, strict=True))
 
     def pair(self, upper: Any, *others: Any) -> SparsePair:
-        """K + iM as real matrices, the rows of K summing to zero; beside them others, such as the boundary's mass."""
+        """Unpack K + iM into real matrices, rows of K summing to zero, followed by others such as the boundary mass."""
         values = np.empty((2, len(self.order)))
         for value, part in zip(values, (upper.data.real, upper.data.imag), strict=True):
-            np.take(part.copy(), self.order, out=value, mode="clip")  # which is not buffered
+            np.take(part.copy(), self.order, out=value, mode="clip")  # this mode is not buffered
         values[0, self.diagonal] -= np.add.reduceat(values[0], self.crow.numpy()[:-1])
         for other in others:
             line: Any = sparse.coo_array((other + other.T) / 2)
@@ -110,14 +110,14 @@ class Pattern:
 
 @dataclass(frozen=True)
 class WeakPair:
-    """(K, M), and the pair of linear elements that is near it, None where it is the same.
+    """The pair (K, M), its P1 pair and its lumped mass.
 
     Attributes
     ----------
     matrices, linear
-        The pairs.
+        The high-order pair, and that of P1 elements near it; None where both are the same.
     mass
-        (N,), ℓ^d, positive, sums to the area; None for that of the operator's shape.
+        (N,), positive, sums to the area, ℓ^d; None for the mass of the operator's shape.
     """
 
     matrices: SparsePair
@@ -126,7 +126,7 @@ class WeakPair:
 
 
 ELEMENTS = {1: (2, (2,)), 2: (2, (2,)), 3: (2, (3, 2)), 4: (3, (4, 2)), 5: (4, (6, 4, 2))}
-"""Degree r of the elements, and degrees m of the fits of functions, best first, by the order p; above 5 as for 5."""
+"""Degree r of the elements and degrees m of the fits of functions, best first, for each order p; p > 5 as p = 5."""
 
 
 class BilinearForm(NamedTuple):
@@ -140,18 +140,18 @@ class BilinearForm(NamedTuple):
 
 @dataclass(frozen=True)
 class PairPlan:
-    """What is decided about the weak pair of a complex of d-simplices.
+    """Plan of the weak pair of a complex of d-simplices.
 
     Attributes
     ----------
     fits, curving
-        Of functions and of the surface at the vertices; of the cells.
+        Plans of the fits at the vertices, and of the curved cells.
     stars
-        (S, d + 1), simplices of local stars, of which an equal share counts.
+        (S, d + 1), simplices of local stars, each weighted by 1/(d + 1).
     shares
-        (F,), which part of each cell counts; None where all of them do.
+        (F,), fraction of each cell that is integrated; None for all of it.
     lowered
-        (L,), nodes beyond the vertices whose rows of P are linear where the mass of the vertices is found.
+        (L,), nodes that are not vertices and whose rows of P are linear for the lumped mass.
     """
 
     fits: FitPlan
@@ -162,16 +162,16 @@ class PairPlan:
 
     @cached_property
     def patterns(self) -> dict[str, Pattern]:
-        """Those of the matrices, by their names in `WeakPair`, once they have been evaluated."""
+        """Patterns of the matrices evaluated so far, by their names in `WeakPair`."""
         return {}
 
     def forms(self, fits: LocalFits, mesh: CurvedMesh | None = None) -> Forms:
-        """The elements from the fits at given points; `mesh` is where the cells are there, if it is known."""
+        """Elements from the fits at given points; `mesh` has the curved cells there, if they are known already."""
         mesh = self.curving.at(fits.points, self.fits, fits) if mesh is None else mesh
         return Forms.curved(self.fits, fits, self.curving, mesh, self.stars, self.shares)
 
     def at(self, fits: LocalFits, numbering: Numbering) -> WeakPair:
-        """The pair from the fits at given points, its matrices in the user's numbers."""
+        """Weak pair from the fits at given points, in the user's numbers."""
         mesh = self.curving.at(fits.points, self.fits, fits)
         return assembled_pair(self, fits, mesh, numbering, self.patterns)[0]
 
@@ -200,7 +200,7 @@ class PairPlan:
 
     @property
     def counts(self) -> Int[Tensor, "4 N"]:
-        """Of each vertex: degree of its fit, 0 if flat; why no higher, a place in `REASONS`; edges; curved edges."""
+        """Per vertex: degree of its fit (0 if flat), why no higher (index into `REASONS`), edges, curved edges."""
         fits, edges = self.fits, self.curving.nodes.edges
         ends = edges, edges[self.curving.curved]
         uses = [torch.bincount(e.flatten(), minlength=len(fits.degree)) for e in ends]
@@ -221,18 +221,18 @@ def mesh_pair(
     shares: Float[Tensor, " F"] | None = None,
     numbering: Numbering | None = None,
 ) -> tuple[PairPlan, WeakPair]:
-    """The pair of a mesh of d-simplices, from the fits of its vertices, with elements of degree r ≥ 2.
+    """Weak pair of a mesh of d-simplices, from the fits at its vertices, with elements of degree r ≥ 2.
 
-    Symmetric, K1 = 0, K ≥ 0, M > 0 whatever the fits are: rows of P sum to one, and it has full column rank. `degrees`
-    are those of the fits of functions, best first; `held` marks where a Dirichlet condition holds. Cells of which only
-    `shares` count may overlap, and have no boundary.
+    K and M are symmetric, K1 = 0, K ≥ 0 and M > 0 whatever the fits are, since the rows of P sum to one and P has full
+    column rank. `degrees` lists the degrees of the fits of functions, best first; `held` marks vertices with a
+    Dirichlet condition. Cells with `shares` may overlap, and have no boundary.
     """
     nodes = lagrange_nodes(cells, len(points), degree, closed=shares is not None)
     boundary = boundary_nodes(points, nodes, degrees, held)
     curving, *mesh = curve(points, fit_plan, fits, nodes, boundary, held)
     stars = cells[:0] if stars is None else stars
     plan = PairPlan(fit_plan, curving, stars, shares, torch.zeros(0, dtype=torch.int64))
-    pair, lowered = assembled_pair(plan, fits, mesh.pop(), numbering, {})  # which lets go of it
+    pair, lowered = assembled_pair(plan, fits, mesh.pop(), numbering, {})  # keeps no reference
     return replace(plan, lowered=lowered), pair
 
 
@@ -243,15 +243,15 @@ def assembled_pair(
     numbering: Numbering | None,
     patterns: dict[str, Pattern],
 ) -> tuple[WeakPair, Int[Tensor, " L"]]:
-    """The matrices in the user's numbers, the mass, and the rows of P that were lowered for it.
+    """Assemble the matrices in the user's numbers and the lumped mass; return also the rows of P lowered for it.
 
-    Patterns that are not known yet are found and kept.
+    Missing `patterns` are computed and added.
     """
     forms = plan.forms(fits, mesh)
     near, flat, p = forms.near(), forms.flat(), forms.prolongation
     boundary = boundary_mass(fits.points, plan.curving, mesh, p)
     blocks, nodes = [forms.blocks()], forms.nodes
-    del forms, mesh  # some of what is here is as large as the pair, and is let go of in time
+    del forms, mesh  # some of these are as large as the pair
     fits.let_go()
     elements = summed(blocks.pop(), nodes, p.shape[0])
     weights, beside = elements.imag.sum(axis=1), _row_sums(flat)
@@ -274,11 +274,10 @@ def positive_mass(
     plan: PairPlan,
     linear: Float[np.ndarray, " N"],
 ) -> tuple[Float[np.ndarray, " N"], Int[Tensor, " L"]]:
-    """Pᵀw, w = M_FE 1: weights of the vertices that integrate to high order and sum to the area.
+    """Lumped mass Pᵀw, w = M_FE 1: quadrature weights of high order at the vertices, which sum to the area.
 
-    Where one is below a tenth of that of linear elements, the rows of P that take from it are replaced by linear ones,
-    until none is; that ends, since linear rows take nothing from anybody. Also which rows these are, beyond the
-    vertices.
+    While a weight is below a tenth of that of P1 elements, the rows of P that contribute negatively to it are replaced
+    by linear ones; this terminates, since linear rows contribute nothing negative. Return also the nodes of these rows.
     """
     nodes, count, mass = plan.curving.nodes, p.shape[1], p.T @ weights
     taking, lowered = count + plan.lowered.numpy(), np.zeros(p.shape[0], dtype=bool)
@@ -301,13 +300,13 @@ def positive_mass(
 
 
 def _row_sums(upper: Any) -> Float[np.ndarray, " N"]:
-    """M1, from the upper triangle of K + iM."""
+    """Row sums M1 from the upper triangle of K + iM."""
     mass = upper.imag
     return mass.sum(axis=1) + mass.sum(axis=0) - mass.diagonal()
 
 
 def boundary_mass(points: Tensor, plan: CurvingPlan, mesh: CurvedMesh, p: Any) -> Any:
-    """∫ φ_i φ_j along the boundary, 1 at the end of a curve, lumped at coarse triangles; None for a closed shape."""
+    """Boundary mass ∫ φ_i φ_j, 1 at the end of a curve, lumped at coarse triangles; None for a closed shape."""
     nodes, shape = plan.nodes, simplex(plan.nodes.dim - 1, plan.nodes.degree)
     cell, elements = nodes.boundary()
     if len(cell) == 0:

@@ -1,4 +1,4 @@
-"""From values at the vertices to values at the nodes (`method.md`, section 9)."""
+"""Prolongation of functions from the vertices to the Lagrange nodes (`method.md`, section 9)."""
 
 from __future__ import annotations
 
@@ -19,10 +19,9 @@ from torchlb.geometry.vectors import at
 def prolongation(
     plan: FitPlan, fits: LocalFits, curving: CurvingPlan, mesh: CurvedMesh
 ) -> sparse.csr_array:
-    """P, (N + X, N): what the vertices' fits say at the nodes, weighted by barycentrics. Its rows sum to one.
+    """P, (N + X, N): fits of the vertices at the nodes, averaged by barycentric coordinates. Its rows sum to one.
 
-    Identity rows at the vertices, linear ones at flat nodes, and those of the boundary's own curves along it; a row is
-    the sum of those of all fits that its node asks.
+    Rows are those of the identity at the vertices, linear at flat nodes, and Lagrange weights along boundary curves.
     """
     count = len(fits.points)
     row, col, value, by_fit = _without_fits(count, curving, mesh)
@@ -78,7 +77,7 @@ def _by_fits(
 def _without_fits(
     count: int, curving: CurvingPlan, mesh: CurvedMesh
 ) -> tuple[Tensor, Tensor, Tensor, Bool[Tensor, " E"]]:
-    """(row, column, value) of the vertices, of flat nodes and of those along the boundary; and which ends are left."""
+    """(row, column, value) of vertices, flat nodes and boundary nodes, and the mask of pairs left to the fits."""
     vertices, ends = torch.arange(count), mesh.ends
     node, vertex, weight = mesh.boundary.entries
     bent, flat, by_fit = curving.bent[node], ~curving.bent[ends.node], curving.bent.clone()

@@ -1,9 +1,8 @@
-"""Linear algebra that knows nothing of shapes.
+"""Linear algebra, independent of shapes.
 
-`precision`: the numbers that rounding, memory and patience set. `checks`: functions are finite tensors. `kernels`: the
-two compiled loops. `sparse`: the product with a CSR matrix that layers differentiate through. `csr`: matrices and other
-tensors as they are stored. `factor`: sparse Cholesky and LU. `lanczos`: eigenpairs of a symmetric pencil.
-`conjugate_gradients`: solves with many right-hand sides. `two_grid`: their preconditioner. `exponential`: e^{tL}x by
-a Chebyshev or a rational series, with derivatives. `once`: an error for second derivatives, where there are none.
-`threads`: one thread for small tensors.
+`precision`: constants set by rounding, memory and computing time. `checks`: validation of tensors. `kernels`: the two
+compiled loops. `sparse`: differentiable products with CSR matrices. `csr`: stored matrices and tensors of points.
+`factor`: sparse Cholesky and LU. `lanczos`: eigenpairs of a symmetric pencil. `conjugate_gradients`: solves with many
+right-hand sides. `two_grid`: their preconditioner. `exponential`: e^{tL}x by a Chebyshev or a rational series, with
+derivatives. `once`: an error for second derivatives that do not exist. `threads`: one thread for small tensors.
 """

@@ -1,4 +1,4 @@
-"""What every product with functions on points asks of them: a tensor of real or complex numbers, all finite."""
+"""Validation of operators, and of functions on points: tensors of finite values."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from torchlb.errors import InputError, InputTypeError, first_few
 
 
 def check_tensor(f: object, what: str = "f") -> None:
-    """InputTypeError unless it is a tensor.
+    """Raise InputTypeError unless `f` is a tensor.
 
     >>> check_tensor([1.0])
     Traceback (most recent call last):
@@ -22,7 +22,7 @@ def check_tensor(f: object, what: str = "f") -> None:
 
 
 def check_operator(lb: object) -> None:
-    """InputTypeError unless it is an operator, as it is not where arguments are in another order.
+    """Raise InputTypeError unless `lb` is an operator; swapped arguments are the usual cause.
 
     >>> check_operator(torch.ones(3))  # doctest: +ELLIPSIS
     Traceback (most recent call last):
@@ -36,7 +36,7 @@ def check_operator(lb: object) -> None:
 
 
 def check_finite(f: Tensor, what: str = "f") -> None:
-    """InputError that names the points where f, (N,) or (…, N, C), is NaN or infinite; not in compiled code.
+    """Raise InputError where f, (N,) or (…, N, C), is NaN or infinite, naming the points; not in compiled code.
 
     >>> check_finite(torch.tensor([0.0, torch.nan, torch.inf]))  # doctest: +ELLIPSIS
     Traceback (most recent call last):
@@ -45,7 +45,7 @@ def check_finite(f: Tensor, what: str = "f") -> None:
     if torch.compiler.is_compiling():
         return
     total = f.detach().sum().item()
-    if total - total == 0:  # else it may have left the range of numbers
+    if total - total == 0:  # otherwise the sum may have overflowed
         return
     bad = (~f.isfinite()).nonzero()[:, max(f.ndim - 2, 0)].unique()
     if len(bad):

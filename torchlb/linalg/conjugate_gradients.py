@@ -22,15 +22,15 @@ def conjugate_gradients(
     tolerance: float = 1e-10,
     max_steps: int = 1000,
 ) -> tuple[Float[Tensor, "N C"], int]:
-    """A⁻¹b for a symmetric A ≥ 0, and the number of steps; each column has its own step lengths.
+    """Return A⁻¹b for a symmetric A ≥ 0, and the number of steps; each column has its own step lengths.
 
-    Ends where the residuals r have √(rᵀBr) ≤ `tolerance` times that of b, B the preconditioner: an estimate of the
-    error in the norm of A, relative to the solution. b has to be in the range of A.
+    Iterations stop when √(rᵀBr) ≤ `tolerance` √(bᵀBb) for every residual r, B the preconditioner, which estimates the
+    relative error in the norm of A. b has to be in the range of A.
 
     Raises
     ------
     DiffusionError
-        Where that is not reached in `max_steps`, and for a b that is not finite.
+        If that is not reached within `max_steps`, or b is not finite.
 
     >>> a = torch.tensor([[2.0, 1.0], [1.0, 3.0]])
     >>> x, steps = conjugate_gradients(lambda v: a @ v, torch.tensor([[3.0], [4.0]]), lambda r: r, tolerance=1e-5)

@@ -1,7 +1,7 @@
 """Stored tensors as modules: records with a row for each point, and sparse matrices on one pattern.
 
-What is stored of an operator is made of these two. `.to`, copies and `state_dict` are theirs by `nn.Module`; a state of
-any size loads into them, and they are joined to those of a batch, and split again, once for all that is stored.
+The stored data of an operator consists of these two. `.to`, copies and `state_dict` come from `nn.Module`; a state of
+any size loads into them, and they are joined to batches and split again.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from torchlb.linalg.sparse import csr_product, csr_tensor, to_scipy, transpose_p
 
 
 def starts(counts: Sequence[int]) -> list[int]:
-    """Where each of several blocks starts.
+    """Start of each of several consecutive blocks.
 
     >>> starts([3, 2, 4])
     [0, 3, 5]
@@ -31,7 +31,7 @@ def starts(counts: Sequence[int]) -> list[int]:
 
 
 class Tensors(nn.Module):
-    """Plain buffers by name, which take those of a state whatever their size: they are data, not parameters."""
+    """Plain buffers by name, which load a state of any size: they are data, not parameters."""
 
     def __init__(self, tensors: Mapping[str, Tensor], *, persistent: bool = True) -> None:
         super().__init__()
@@ -39,7 +39,7 @@ class Tensors(nn.Module):
             self.register_buffer(name, tensor, persistent=persistent)
 
     def __getattr__(self, name: str) -> Any:
-        """A buffer or a part. Not by `nn.Module`, for whose buffers `torch.compile` makes a graph of every size."""
+        """Buffer or submodule, not by `nn.Module`, for whose buffers `torch.compile` makes a graph of every size."""
         for kind in ("_buffers", "_modules"):
             held = self.__dict__.get(kind, {})
             if name in held:
@@ -48,7 +48,7 @@ class Tensors(nn.Module):
 
     @property
     def tensors(self) -> dict[str, Tensor]:
-        """All buffers by name, those of parts and those that share their memory, too."""
+        """All buffers by name, including those of submodules and those that share memory."""
         return dict(self.named_buffers(remove_duplicate=False))
 
     def _load_from_state_dict(self, state_dict: Any, prefix: str, *given: Any) -> None:  # pyright: ignore[reportIncompatibleMethodOverride]
@@ -60,14 +60,14 @@ class Tensors(nn.Module):
 
 
 class Record(Tensors):
-    """Tensors with a row for each point; those of a batch have the rows of its shapes below each other.
+    """Tensors with a row for each point; those of a batch concatenate the rows of its shapes.
 
     Parameters
     ----------
     tensors
         (N, …), of any type.
     persistent
-        Whether `state_dict` has them.
+        Whether `state_dict` includes them.
 
     >>> record = Record({"order": torch.tensor([3, 3, 0])})
     >>> [part.order.tolist() for part in record.split([2, 1])]
@@ -76,24 +76,24 @@ class Record(Tensors):
 
     @staticmethod
     def join(records: Sequence[Tensors]) -> Record:
-        """The record of a batch."""
+        """Record of a batch."""
         names = records[0].tensors
         return Record({n: torch.cat([each.tensors[n] for each in records]) for n in names})
 
     def split(self, sizes: Sequence[int]) -> list[Record]:
-        """The records of the shapes of a batch with so many points."""
+        """Records of the shapes of a batch, with `sizes` points."""
         rows = zip(*(tensor.split(list(sizes)) for tensor in self.tensors.values()), strict=True)
-        copies = [map(torch.clone, row) for row in rows]  # which do not hold the batch
+        copies = [map(torch.clone, row) for row in rows]  # do not keep the batch alive
         return [Record(dict(zip(self.tensors, row, strict=True))) for row in copies]
 
 
 class Csr(Tensors):
-    """Sparse matrices (N, N) on one pattern, a channel of values each; of a batch block-diagonal.
+    """Sparse matrices (N, N) on one pattern, a channel of values each; block-diagonal for a batch.
 
     Parameters
     ----------
     crow, col
-        (N + 1,), (nnz,), CSR with ascending columns; by default of no rows.
+        (N + 1,), (nnz,), CSR with ascending columns; no rows by default.
     values
         (c, nnz).
     order_t
@@ -128,7 +128,7 @@ class Csr(Tensors):
 
     @staticmethod
     def with_transpose(crow: Tensor, col: Tensor, values: Tensor) -> Csr:
-        """Matrices that are not symmetric."""
+        """Build matrices that are not symmetric."""
         return Csr(crow, col, values, transpose_pattern(crow, col, len(crow) - 1)[2])
 
     def _transpose(self, order_t: Tensor | None = None) -> None:
@@ -156,11 +156,11 @@ class Csr(Tensors):
         return [self.crow, self.col, self.crow_t, self.col_t, self.order_t]
 
     def tensor(self, channel: int) -> Tensor:
-        """A matrix as a torch sparse CSR tensor, which shares its memory."""
+        """Matrix of a channel as a torch sparse CSR tensor that shares its memory."""
         return csr_tensor(self.crow, self.col, self.values[channel], self.num_rows)
 
     def to_scipy(self, channel: int) -> sparse.csr_array:
-        """A matrix as a scipy CSR matrix on the CPU."""
+        """Matrix of a channel as a scipy CSR matrix on the CPU."""
         shape = self.num_rows, self.num_rows
         return to_scipy(self.crow, self.col, self.values[channel], shape)
 
@@ -172,7 +172,7 @@ class Csr(Tensors):
         transposed: bool = False,
         dtype: torch.dtype | None = None,
     ) -> Tensor:
-        """A matrix, or its transpose, times f: (N,), (N, C) or (B, N, C), of that shape; types as in `csr_product`.
+        """Product of a matrix, or its transpose, with f: (N,), (N, C) or (B, N, C); types as in `csr_product`.
 
         Parameters
         ----------
@@ -181,9 +181,9 @@ class Csr(Tensors):
         f
             Dense, of any floating type.
         transposed
-            Whether it is the transpose.
+            Whether to multiply by the transpose.
         dtype
-            To which the values are cast before; None for their own.
+            Type that the values are cast to first; None for their own.
 
         Raises InputError for another shape.
         """
@@ -204,7 +204,7 @@ class Csr(Tensors):
 
     @staticmethod
     def join(records: Sequence[Csr]) -> Csr:
-        """Block-diagonal, with as many channels as one of them has: zeros where another has fewer."""
+        """Block-diagonal matrices with the largest number of channels; missing ones are zero."""
         most = max(len(each.values) for each in records)
         first = starts([len(each.col) for each in records])
         rows = starts([each.num_rows for each in records])

@@ -1,14 +1,13 @@
 r"""e^{tL}x of a symmetric L ≤ 0 for many channels, each with its own time, in one differentiable operation.
 
-The spectrum lies in [−R, 0]. Both expansions e^{tL}x = Σ_k c_k(t) v_k have vectors v_k that all channels and times
-share (`method.md`, section 8):
+The spectrum lies in [−R, 0]. All channels and times share the vectors v_k of e^{tL}x = Σ_k c_k(t) v_k (`method.md`, 8):
 
 - a Chebyshev series, v_k = T_k(1 + 2L/R) x and c_k = 2 e^{−tR/2} I_k(tR/2), about √(2tR ln 1/ε) products;
 - where that would be more than `PRODUCTS`, as slivers make the spectrum long, a Chebyshev series of Z = (1 − γL)⁻¹: in
   z = 1/(1 + γλ), between 0 and 1, e^{−tλ} is smooth for all t between 5γ and 50γ, and takes about 20 solves.
 
-In both constants are kept exactly. The derivatives come from the expansion w_k of the gradient g: Σ c_k w_k in x, and
-Σ c_k'(t) ⟨w_k, x⟩ in t.
+Both preserve constants exactly. Derivatives use the expansion w_k of the gradient g: Σ c_k w_k in x, and Σ c_k'(t)
+⟨w_k, x⟩ in t.
 """
 
 from __future__ import annotations
@@ -32,18 +31,18 @@ from torchlb.linalg.precision import AT_ONCE, NEGLIGIBLE, ROUNDS, TINY
 from torchlb.linalg.sparse import multiply
 
 PRODUCTS = 5_000
-"""Products beyond which a few factors are quicker."""
+"""Number of products beyond which a few factorisations are faster."""
 SHORTEST = 5.0
-"""t/γ of the shortest time that shares a pole γ, a power of ten; the longest is ten times longer."""
+"""Ratio t/γ of the shortest time that shares a pole γ, a power of ten; the longest is ten times longer."""
 POINTS = 256
-"""Points of the interpolation that gives the coefficients of rational functions."""
+"""Number of Chebyshev points that the coefficients of rational functions are interpolated at."""
 Term = tuple[tuple[slice, Any], Tensor, np.ndarray, np.ndarray]
 
 
 def spectral_radius(stiffness: sparse.csr_array, mass: Float[np.ndarray, " N"]) -> float:
-    """A bound of the eigenvalues of D⁻¹K, K positive semidefinite and D the diagonal mass, in 1/ℓ².
+    """Upper bound of the eigenvalues of D⁻¹K, K positive semidefinite and D the diagonal mass, in 1/ℓ².
 
-    max_i (|K|x)_i / (Dx)_i for any x > 0: so say Collatz and Wielandt of |K|, whose spectral radius is not below K's.
+    It is the Collatz–Wielandt bound max_i (|K|x)_i / (Dx)_i, x > 0, of D⁻¹|K|, whose spectral radius is no smaller.
 
     >>> path = sparse.csr_array([[1.0, -1.0], [-1.0, 1.0]])
     >>> spectral_radius(path, np.ones(2))
@@ -53,7 +52,7 @@ def spectral_radius(stiffness: sparse.csr_array, mass: Float[np.ndarray, " N"]) 
     for _ in range(ROUNDS):
         y = size @ x / mass
         radius = min(radius, float((y / x).max(initial=0.0)))
-        x = np.sqrt(x) * np.sqrt(y)  # the mean keeps it from turning in circles
+        x = np.sqrt(x) * np.sqrt(y)  # the geometric mean prevents oscillation
         x = np.maximum(x / (x.max(initial=0.0) or 1.0), NEGLIGIBLE)
     return radius
 
@@ -74,13 +73,13 @@ def heat(
     pattern
         [crow, col] of L.
     values
-        Of L, 1/ℓ²; no gradient goes there.
+        Values of L, 1/ℓ²; they get no gradient.
     time
         t ≥ 0, ℓ².
     radius
         R, in float64 on the CPU: a tensor, since a number would be compiled anew for every operator.
     tolerance
-        Of the result, relative to x.
+        Error of the result, relative to x.
     sizes
         Numbers of rows of the diagonal blocks of L; (N,) for one shape.
     """
@@ -165,7 +164,7 @@ def _terms(
     tolerance: float,
     sizes: Sequence[int],
 ) -> Iterator[Term]:
-    """The terms ((rows, columns), v_k, c_k, c_k') of the shorter expansion; it needs values that a trace has not."""
+    """Terms ((rows, columns), v_k, c_k, c_k') of the shorter expansion; the choice cannot be traced."""
     times = time.detach().double().cpu().numpy()
     if len(times) == 0 or len(x) == 0:
         return iter(())
@@ -175,13 +174,13 @@ def _terms(
 
 
 def _estimate(scaled: float, tolerance: float) -> float:
-    """Products that the Chebyshev series takes for tR, from above."""
+    """Upper bound on the products that the Chebyshev series takes for tR."""
     digits = log(1 / tolerance)
     return sqrt(2 * digits * scaled) + 2 * digits + 8
 
 
 def chebyshev_coefficients(scaled: np.ndarray, tolerance: float) -> tuple[np.ndarray, np.ndarray]:
-    """Coefficients c_k for tR, and their derivatives in tR, (K, C), as few as sum to less than the tolerance beyond.
+    """Coefficients c_k for tR and their derivatives in tR, (K, C), up to a tail that sums to less than the tolerance.
 
     >>> chebyshev_coefficients(np.array([0.0]), 1e-7)[0].tolist()
     [[1.0], [0.0]]
@@ -237,7 +236,7 @@ def chebyshev_vectors(
 def _blocks(
     crow: Tensor, col: Tensor, values: Tensor, x: Tensor, sizes: Sequence[int]
 ) -> Iterator[tuple[slice, tuple[Tensor, Tensor, Tensor]]]:
-    """Diagonal blocks (rows, (crow, col, values)): on the CPU as many together as stay in its cache, else all."""
+    """Yield diagonal blocks (rows, (crow, col, values)): on the CPU as many as stay in its cache, else all at once."""
     limit = AT_ONCE if x.device.type == "cpu" else len(x)
     ends = list(accumulate(sizes))
     start = 0
@@ -274,14 +273,14 @@ def _rational(
 
 
 def poles(times: np.ndarray) -> Iterator[tuple[float, np.ndarray]]:
-    """(γ, which times share it) for the positive times: powers of ten, so that those of the next step share them."""
+    """Yield (γ, indices of its times) for positive times; γ is a power of ten, shared by similar times."""
     level = np.floor(np.log10(np.where(times > 0, times / SHORTEST, 1.0)))
     for exponent in np.unique(level[times > 0]).tolist():
         yield 10.0**exponent, np.flatnonzero((level == exponent) & (times > 0))
 
 
 def rational_coefficients(ratios: np.ndarray, tolerance: float) -> tuple[np.ndarray, np.ndarray]:
-    """c_k of T_k(2Z − 1) for several t/γ, and their derivatives, (K, C); constants, z = 1, stay exactly.
+    """Coefficients c_k of T_k(2Z − 1) for several t/γ, and their derivatives, (K, C); exact for constants, z = 1.
 
     >>> c, slope = rational_coefficients(np.array([10.0]), 1e-7)
     >>> bool(abs(np.polynomial.chebyshev.chebval(2 / (1 + 0.3) - 1, c[:, 0]) - np.exp(-10 * 0.3)) < 1e-7)
@@ -295,7 +294,7 @@ def rational_coefficients(ratios: np.ndarray, tolerance: float) -> tuple[np.ndar
 
 @lru_cache(maxsize=4096)
 def _coefficients(ratio: float, tolerance: float) -> tuple[np.ndarray, np.ndarray]:
-    """Of one ratio, zero from where they are small on."""
+    """Coefficients for one ratio, with a negligible tail set to zero."""
     decay = 2 / (1 + np.cos(np.pi * (np.arange(POINTS) + 0.5) / POINTS)) - 1
     flow = np.exp(-ratio * decay)
     c, slope = np.asarray(dct(np.stack([flow, -decay * flow]))) / POINTS

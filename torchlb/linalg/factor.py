@@ -1,4 +1,4 @@
-"""Sparse factors: Cholesky of what is symmetric and positive definite, LU of nearly symmetric patterns."""
+"""Sparse factors: Cholesky of symmetric positive definite matrices, LU of nearly symmetric patterns."""
 
 from __future__ import annotations
 
@@ -15,9 +15,9 @@ from torchlb.errors import InputError
 from torchlb.linalg.precision import LOW, ROUNDING
 
 COLUMNS = {"cpu": 16, "cuda": 128}
-"""Right-hand sides that cholespy takes at once: on the CPU a fifth of the time is saved, on CUDA it takes no more."""
+"""Right-hand sides per call of cholespy: on the CPU they save a fifth of the time, on CUDA 128 is the limit."""
 TRIALS = 4
-"""Random right-hand sides by which a matrix is judged."""
+"""Random right-hand sides of the test for singular matrices."""
 
 
 def factorized(matrix: sparse.csc_array, threshold: float) -> SuperLU:
@@ -31,9 +31,9 @@ def factorized(matrix: sparse.csc_array, threshold: float) -> SuperLU:
 
 
 def cholesky(matrix: Any) -> Factor:
-    """Factor of a sparse matrix, (N, N), scipy's or what scipy takes, for right-hand sides on any device.
+    """Factor of a sparse matrix, (N, N), scipy's or anything scipy accepts, for right-hand sides on any device.
 
-    By CHOLMOD (`cholespy`), 2.5 times faster than SuperLU and 6 times in the solves. SuperLU takes over where cholespy
+    CHOLMOD (`cholespy`) is 2.5 times faster than SuperLU, and 6 times in the solves. SuperLU takes over where cholespy
     is not installed or the matrix is not symmetric and positive definite. InputError for a complex matrix or right-hand
     side, and for a matrix that is singular, or so close to singular that the rounding of its entries decides.
 
@@ -69,12 +69,12 @@ def _check_real(name: str, is_complex: bool) -> None:
 
 
 class Factor:
-    """A⁻¹ of a sparse matrix; factored in float64 once for every kind of device that a right-hand side is on.
+    """A⁻¹ of a sparse matrix, factored in float64, once for each device of a right-hand side.
 
     Attributes
     ----------
     is_cholesky
-        Whether it is a Cholesky factor, the matrix thus positive definite.
+        Whether the factor is Cholesky's, and the matrix thus positive definite.
     """
 
     def __init__(self, matrix: sparse.csr_array) -> None:
@@ -85,10 +85,10 @@ class Factor:
         self._solver(torch.device("cpu"))
 
     def check(self, precision: float) -> None:
-        """InputError if the matrix is singular, its entries known to a relative `precision`.
+        """Raise InputError if the matrix is singular, its entries known to a relative `precision`.
 
-        Of a random b, whatever x is, b − Ax keeps the part along a left null vector, which is |g|/√N of |b| for a
-        normal g. Where the null vector is one to rounding alone, x is so large that it hides in the rounding of |A||x|.
+        For a random b and any x, b − Ax keeps the component of b along a left null vector, |g|/√N of |b| for a normal
+        g. Where that vector is null only up to rounding, a large x hides the component in the rounding of |A||x|.
         """
         b = np.random.default_rng(0).standard_normal((len(self._matrix.indptr) - 1, TRIALS))
         x = self.solve(torch.from_numpy(b)).numpy()
@@ -122,7 +122,7 @@ class Factor:
         try:
             if self.is_cholesky:
                 return _cholespy(self._matrix, device)
-        except (ImportError, ValueError):  # not there; not positive definite
+        except (ImportError, ValueError):  # not installed; not positive definite
             self.is_cholesky = False
         return factorized(sparse.csc_array(self._matrix), 1e-1)
 

@@ -1,7 +1,7 @@
-"""The two loops that NumPy, SciPy and torch have no fast form of, compiled by numba.
+"""Two loops without a fast form in NumPy, SciPy or torch, compiled by numba.
 
-Whoever needs one imports it where it is called, so that numba is not loaded by an import of the package. The signatures
-are the only types that are ever compiled for; what is compiled is kept beside this file, or in the user's cache.
+Callers import them where they call them, so that importing the package does not load numba. Each is compiled for one
+signature only, and cached beside this file, or in the user's cache.
 """
 
 from __future__ import annotations
@@ -13,17 +13,17 @@ import numpy as np
 from numba import njit
 
 LANES = 64
-"""Left inverses at a time; 16 to 128 take about as long."""
+"""Left inverses computed together; 16 to 128 take about as long."""
 
 
 def _kept(signature: str) -> Callable[[Any], Any]:
-    """Compile for one signature, and keep that on disk for later processes, if there is a place to write to."""
+    """Compile for one signature, cached on disk for later processes if there is a place to write to."""
 
     def compiled(function: Any) -> Any:
         options = {"error_model": "numpy", "nogil": True}
         try:
             return njit(signature, cache=True, **options)(function)
-        except RuntimeError:  # numba's, for want of such a place
+        except RuntimeError:  # numba finds no place to write to
             return njit(signature, **options)(function)
 
     return compiled
@@ -44,7 +44,7 @@ def _product(x: np.ndarray, y: np.ndarray, total: np.ndarray) -> None:
 @njit(error_model="numpy")
 @no_type_check
 def _subtract(factor: np.ndarray, x: np.ndarray, y: np.ndarray) -> None:
-    """Take so much of one column from another."""
+    """Subtract multiples of columns from others."""
     size, lanes = x.shape
     for k in range(size):
         for a in range(lanes):
@@ -61,16 +61,16 @@ def _scale(x: np.ndarray, factor: np.ndarray) -> None:
 
 
 def left_inverse(columns: np.ndarray, root: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """C = R⁻¹Qᵀ√ω of √ω V = QR by the modified Gram–Schmidt process, and the norms of R⁻¹.
+    """C = R⁻¹Qᵀ√ω of √ω V = QR by modified Gram–Schmidt, and the norms of R⁻¹.
 
-    `LANES` matrices at a time lie one beside the other in memory, so that one instruction serves several.
+    `LANES` matrices are interleaved in memory, so that loops over them are vectorised.
 
     Parameters
     ----------
     columns
-        (B, M, K) The columns of every V, one after the other.
+        (B, M, K), columns of every V, each contiguous.
     root
-        (B, K) √ω.
+        (B, K), √ω.
     """
     batch, terms, size = columns.shape
     lanes = max(min(LANES, batch), 1)
@@ -80,7 +80,7 @@ def left_inverse(columns: np.ndarray, root: np.ndarray) -> tuple[np.ndarray, np.
     return found, condition
 
 
-# Whatever is allocated in compiled code takes a tenth of a second to compile. @no_type_check keeps checkers off.
+# Any allocation in compiled code takes a tenth of a second to compile. @no_type_check keeps checkers off.
 @_kept(
     "void(float64[:, :, ::1], float64[:, ::1], float64[:, :, ::1], float64[:, :, ::1], float64[:, ::1], "
     "float64[:, :, ::1], float64[::1])"
@@ -142,10 +142,11 @@ def _distance(
     alignment: float,
     room: np.ndarray,
 ) -> float:
-    """Square of the distance, ℓ², or −1 where `geometry.compatibility.compatible` refuses the other.
+    """Squared distance, ℓ², or −1 where `geometry.compatibility.compatible` rejects the other point.
 
-    C = AᵀB of the frames A, B of the normal spaces has those angles that the tangent spaces have; and σ_min(C) is as
-    large as the alignment a if CᵀC − a²I = LDLᵀ with D > 0. There is `room` for C and CᵀC.
+    With frames A, B of the normal spaces, the singular values of C = AᵀB are the cosines of the principal angles, which
+    are those of the tangent spaces; σ_min(C) exceeds the alignment a if CᵀC − a²I = LDLᵀ with D > 0. `room` is work
+    space for C and CᵀC.
     """
     dim, codimension = normals.shape[1:]
     square, height, cosine = 0.0, 0.0, 0.0
@@ -185,7 +186,7 @@ def _distance(
 @njit
 @no_type_check
 def _nearest_first(square: np.ndarray, ball: np.ndarray, total: int, size: int) -> int:
-    """Sort so that the `size` nearest come first, equal ones by their number; how many these are."""
+    """Insertion sort of the `size` nearest, ties by their number; return how many these are."""
     kept = 0
     for a in range(total):
         key, point, place = square[a], ball[a], kept
@@ -221,14 +222,15 @@ def k_hop_neighborhoods(
     points
         (N, n).
     normals
-        (N, n, n − d) Orthonormal frames of the normal spaces.
+        (N, n, n − d), orthonormal frames of the normal spaces.
     sides
-        (N, n) A point is refused whose vector is opposed to the centre's; zero where no sides are known.
+        (N, n), side vectors: a point opposed to the centre's is rejected; zero where no sides are known.
     indptr, indices
-        The graph's rows, without loops.
-    centers : (B,)
+        CSR pattern of the graph, without loops.
+    centers
+        (B,).
     wanted, rings
-        A ball grows ring by ring until it holds so many points, or is so many rings wide.
+        Number of points, or of rings, at which a neighbourhood stops growing.
     slope, alignment
         Bounds of `compatible`.
     """
@@ -264,7 +266,7 @@ def _k_hop_neighborhoods(
     index: np.ndarray,
     count: np.ndarray,
 ) -> None:
-    """A point was `seen` in the last row, plus one, that it came by in."""
+    """Breadth-first search; `seen` holds the last row, plus one, that reached a point."""
     size = index.shape[1]
     for row in range(len(centers)):
         center = centers[row]

@@ -15,16 +15,16 @@ from torchlb.linalg.factor import Factor
 from torchlb.linalg.precision import LOW, ROUNDS, SMALL
 
 BLOCK = 16
-"""Vectors at a time, the largest multiplicity that is surely found; 8 to 32 take about the same time."""
+"""Block size, the largest multiplicity that is surely found; 8 to 32 take about the same time."""
 CHECK = 2
-"""Blocks between two looks at the residuals."""
+"""Blocks between two checks of the residuals."""
 
 Inverse = Callable[[Float[np.ndarray, "N C"]], Float[np.ndarray, "N C"]]
 Pairs = tuple[Float[np.ndarray, " k"], Float[np.ndarray, "N k"]]
 
 
 class ShiftTooLarge(Exception):
-    """The shift is far above the eigenvalues asked for, the last of which is `bound` or less."""
+    """The shift is far above the requested eigenvalues, the largest of which is at most `bound`."""
 
     def __init__(self, bound: float) -> None:
         super().__init__(f"eigenvalues up to {bound:.3g}")
@@ -32,7 +32,7 @@ class ShiftTooLarge(Exception):
 
 
 def inverse(matrix: sparse.csr_array) -> Inverse:
-    """The product with A⁻¹, by a Cholesky factor."""
+    """Product with A⁻¹, by a Cholesky factor."""
     factor = Factor(sparse.csr_array(matrix))
     return lambda b: factor.solve(torch.from_numpy(b)).numpy()
 
@@ -44,10 +44,10 @@ def lanczos_of_pair(
     shift: float,
     **settings: Any,
 ) -> tuple[Inverse, Pairs]:
-    """A product with (K + shift M)⁻¹, and what `lanczos` finds with it; from the given shift on downwards.
+    """Product with (K + shift M)⁻¹, and the eigenpairs by `lanczos`; the shift is lowered where necessary.
 
-    On a shape as narrow as a ribbon, eigenvalues are those of a curve, far below the inverse of its area. The shift
-    comes down to them there, but not below the rounding of K.
+    Eigenvalues of a shape as narrow as a ribbon are those of a curve, far below the inverse of its area. The shift is
+    lowered to them there, but not below the rounding of K.
     """
     rounding = float(np.finfo(float).eps) * float(stiffness.diagonal().max())
     least = rounding / float(mass_matrix.diagonal().max())
@@ -70,21 +70,21 @@ def lanczos(
     null: Float[np.ndarray, " N"] | None = None,
     least: float = np.inf,
 ) -> Pairs:
-    """The k smallest eigenpairs but `null`, ascending and M-orthonormal, and `more` that are less accurate.
+    """The k smallest eigenpairs except `null`, ascending and M-orthonormal, and `more` less accurate ones.
 
-    Krylov space of (K + shift M)⁻¹M from random vectors, fixed ones, orthogonalised in full; no restarts.
+    The Krylov space of (K + shift M)⁻¹M from fixed pseudo-random vectors is orthogonalised in full, without restarts.
 
     Parameters
     ----------
     solve, mass_matrix
         Product with (K + shift M)⁻¹, K positive semidefinite, (N, N); and M, positive definite.
     shift, least
-        Small and positive, in the unit of λ, and the smallest that is worth trying instead.
+        Small positive shift, in the unit of λ, and the smallest one worth trying instead.
     tolerance
-        Of the residuals in the M-norm, relative to 1/(λ + shift); eigenvalues are off by about its square.
+        Bound on the residuals in the M-norm, relative to 1/(λ + shift); the error of eigenvalues is about its square.
 
-    Raises ShiftTooLarge if `LOW` times the shift serves better, and `least` allows that; EigenbasisError if N
-    vectors do not suffice, or `ROUNDS` times those asked for.
+    Raises ShiftTooLarge if `LOW` times the shift serves better, and `least` allows that; EigenbasisError if N vectors
+    do not suffice, or `ROUNDS` times those requested.
     """
     size, count = len(mass_matrix.diagonal()), k + more
     generator, first = np.random.default_rng(0), int(null is not None)
@@ -122,7 +122,7 @@ def lanczos(
 
 
 def _orthogonalise(z: np.ndarray, basis: np.ndarray, dual: np.ndarray, passes: int) -> np.ndarray:
-    """Take from the rows of z, in place, their parts in the basis; the coefficients."""
+    """Orthogonalise the rows of z against the basis, in place; return the coefficients."""
     total = np.zeros((len(z), len(basis)))
     for _ in range(passes):
         coefficients = z @ dual.T
@@ -140,7 +140,7 @@ def _combined(basis: np.ndarray, y: np.ndarray, tolerance: float) -> np.ndarray:
 def _orthonormal(
     z: np.ndarray, mass_matrix: sparse.csr_array
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Rows made M-orthonormal, their products with M, and R with z = Rᵀ × rows; LinAlgError if they are dependent."""
+    """M-orthonormal rows, their products with M, and R with z = Rᵀ × rows; LinAlgError if z is dependent."""
     mz = np.ascontiguousarray((mass_matrix @ np.ascontiguousarray(z.T)).T)
     lower = np.linalg.cholesky(z @ mz.T)
     back = linalg.inv(lower)

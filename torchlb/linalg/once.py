@@ -1,4 +1,4 @@
-"""Derivatives that exist once."""
+"""Operations that are differentiable once."""
 
 from __future__ import annotations
 
@@ -13,10 +13,10 @@ from torchlb.errors import DerivativeError
 
 
 def once_differentiable(backward: Callable[..., Any]) -> Callable[..., Any]:
-    """As torch's decorator of that name, but whoever asks for second derivatives gets the error whichever way he asks.
+    """Like torch's decorator of that name, but second derivatives raise an error however they are requested.
 
-    Torch's error stands at a leaf of its own, which `torch.autograd.grad` and `functional.hessian` do not come to on
-    their way to an input: they take the second derivative for zero.
+    Torch attaches its error to a separate leaf, which `torch.autograd.grad` and `functional.hessian` do not visit on
+    their way to an input: they return a second derivative of zero.
     """
 
     @wraps(backward)
@@ -32,7 +32,7 @@ def once_differentiable(backward: Callable[..., Any]) -> Callable[..., Any]:
 
 
 class _Last(torch.autograd.Function):
-    """Its first argument, which depends on the others in a way that cannot be differentiated."""
+    """Identity of the first argument, with a dependence on the others that cannot be differentiated."""
 
     @staticmethod
     def forward(ctx: Any, value: Tensor, *inputs: Tensor) -> Tensor:  # pyright: ignore[reportIncompatibleMethodOverride]

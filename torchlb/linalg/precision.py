@@ -1,43 +1,43 @@
-"""What rounding, memory and patience allow: the numbers that all rooms share."""
+"""Constants set by rounding, memory and computing time, shared by all packages."""
 
 from __future__ import annotations
 
 import numpy as np
 
 EPS = float(np.finfo(float).eps)
-"""Rounding of one number in float64, 2e-16."""
+"""Machine epsilon of float64, 2e-16."""
 ROUNDING: float = EPS**0.75
-"""Share of its terms that a sum of thousands may be off by, 2e-12."""
+"""Relative rounding error that a sum of thousands of terms may have, 2e-12."""
 ROOT_EPS: float = EPS**0.5
-"""Half of the digits, 1.5e-8: what is smaller is gone in a square, and no answer has to be more accurate."""
+"""Half of the digits, 1.5e-8: anything smaller is lost in a square, and no result has to be more accurate."""
 TINY = float(np.finfo(float).tiny)
-"""Least divisor, which keeps 0/0 at 0."""
+"""Smallest divisor, with which 0/0 is 0."""
 
 NEGLIGIBLE = 1e-6
-"""Share of a quantity that no result shows; a volume, a spread or a residual below it counts as none."""
+"""Relative size that affects no result; a volume, a spread or a residual below it counts as zero."""
 SINGLE = 1e-5
-"""What single precision is good for: error of solves in float32, and share of lengths that rounding to it makes."""
+"""Accuracy of single precision: error of solves in float32, and relative error of lengths that are rounded to it."""
 SMALL = 1e-3
-"""Share of a quantity that changes a result by less than the mesh does."""
+"""Relative change that affects a result by less than the mesh does."""
 LOW = 0.1
-"""Share of what is usual below which something is poor, and of a shape from which on a warning names it."""
+"""Fraction of the usual value below which a quantity is poor, and of a shape from which on a warning is issued."""
 
 BYTES = 2**24
-"""Size of the arrays that are worked on: smaller ones are mostly overhead, larger ones leave the processor's cache."""
+"""Size of work arrays: smaller ones are mostly overhead, larger ones exceed the processor's cache."""
 AT_ONCE = 2**13
-"""Points, elements or rows of a matrix that are worked on together; 2¹¹ to 2¹⁸ take the same time."""
+"""Points, elements or rows of a matrix that are processed together; 2¹¹ to 2¹⁸ take the same time."""
 DENSE = 600
 """Unknowns up to which a dense eigensolver is as fast."""
 LARGEST_FACTORED = 100_000
-"""Unknowns beyond which an iteration takes the place of sparse factors, whose memory grows faster than the points."""
+"""Unknowns beyond which iterations replace sparse factors, whose memory grows faster than the number of points."""
 ROUNDS = 20
-"""Restarts of an iteration, after which it has failed; two or three suffice where things are well."""
+"""Restarts after which an iteration has failed; two or three suffice as a rule."""
 STEPS = 500
-"""Steps of a Krylov method between restarts at most; a tenth suffices where things are well."""
+"""Largest number of steps of a Krylov method between restarts; a tenth suffices as a rule."""
 
 
 def rows_at_once(size: int) -> int:
-    """Rows of so many numbers that fit into `BYTES`, at least 64.
+    """Number of rows of `size` numbers that fit into `BYTES`, at least 64.
 
     >>> rows_at_once(2**10)
     2048

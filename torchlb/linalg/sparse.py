@@ -1,4 +1,4 @@
-"""The sparse product that layers differentiate through, on plain tensors.
+"""Differentiable products of sparse matrices, on plain tensors.
 
 A sparse CSR tensor as a buffer breaks `deepcopy`, autocast and second derivatives, and its native backward is slow.
 Here the matrix is `crow, col, values`, the transpose's pattern is computed once, and two operations, whose derivatives
@@ -27,7 +27,7 @@ def transpose_pattern(
     num_cols: int,
     order: Int[Tensor, " nnz"] | None = None,
 ) -> tuple[Int[Tensor, " cols_plus_1"], Int[Tensor, " nnz"], Int[Tensor, " nnz"]]:
-    """Pattern of the transpose: (crow_t, col_t, order_t) with values_t = values[order_t]; `order` is that, if known.
+    """Pattern of the transpose: (crow_t, col_t, order_t) with values_t = values[order_t]; `order` is order_t, if known.
 
     >>> crow, col = torch.tensor([0, 2, 3]), torch.tensor([0, 1, 1])
     >>> [part.tolist() for part in transpose_pattern(crow, col, 2)]
@@ -53,10 +53,10 @@ def csr_product(
     pattern
         [crow, col, crow_t, col_t, order_t] of A and, from `transpose_pattern`, of its transpose; int32 or int64.
     values
-        Of A.
+        Values of A.
     x
         Dense. The product is computed in the wider of the types of `values` and `x`, and at least in float32, also
-        under autocast; the result has that type, but for a half-precision x, which gives its own.
+        under autocast; the result has that type, or that of a half-precision x.
 
     >>> crow, col, values = torch.tensor([0, 2, 3]), torch.tensor([0, 1, 1]), torch.tensor([1.0, 2.0, 3.0])
     >>> pattern = [crow, col, *transpose_pattern(crow, col, 2)]
@@ -84,7 +84,7 @@ def _result_dtype(values: Tensor, x: Tensor) -> torch.dtype:
 
 @cache
 def _hear_out_torch() -> None:
-    """Make the first CSR tensor, at which torch says once that they are in beta."""
+    """Create a first CSR tensor, to silence torch's one-time warning that these are in beta."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         torch.sparse_csr_tensor([0, 1], [0], [1.0], (1, 1))
@@ -103,10 +103,10 @@ def multiply(
     values: Float[Tensor, " nnz"],
     x: Float[Tensor, "cols C"],
 ) -> Float[Tensor, "rows C"]:
-    """A x alone, for operations with derivatives of their own; values and x of one type, at least float32."""
+    """A x without derivatives, for operations that define their own; values and x of one type, at least float32."""
     x = x.contiguous()
     if x.device.type == "cpu" and x.dtype == torch.float32 and x.numel():
-        # A row of the result is a weighted sum of rows of x; in this type bags beat MKL twofold.
+        # A row of the result is a weighted sum of rows of x; in float32 bags are twice as fast as MKL.
         return embedding_bag(
             col, x, crow, mode="sum", per_sample_weights=values, include_last_offset=True
         )
@@ -115,7 +115,7 @@ def multiply(
 
 
 def on_one_pattern(one: sparse.csr_array, other: sparse.csr_array) -> bool:
-    """Whether two CSR matrices have their entries at the same places, in the same order."""
+    """Whether two CSR matrices have the same pattern, in the same order."""
     return np.array_equal(one.indptr, other.indptr) and np.array_equal(one.indices, other.indices)
 
 
@@ -151,7 +151,7 @@ def symmetric_product(
 
 
 def _product(*inputs: Any) -> Tensor:
-    """A x, or Aᵀ x, by crow, col, crow_t, col_t, order_t, values, x, transposed."""
+    """A x or Aᵀ x, from crow, col, crow_t, col_t, order_t, values, x, transposed."""
     crow, col, crow_t, col_t, order_t, values, x, transposed = inputs
     dtype, result_dtype = compute_dtype(values, x), _result_dtype(values, x)
     if transposed:
@@ -160,7 +160,7 @@ def _product(*inputs: Any) -> Tensor:
 
 
 def _values_gradient(*inputs: Any) -> Tensor:
-    """Σ_c left[row, c] right[col, c] at every entry (row, col), without the (nnz, C) of its terms."""
+    """Σ_c left[row, c] right[col, c] at every entry (row, col), without storing the (nnz, C) terms."""
     crow, col, _, _, _, left, right = inputs
     dtype = compute_dtype(left, right)
     matrix = csr_tensor(
@@ -261,7 +261,7 @@ def to_scipy(
     values: Float[Tensor, " nnz"],
     shape: tuple[int, int],
 ) -> sparse.csr_array:
-    """As a scipy CSR matrix on the CPU, without a copy where there is none needed; half precision becomes float32."""
+    """Convert to a scipy CSR matrix on the CPU, without needless copies; half precision becomes float32."""
     values = values.float() if values.dtype.itemsize < 4 else values
     data, indices, indptr = (t.detach().cpu().numpy() for t in (values, col, crow))
     return sparse.csr_array((data, indices, indptr), shape=shape)

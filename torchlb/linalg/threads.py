@@ -1,4 +1,4 @@
-"""Threads of torch's for the many small tensors of a build."""
+"""Number of torch threads for the many small tensors of a build."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -6,12 +6,12 @@ from contextlib import contextmanager
 import torch
 
 FEW = 20_000
-"""Points whose tensors are not worth a second thread: on a busy machine it is waited for at every product."""
+"""Points up to which a second thread does not pay: on a busy machine every product waits for it."""
 
 
 @contextmanager
 def threads_for(num_points: int) -> Iterator[None]:
-    """One thread inside, if there are few points; afterwards as many as before.
+    """Context with one thread if there are few points; the former number is restored afterwards.
 
     >>> before = torch.get_num_threads()
     >>> with threads_for(100):

@@ -1,4 +1,4 @@
-"""A cycle of two levels, smoothing around a coarse solve, as a preconditioner."""
+"""A two-grid cycle, smoothing before and after a coarse solve, as a preconditioner."""
 
 from __future__ import annotations
 
@@ -12,26 +12,26 @@ from torchlb.linalg.precision import SMALL
 
 Matrix = tuple[Tensor, Tensor, Tensor]  # crow, col, values
 LOWEST = 0.25
-"""Lower end of the spectrum of D⁻¹A that is smoothed; a quarter of it is left to the coarse solve."""
+"""Lower end of the smoothed part of the spectrum of D⁻¹A; the quarter below is left to the coarse solve."""
 SIZE = 2 * (1 + LOWEST) ** 2 - (1 - LOWEST) ** 2
 FIRST, SECOND = 8 * (1 + LOWEST) / SIZE, -8 / SIZE
-"""Of the smoother D⁻¹(a + b AD⁻¹): 1 − x(a + bx), x in the spectrum, is the Chebyshev polynomial T₂ there, 1 at 0."""
+"""Coefficients a, b of the smoother D⁻¹(a + b AD⁻¹): 1 − x(a + bx) is T₂ on the smoothed part, scaled to 1 at x = 0."""
 
 
 def two_grid(product: Linear, sums: Float[Tensor, "N _"], coarse: Linear) -> Linear:
-    """An approximate inverse of a symmetric A ≥ 0, itself symmetric and definite, for right sides (N, C) in float32.
+    """Approximate inverse of a symmetric A ≥ 0, itself symmetric and definite, for right-hand sides (N, C) in float32.
 
-    Smoothing is by Chebyshev polynomials of degree 2 over the upper three quarters of the spectrum of D⁻¹A, D the
-    absolute row sums or more, which bound it by one. Scale what it is given to about one.
+    The smoother is a Chebyshev polynomial of degree 2 over the upper three quarters of the spectrum of D⁻¹A, D the
+    absolute row sums or more, which bound it by one. Right-hand sides should be scaled to about one.
 
     Parameters
     ----------
     product
-        With A, or with what is near A on rough functions.
+        Product with A, or with an approximation to A on rough functions.
     sums
-        D, (N, 1), or (N, C) for columns with matrices of their own; rows of zeros are left alone.
+        D, (N, 1), or (N, C) for columns with matrices of their own; rows of zeros are skipped.
     coarse
-        A solve with what is near A on smooth functions.
+        Solve with an approximation to A on smooth functions.
 
     >>> diagonal = torch.tensor([[2.0], [4.0]])
     >>> cycle = two_grid(lambda x: diagonal * x, diagonal, torch.zeros_like)
@@ -59,9 +59,9 @@ def two_grid(product: Linear, sums: Float[Tensor, "N _"], coarse: Linear) -> Lin
 def without_small_entries(
     crow: Int[Tensor, " N_plus_1"], col: Int[Tensor, " nnz"], values: Float[Tensor, " nnz"]
 ) -> Matrix:
-    """A symmetric matrix without entries below a thousandth of √(d_i d_j), d the absolute row sums; in float32.
+    """Drop the entries of a symmetric matrix below a thousandth of √(d_i d_j), d the absolute row sums; in float32.
 
-    They go to the diagonal, so that row sums stay. Of a stiffness matrix four of ten are left, which do for smoothing.
+    They are added to the diagonal, which preserves row sums. Four of ten entries of a stiffness matrix remain.
 
     >>> crow, col = torch.tensor([0, 2, 4]), torch.tensor([0, 1, 0, 1])
     >>> without_small_entries(crow, col, torch.tensor([1.0, 1e-4, 1e-4, 1.0]))[1:]

@@ -16,24 +16,25 @@ from torchlb.linalg.precision import NEGLIGIBLE
 from torchlb.stencils.rows import Reason
 
 RESOLVED_ON_MESH, RESOLVED_ON_CLOUD = 1.8, 4.1
-"""Heights may leave this much of a fit, over the growth g∞ that turns it into an error of Δ. Triangles know more of a
-surface that its points do not resolve than a fit, points alone do not; on a mesh along normals half of it."""
+"""Largest height residual of a stencil times the growth g∞, which turns it into an error of Δ. The bound is lower on a
+mesh, whose triangles follow a surface that its points do not resolve better than a fit; along normals half of it."""
 RESOLVING_DEGREE = 4
-"""Up to it the bound stays the same: what a low degree leaves of the heights is not worth the fall to the next rows."""
+"""Degree up to which the bound stays constant: the residual of a low degree does not justify the next rows."""
 
 
 @dataclass(frozen=True)
 class Acceptance:
-    """The tests for the stencils of a shape.
+    """Tests for the stencils of a shape.
 
     Attributes
     ----------
     dim
-        d.
+        Dimension d.
+
     on_mesh
-        Whether low-order rows know the surface better than a fit that misses heights.
+        Whether low-order rows follow the surface better than a fit that misses heights.
     projection
-        Of the coordinates.
+        Projection of the coordinates.
     """
 
     dim: int
@@ -42,19 +43,19 @@ class Acceptance:
 
     @staticmethod
     def too_wide_at_boundary(candidate: Candidate) -> bool:
-        """Whether a stencil with boundary points would be so wide that it is lopsided, and a lower order better."""
+        """Whether a stencil with boundary points would be so wide and one-sided that a lower order is better."""
         return candidate.degree > 2 and candidate.factor > FACTOR
 
     def judge(
         self, weights: Weights, candidate: Candidate, touching: Bool[Tensor, " B"]
     ) -> tuple[Int[Tensor, " B"], Bool[Tensor, " B"]]:
-        """The first test that each stencil fails, as a `Reason`, and whether its whole degree is to be given up.
+        """Return the first test that each stencil fails, a `Reason`, and whether to reject its whole degree.
 
-        `touching` are the stencils that hold boundary points.
+        `touching` marks the stencils with boundary points.
         """
         inside = reference(self.dim, candidate.degree, candidate.rule)
         edge = reference(self.dim, candidate.degree, one_sided=True) if touching.any() else inside
-        # at a boundary over the one-sided reference, or over what is accepted inside, since corners have more
+        # at a boundary relative to the one-sided reference, or to the bound inside, since corners have more
         at_edge = FACTOR * max(edge.growth, FACTOR * inside.growth)
         max_growth = torch.where(touching, at_edge, FACTOR * inside.growth)
         max_ratio = FACTOR * torch.where(touching, edge.off_diagonal_ratio, 1.0)
@@ -76,11 +77,11 @@ class Acceptance:
         return weights.height_residual <= self._resolved(candidate)[0]
 
     def _resolved(self, candidate: Candidate) -> tuple[float, float]:
-        """Bounds on the residual of the heights: for this candidate, and for all of its degree.
+        """Bounds on the height residual: for this candidate, and for every candidate of its degree.
 
-        On a mesh they may leave the less the more points there are, from 3 a polynomial on: a fit to folds does not
-        become better over more of them. On a cloud the noise of the heights may fall by as much as the widest stencil
-        is wider than the first, and a size that the user fixed cannot widen.
+        On a mesh the bound shrinks with the number of points beyond 3 per polynomial: a fit to folds does not improve
+        over more of them. On a cloud, noise may shrink by the ratio of the widest stencil to the first; a size fixed by
+        the user cannot widen.
         """
         growth = max(reference(self.dim, m).growth for m in (candidate.degree, RESOLVING_DEGREE))
         if self.on_mesh:

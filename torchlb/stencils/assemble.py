@@ -2,8 +2,8 @@
 
 The candidates of a point at order p (`method.md`, section 4): least-squares (or polyharmonic) stencils of degree p + 1
 with K = 1.6, 2, …, 10 times as many points as polynomials; then the same at every odd order below; then positive
-weights of order 1; then the low-order row. On a mesh that is better than order 1, which is tried there only if asked
-for. What each point took, and why no better, is part of the result and never silent.
+weights of order 1; then the low-order row. On a mesh the low-order row is better than order 1, which is tried there
+only on request. The candidate of each point, and the reason for no better one, are part of the result.
 """
 
 from __future__ import annotations
@@ -44,22 +44,22 @@ from torchlb.stencils.shape import Shape
 
 RULES = list(WEIGHT_RULES)
 GRADIENT_GROWTH = 30.0
-"""Largest ρ Σ|w| of a first derivative beside a boundary; where points lie well it is 5 to 15."""
+"""Largest ρ Σ|w| of a first derivative beside a boundary; well-placed points have 5 to 15."""
 
 
 class Stencils:
-    """All that decides a row, ready to build any of them from any candidate on.
+    """Rows of a shape, each by the first of its candidates that passes.
 
     Parameters
     ----------
     shape
         Points, frames, neighbourhoods, boundary and low-order rows.
     order
-        p ≥ 1 of the first candidates.
+        Order p ≥ 1 of the first candidates.
     projection, weights
         Keys of `PROJECTIONS` and `WEIGHT_RULES`.
     num_neighbors
-        K of every candidate, instead of `SIZE_FACTORS`.
+        Size K of every candidate, instead of `SIZE_FACTORS`.
     """
 
     def __init__(
@@ -83,7 +83,7 @@ class Stencils:
         self.share = None if share is None or boundary is None else share * boundary.folds
 
     def rows(self, centers: Int[Tensor, " B"], start: Int[Tensor, " B"] | None = None) -> Rows:
-        """Rows of `centers`, each of the first candidate (from `start` on) that passes, else the low-order row."""
+        """Rows of `centers`, each by the first candidate (from `start` on) that passes, else the low-order row."""
         blocks, taken = [], []
         reason = torch.full_like(centers, Reason.FEW)  # until something is tried
         assert self.shape.neighborhoods is not None
@@ -129,11 +129,11 @@ class Stencils:
         return self.shape.boundary.mask[index].any(1)
 
     def plan(self, rows: Rows) -> RowsPlan:
-        """What was decided about all rows."""
+        """Plan of all rows."""
         row = torch.arange(len(rows.length)).repeat_interleave(rows.length)
         own = (rows.candidate == len(self.candidates)) & (rows.slope > 0)
         slope = (rows.gradient != 0).any(1)
-        # Dirichlet's condition takes weights of Δ away, that of Neumann knows more than those of ∇.
+        # Dirichlet's condition removes weights of Δ; beside Neumann data ∇ is fitted to all points.
         weights = slope if self.share is None else rows.laplacian != 0
         positive = rows.rule == RULES.index("positive")
         used = (~positive[row] | weights) & (~own[row] | slope)
@@ -141,7 +141,7 @@ class Stencils:
         return RowsPlan(rows.length, rows.col.int(), *kinds, used)
 
     def evaluated(self, plan: RowsPlan) -> Rows:
-        """The rows of all points that were decided for."""
+        """Evaluate the planned rows of all points."""
         every, blocks, taken = torch.arange(len(plan.length)), [], []
         for number, candidate in enumerate(self.candidates):
             rows = every[plan.candidate == number]
@@ -170,7 +170,7 @@ class Stencils:
         return replace(rows, reason=plan.reason)
 
     def _low_order_again(self, centers: Int[Tensor, " B"], plan: RowsPlan) -> Rows:
-        """Low-order rows, with the gradients that were decided for."""
+        """Low-order rows, with the planned gradients."""
         assert self.shape.low_order is not None
         matrix = self.shape.low_order.rows(centers)
         rows = matrix_rows(matrix, self.shape.points, self.shape.frames, centers)
@@ -201,10 +201,10 @@ class Stencils:
         keep: Bool[Tensor, "B neighbors"] | None = None,
         slope: Int[Tensor, " B"] | None = None,
     ) -> Weights:
-        """Weights of a batch, with the data of the boundary where `with_data` says so.
+        """Weights of a batch, with boundary data where `with_data` is set.
 
-        Where they were decided for, positive ones are of the neighbours `keep`, and gradients beside data of the degree
-        `slope`; what they leave of the heights is not asked then.
+        For planned rows, positive weights are restricted to the neighbours `keep`, gradients beside data have the
+        degree `slope`, and height residuals are not computed.
         """
         parts, order = [], []
         for data, rows in ((False, ~with_data), (True, with_data)):
@@ -238,11 +238,11 @@ class Stencils:
         keep: Bool[Tensor, "B neighbors"] | None = None,
         slope: Int[Tensor, " B"] | None = None,
     ) -> Weights:
-        """Δ by a fit that uses the condition; first derivatives by one that does not, to serve any f.
+        """Δ by a fit with the boundary data; first derivatives by one without, valid for every f.
 
-        By straight projection, where the derivative along a conormal is its component in the plane. Splines have no
-        such form; least squares stands in for them. Points in a few lines along the boundary hardly determine what the
-        data did: first derivatives are those of the highest degree that they do.
+        Coordinates are by tangential projection, in which the conormal derivative is a component in the plane. Splines
+        have no such form and are replaced by least squares. A few rows of points along the boundary may not suffice
+        without the data: first derivatives are of the highest degree that the points determine.
         """
         points, frames, degree = self.shape.points, self.shape.frames, candidate.degree
         boundary, share = self.shape.boundary, self.share
@@ -271,10 +271,10 @@ class Stencils:
         return replace(weights, height_residual=free.height_residual, **found)
 
     def _heights(self, centers: Tensor, index: Tensor, coords: Tensor) -> Float[Tensor, "B K n"]:
-        """What a polynomial must follow: heights over the points of the plane that the coordinates name, on a mesh.
+        """Heights that a fit has to follow; on a mesh, over the points of the plane with the given coordinates.
 
-        So coordinates along normals are tested too, which need normals that folds do not have. On a cloud there is
-        nothing better to fall to: heights straight over the plane.
+        This also tests coordinates along normals, which need normals that folds do not have. A cloud has no better rows
+        to fall back to, so there the heights are those of the tangential projection.
         """
         points, frames, neighbors = self.shape.points, self.shape.frames, index[:, 1:]
         if not self.shape.on_mesh and self.projection != "tangent":
@@ -287,7 +287,7 @@ class Stencils:
         index: Int[Tensor, "B K"],
         gradient: Float[Tensor, "B K d"],
     ) -> Float[Tensor, "B K d"]:
-        """Weights of ∇ in the frames, from those of derivatives along the coordinates."""
+        """Convert weights of derivatives along the coordinates to weights of ∇ in the frames."""
         points, frames = self.shape.points, at(self.shape.frames, centers)
         jacobian = gradient.mT @ (at(points, index) - at(points, centers)[:, None])
         return gradient @ to_tangent_vectors(jacobian, frames).mT
@@ -320,9 +320,9 @@ class Stencils:
     def _gradients(
         self, centers: Int[Tensor, " B"]
     ) -> Iterator[tuple[Int[Tensor, " b"], Int[Tensor, "b K"], Float[Tensor, "b K d"], int]]:
-        """First derivatives where only Δ has no good stencil, as at a boundary: of the highest degree that has.
+        """Yield first derivatives of the highest acceptable degree where only Δ has no stencil, as at a boundary.
 
-        Batches of (places in `centers`, points, weights, degree). Of degree 1 those of the low-order row are as good.
+        Batches are (indices into `centers`, points, weights, degree). At degree 1 the low-order row is as good.
         """
         dim = self.shape.frames.shape[-1]
         degrees = range(self.order + 1, 1, -1)
@@ -344,7 +344,7 @@ class Stencils:
 
 
 def _good_slope(weights: Weights) -> Bool[Tensor, " B"]:
-    """Whether the points determine first derivatives, and well."""
+    """Whether the points determine first derivatives, with bounded growth."""
     growth = weights.radius * weights.gradient.abs().sum(1).amax(1)
     return (weights.residual <= NEGLIGIBLE) & (growth <= GRADIENT_GROWTH)
 
@@ -352,8 +352,7 @@ def _good_slope(weights: Weights) -> Bool[Tensor, " B"]:
 def assemble(stencils: Stencils, *, progress: bool = True) -> Rows:
     """Rows of all points, in chunks.
 
-    Memory beyond the result: about 0.1 GB whatever N (`precision.BYTES`). The result takes 16 + 8 d
-    bytes an entry.
+    Memory beyond the result is about 0.1 GB for any N (`precision.BYTES`); the result takes 16 + 8 d bytes an entry.
     """
     shape = stencils.shape
     parts = torch.arange(len(shape.points)).split(AT_ONCE)
@@ -362,5 +361,5 @@ def assemble(stencils: Stencils, *, progress: bool = True) -> Rows:
 
 
 def _own_first(index: Int[Tensor, "B K"], centers: Int[Tensor, " B"]) -> Int[Tensor, "B K"]:
-    """The columns of each row in an order that begins with its own point."""
+    """Columns of each row, reordered to begin with its own point."""
     return (index == centers[:, None]).byte().argsort(dim=1, descending=True, stable=True)

@@ -1,4 +1,4 @@
-"""What holds at a boundary: a class each, with what it does to rows and to the weak pair (`method.md`, 6 and 9)."""
+"""Boundary conditions, a class each, with their effect on rows and on the weak pair (`method.md`, 6 and 9)."""
 
 from __future__ import annotations
 
@@ -18,24 +18,24 @@ from torchlb.stencils.rows import Rows
 
 
 class Condition:
-    """Nothing is known at the boundary: stencils there are one-sided. Other conditions derive from it.
+    """No condition, with one-sided stencils at the boundary; base class of all conditions.
 
-    A class with a `name` is known by it, in options, files and messages. What it is made of is one argument of numbers
-    and lists, or none, and `data` gives that back.
+    A class is registered under its `name`, for options, files and messages. Its constructor takes one argument of
+    numbers and lists, or none, which `data` gives back.
 
     Attributes
     ----------
     name
-        Of the condition.
+        Name of the condition.
     conserves
-        Whether constants stay: rows sum to zero, and K1 = 0.
+        Whether constants are preserved: rows sum to zero, and K1 = 0.
     fixes
-        Whether values at the boundary are zero: solves take out rows and columns there.
+        Whether values at the boundary are zero: solves remove rows and columns there.
     share
-        a ≥ 0 of ∂_ν f + a f = 0, 1/ℓ, a number or of each point: stencils have that as data, and K has a added along
-        the boundary. None where they have not.
+        a ≥ 0 of ∂_ν f + a f = 0, 1/ℓ, a number or one per point: stencils use it as data, and K gains a along the
+        boundary. None without such data.
     data
-        What an instance is made of again; None for nothing.
+        Constructor argument of the instance; None without one.
     """
 
     known: ClassVar[dict[str | None, type[Condition]]] = {}
@@ -64,7 +64,7 @@ class Condition:
         return repr(self.plain)
 
     def taken(self, points: Int[Tensor, " N"], count: int) -> Condition:
-        """That of the points in another order; InputError if it is not one of `count` points."""
+        """Condition of the points in another order; InputError unless it has one value, or one per point, `count`."""
         if not isinstance(self.share, Tensor):
             return self
         if len(self.share) != count:
@@ -83,7 +83,7 @@ class Condition:
         centers: Int[Tensor, " B"],
         rows: Rows,
     ) -> Rows:
-        """The rows of `centers` as they stand: those of low order, without data, lose a f through their share."""
+        """Adapt the rows of `centers`: low-order ones, without data, lose a f over their share of the boundary."""
         if self.share is None or self.conserves:
             return rows
         lost = self.share * boundary.sizes / areas
@@ -103,10 +103,10 @@ class Neumann(Condition):
 
 
 class Dirichlet(Condition):
-    """f = 0: no entry joins a boundary point to another point.
+    """f = 0: no entry couples a boundary point to another point.
 
-    A boundary point has −4d/h² for itself, as a grid's fastest wave, h its distance to the nearest point, but at least
-    `LOW` of that to the farthest in its row.
+    The diagonal entry of a boundary point is −4d/h², as for the fastest wave of a grid; h is the distance to the
+    nearest point, but at least `LOW` times that to the farthest in the row.
     """
 
     name = "dirichlet"
@@ -121,7 +121,7 @@ class Dirichlet(Condition):
         centers: Int[Tensor, " B"],
         rows: Rows,
     ) -> Rows:
-        """The rows, decoupled from the boundary."""
+        """Decouple the rows from the boundary."""
         mask, dim = boundary.mask, rows.gradient.shape[1]
         local = torch.arange(len(centers)).repeat_interleave(rows.length)
         row, col = centers[local], rows.col
@@ -136,15 +136,15 @@ class Dirichlet(Condition):
 
 
 class Robin(Condition):
-    """κ∂_ν f + a f = 0: what leaves through the boundary is a ≥ 0 times what is there.
+    """κ∂_ν f + a f = 0: the flux out through the boundary is a ≥ 0 times f.
 
     Parameters
     ----------
     a
-        Units of κ/ℓ: a number, or one of each point, of which those off the boundary do not count. 0 is Neumann's
-        condition, and a → ∞ Dirichlet's. Of first order where a jumps.
+        In units of κ/ℓ: a number, or one per point, of which those off the boundary are ignored. 0 is Neumann's
+        condition, and a → ∞ Dirichlet's. First order where a jumps.
 
-    Raises InputError for what is neither, and for values that are negative or not finite.
+    Raises InputError for anything else, and for values that are negative or not finite.
 
     >>> Robin(2.0)
     Robin(2.0)
@@ -182,7 +182,7 @@ ConditionName = Literal["neumann", "dirichlet"]
 
 
 def condition_of(given: Any) -> Condition | None:
-    """The condition of a name, of plain types, or itself; None for none at all. InputError for anything else.
+    """Condition of a name or of plain types; a condition itself, and None, are returned. InputError for anything else.
 
     >>> condition_of({"robin": 2.0})
     Robin(2.0)

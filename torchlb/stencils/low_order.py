@@ -1,4 +1,4 @@
-"""Low-order rows, for points where no stencil passes: linear elements, stable, and first order at best."""
+"""Low-order rows for points where no stencil passes: P1 elements, stable, and at best of first order."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def simplex_shares(
     faces: Int[Tensor, "F v"],
     shares: Float[Tensor, " F"] | None = None,
 ) -> Float[Tensor, " N"]:
-    """Of each vertex an equal share of the length, area or volume of its simplices, ℓ^d: half, a third, a quarter.
+    """Equal shares for each vertex of the length, area or volume of its simplices, ℓ^d: half, a third, a quarter.
 
     >>> simplex_shares(torch.tensor([[0.0], [1.0], [3.0]]), torch.tensor([[0, 1], [1, 2]])).tolist()
     [0.5, 1.5, 1.0]
@@ -38,19 +38,19 @@ def simplex_shares(
 
 
 class MeshLowOrder:
-    """Linear elements with lumped mass: on triangles those of the intrinsic Delaunay triangulation (`delaunay_cover`).
+    """P1 elements with lumped mass; on triangles, of the intrinsic Delaunay triangulation (`delaunay_cover`).
 
-    Symmetric and negative in the mass, so that the certificate holds for these rows alone; those of segments and of
-    triangles are M-matrix rows, too. Where several segments meet, what flows in flows out.
+    The rows are symmetric and negative semidefinite in the mass, so that the certificate holds for these rows alone;
+    those of segments and of triangles are M-matrix rows, too. Where several segments meet, the fluxes balance.
 
     Parameters
     ----------
     points, cells
         (N, n), ℓ; (F, d + 1).
     flips
-        Those that lead to the triangulation, `flips` of the same shape before it moved; None to look for them.
+        Edge flips to the triangulation, the `flips` of the same shape before it moved; None to search for them.
     shares
-        (F,), which part of each cell counts; None where all of them do.
+        (F,), fraction of each cell that is integrated; None for all of it.
     """
 
     def __init__(
@@ -64,7 +64,7 @@ class MeshLowOrder:
 
     @property
     def flips(self) -> list[Tensor]:
-        """The flips of edges that lead to the triangulation; none where it was not needed, or is not of triangles."""
+        """Edge flips to the triangulation; none where it was not needed, or for other cells than triangles."""
         return self._elements[2] if "_elements" in vars(self) else []
 
     @cached_property
@@ -81,7 +81,7 @@ class MeshLowOrder:
         return pair.real, torch.from_numpy(pair.imag.sum(axis=1)), flips
 
     def areas(self) -> Float[Tensor, " N"]:
-        """Equal shares of the cells around each vertex, ℓ^d; the triangulation's where some have next to none."""
+        """Equal shares of the cells around each vertex, ℓ^d, or lumped masses where some are almost zero."""
         shares = simplex_shares(self.points, self.cells, self.shares)
         longest = torch.zeros_like(shares)
         square = (

@@ -1,4 +1,4 @@
-"""What is decided about where a shape is: its frames, normals and boundary, and what follows at given points."""
+"""Plan of the frames, normals and boundary of a shape, and their evaluation at given points."""
 
 from __future__ import annotations
 
@@ -23,18 +23,18 @@ from torchlb.linalg.precision import TINY
 
 
 class Beside(NamedTuple):
-    """What a cloud's surface has beside that of its triangles, as multiples of what these have: without a unit.
+    """Normals and displacements of a cloud's surface, relative to its triangles and so without a unit.
 
     Attributes
     ----------
     neighbor
-        (N,), a point beside each, towards which the first tangent is.
+        (N,), neighbour of each point, in the direction of its first tangent.
     normals
-        (N, 3), the first normals, along the triangles' normal, that tangent, and the vector orthogonal to both.
+        (N, 3), initial normals, by components along the triangles' normal, that tangent, and their cross product.
     moved
-        (m,), points that are put elsewhere: noisy ones, and those in mid-air.
+        (m,), displaced points: noisy ones, and those off the surface.
     offsets
-        (m, 3), to where, along the same three, over the distance to the neighbour.
+        (m, 3), their displacements, by the same components, relative to the distance to the neighbour.
     """
 
     neighbor: Int[Tensor, " N"]
@@ -51,7 +51,7 @@ class Beside(NamedTuple):
         nearest: Int[Tensor, " N"],
         normals: Float[Tensor, "N 3"],
     ) -> Beside:
-        """Of points that stand at other places, and have these normals there."""
+        """Encode the surface positions `places` of the given points, and the normals there."""
         neighbor = nearest.clone()
         neighbor[triangles.flatten()] = triangles.roll(1, 1).flatten()
         given = pad(given, (0, 3 - given.shape[1]))
@@ -64,7 +64,7 @@ class Beside(NamedTuple):
     def places(
         self, points: Float[Tensor, "N n"], triangles: Int[Tensor, "F 3"]
     ) -> Float[Tensor, "N n"]:
-        """Where the surface is at given points."""
+        """Positions on the surface for given points."""
         if len(self.moved) == 0:
             return points
         space = pad(points, (0, 3 - points.shape[1]))
@@ -75,7 +75,7 @@ class Beside(NamedTuple):
     def frames(
         self, places: Float[Tensor, "N 3"], triangles: Int[Tensor, "F 3"]
     ) -> Float[Tensor, "N 3 2"]:
-        """Frames under the first normals."""
+        """Frames orthogonal to the initial normals."""
         axes, _ = _axes(places, triangles, self.neighbor)
         normal = normalize((self.normals[:, None] @ axes)[:, 0])
         first = normalize(axes[:, 1] - dot(axes[:, 1], normal)[:, None] * normal)
@@ -85,9 +85,9 @@ class Beside(NamedTuple):
 def _axes(
     points: Float[Tensor, "N 3"], triangles: Int[Tensor, "F 3"], neighbor: Int[Tensor, " N"]
 ) -> tuple[Float[Tensor, "N 3 3"], Float[Tensor, " N"]]:
-    """Of each point the normal of the triangles around it, and two tangents; any where there are none.
+    """Normal of the triangles around each point, two tangents, the first towards its neighbour, and the distance to it.
 
-    And the distance to the neighbour that the first of them points to.
+    Where a direction is undefined, it is arbitrary.
     """
     normal = vertex_normals(points, triangles)
     normal = torch.where((normal == 0).all(1, keepdim=True), normal.new_tensor([0.0, 0, 1]), normal)
@@ -100,22 +100,22 @@ def _axes(
 
 @dataclass(frozen=True)
 class ShapePlan:
-    """What is decided about a shape of simplices.
+    """Plan of a shape of simplices.
 
     Attributes
     ----------
     cells
-        (F, d + 1), whose planes the frames start from.
+        (F, d + 1), simplices whose planes give the initial frames.
     shares
-        (F,), which part of each counts; None where all of them do.
+        (F,), fraction of each cell that is integrated; None for all of it.
     fits
-        Of heights, and of functions where there is to be a weak pair.
+        Plan of the fits of heights, and of functions where a weak pair is built.
     beside
-        Of the surface through a cloud; None where points stand as given, and frames start from the planes of the cells.
+        Data of the surface through a cloud; None where points stay as given and frames start from the cells.
     side
-        (N,), ±1: on which side of the normal of the cells around a vertex its own is; None for shapes without sides.
+        (N,), sign of each normal along that of the cells around the vertex; None for shapes without sides.
     boundary
-        None for a closed shape, or where no condition holds.
+        Plan of the boundary; None for a closed shape, or where no condition holds.
     """
 
     cells: Int[Tensor, "F corners"]
@@ -133,7 +133,7 @@ class ShapePlan:
         return self.placed(fits), fits
 
     def placed(self, fits: LocalFits) -> Placed:
-        """The same from fits that are there."""
+        """Frames, normals and boundary from given fits."""
         frames, normals = righthanded(fits.frames, None)
         if self.side is not None:
             reference = self.side[:, None] * vertex_normals(fits.points, self.cells)
@@ -144,7 +144,7 @@ class ShapePlan:
 
 @dataclass(frozen=True)
 class Placed:
-    """Where a shape is.
+    """Points, frames, normals and boundary of a shape.
 
     Attributes
     ----------
@@ -155,7 +155,7 @@ class Placed:
     normals
         (N, n) unit normals of a hypersurface, else None. Oriented by the cells, or consistently on a cloud.
     boundary
-        Its points and conormals; None for a closed shape, or where no condition holds.
+        Boundary points and conormals; None for a closed shape, or where no condition holds.
     """
 
     points: Float[Tensor, "N n"]
@@ -167,21 +167,21 @@ class Placed:
 def first_frames(
     places: Float[Tensor, "N n"], cells: Int[Tensor, "F corners"], beside: Beside | None
 ) -> Float[Tensor, "N n d"]:
-    """The frames that fits are over."""
+    """Initial frames, over which the fits are made."""
     if beside is None or places.shape[1] == 2:
         return mesh_frames(places, cells)
     return beside.frames(places, cells)
 
 
 def turned(normals: Tensor, reference: Tensor) -> Tensor:
-    """The normals, on the side of `reference`."""
+    """Flip the normals to the side of `reference`."""
     return torch.where(((normals * reference).sum(1) < 0)[:, None], -normals, normals)
 
 
 def righthanded(
     frames: Float[Tensor, "N n d"], reference: Float[Tensor, "N n"] | None
 ) -> tuple[Float[Tensor, "N n d"], Float[Tensor, "N n"] | None]:
-    """Frames turned so that [frames, normal] is right-handed, normals of hypersurfaces on the side of `reference`."""
+    """Frames with [frames, normal] right-handed, and normals of a hypersurface on the side of `reference`."""
     if frames.shape[2] != frames.shape[1] - 1:
         return frames, None
     righthanded = normals_of_frames(frames)

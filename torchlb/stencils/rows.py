@@ -1,4 +1,4 @@
-"""Rows of a sparse operator, with what is known of the stencil behind each."""
+"""Rows of a sparse operator, with a record of the stencil behind each."""
 
 from __future__ import annotations
 
@@ -41,32 +41,32 @@ class Reason(IntEnum):
 
 @dataclass(frozen=True)
 class Rows:
-    """Consecutive rows of the operator in CSR, with what is known of each.
+    """Consecutive rows of the operator in CSR, with a record of each stencil.
 
     Attributes
     ----------
     length
-        (B,), entries of each row.
+        (B,), number of entries of each row.
     col
-        (nnz,), points, ascending within a row.
+        (nnz,), columns, ascending within a row.
     laplacian
         (nnz,), 1/ℓ².
     gradient
         (nnz, d), 1/ℓ, in the frame of the row's point.
     candidate
-        (B,), place in the list of candidates; their number for a low-order row.
+        (B,), index into the list of candidates; its length for a low-order row.
     rule
-        (B,), place in `WEIGHT_RULES` of the rule for its weights; their number for a low-order row.
+        (B,), index into `WEIGHT_RULES`; its length for a low-order row.
     order
         (B,), order of accuracy p; 0 for a low-order row.
     growth
         (B,), ρ² Σ|w|, the factor of the a-priori error bound.
     condition
-        (B,), of the scaled weighted Vandermonde matrix.
+        (B,), condition number of the scaled weighted Vandermonde matrix.
     off_diagonal_ratio
         (B,), Σ_{j≠i}|w_ij| / |w_ii|; 1 for an M-matrix row.
     slope
-        (B,), degree of the fit of the gradient where that is another one, else 0.
+        (B,), degree of the gradient's fit where it has one of its own, else 0.
     reason
         (B,), a `Reason`.
     """
@@ -102,7 +102,7 @@ class Rows:
     def with_gradient(
         self, local: Int[Tensor, " e"], index: Int[Tensor, " e"], gradient: Float[Tensor, "e d"]
     ) -> Rows:
-        """The same with another gradient in the rows `local`: entries, all of a row, at the points `index`."""
+        """Replace the gradient of the rows `local` by entries at the points `index`."""
         taken = torch.zeros_like(self.length, dtype=torch.bool).index_fill(0, local, True)
         row = torch.arange(len(self.length)).repeat_interleave(self.length)
         old = torch.where(taken[row, None], 0.0, self.gradient)
@@ -117,7 +117,7 @@ class Rows:
         return replace(self, length=length, **entries)
 
     def restored(self, numbering: Numbering) -> Rows:
-        """All rows, with the user's numbers."""
+        """All rows, in the user's numbers."""
         _, col, entry = numbering.restored_pattern(self.crow, self.col)
         values = {
             f.name: getattr(self, f.name)[entry if f.name in ENTRIES else numbering.here]
@@ -126,7 +126,7 @@ class Rows:
         return Rows(**values | {"col": col})
 
     def on_pattern(self, other: Rows | RowsPlan) -> Rows:
-        """The same on the pattern of as many others; what is not there goes to the diagonal."""
+        """Rows on the pattern of `other`; entries outside it are added to the diagonal."""
         span = int(max(self.col.max(), other.col.max())) + 1
         ours, theirs = (
             torch.arange(len(rows.length)).repeat_interleave(rows.length) * span + rows.col
@@ -146,20 +146,19 @@ class Rows:
 
     @staticmethod
     def stack(blocks: Iterable[Rows]) -> Rows:
-        """Blocks of rows one after the other."""
+        """Concatenate blocks of rows."""
         blocks = list(blocks)
         return Rows(*(torch.cat([getattr(b, f.name) for b in blocks]) for f in fields(Rows)))
 
 
 @dataclass(frozen=True)
 class RowsPlan:
-    """What is decided about rows; attributes are those of `Rows`.
+    """Plan of rows; attributes are those of `Rows`.
 
     Attributes
     ----------
     used
-        (nnz,), which entries have weights: of positive weights those that are not zero, of low-order rows with another
-        fit for the gradient those of that.
+        (nnz,), entries with weights: the non-zero ones of positive weights, and those of a low-order row's gradient.
     """
 
     length: Int[Tensor, " B"]
@@ -172,24 +171,24 @@ class RowsPlan:
     used: Bool[Tensor, " nnz"]
 
     def entries(self, rows: Int[Tensor, " b"]) -> Int[Tensor, "b K"]:
-        """Places of the entries of rows of one length."""
+        """Indices of the entries of rows of equal length."""
         start = (self.length.cumsum(0) - self.length)[rows]
         return start[:, None] + torch.arange(int(self.length[rows[0]]))
 
 
 ENTRIES = {"col", "laplacian", "gradient"}
-"""The fields of `Rows` that have one value an entry; the others have one a row."""
+"""Fields of `Rows` with one value per entry; the others have one per row."""
 
 
 def to_tangent_vectors(
     jacobian: Float[Tensor, "B d n"], frames: Float[Tensor, "B n d"]
 ) -> Float[Tensor, "B d d"]:
-    """EᵀJ⁺, which makes components in the frame E of the gradient from derivatives along the coordinates of a fit.
+    """EᵀJ⁺, which maps derivatives along the coordinates of a fit to the components of the gradient in the frame E.
 
-    With weights G of these derivatives J = Gx are tangent vectors of the surface that the fit makes of the points x,
-    and over it ∇f = Jᵀ(JJᵀ)⁻¹Gf = J⁺Gf. Of coordinates ∇ is Eᵀ times a projector, so no longer than 1, however steep
-    the fit is over the frame. Where the frame is tangent to it, to `SLIGHT`, G stays, and ∇ is exact for functions
-    that are linear in the tangent plane.
+    With weights G of these derivatives, the rows of J = Gx are tangent vectors of the surface fitted to the points x,
+    and ∇f = Jᵀ(JJᵀ)⁻¹Gf = J⁺Gf on it. The gradient of the coordinates is Eᵀ times a projector, thus of norm 1 at most,
+    however steep the fit is over the frame. Where the frame is tangent to it, to `SLIGHT`, G is kept, and ∇ is exact
+    for functions that are linear in the tangent plane.
 
     >>> steep = torch.tensor([[[1.0, 2.0]]])
     >>> to_tangent_vectors(steep, torch.tensor([[[1.0], [0.0]]])).round(decimals=4).tolist()
@@ -197,7 +196,7 @@ def to_tangent_vectors(
     """
     turn = torch.eye(jacobian.shape[1], dtype=jacobian.dtype).repeat(len(jacobian), 1, 1)
     tilted = (jacobian @ jacobian.mT - turn).abs().amax((1, 2)) > SLIGHT
-    # Singular values are those of [1, slope], 1 and more, and 0 across a line on which all points lie.
+    # Singular values are those of [1, slope], at least 1, and 0 across a line that holds all points.
     inverse = torch.linalg.pinv(jacobian[tilted], atol=NEGLIGIBLE, rtol=0.0)
     turn[tilted] = frames[tilted].mT @ inverse
     return turn
@@ -206,7 +205,7 @@ def to_tangent_vectors(
 def stencil_rows(
     index: Int[Tensor, "B K"], weights: Weights, candidate: int, order: int, rule: Int[Tensor, " B"]
 ) -> Rows:
-    """A batch of stencils of one candidate as rows, columns ascending."""
+    """Convert a batch of stencils of one candidate to rows with ascending columns."""
     batch, size = index.shape
     col, place = index.sort(dim=1)
     laplacian = weights.laplacian
@@ -239,7 +238,7 @@ def matrix_rows(
 ) -> Rows:
     """Rows of a given strong-form matrix (B, N), with the least-squares gradient over the points of each row.
 
-    Where those all lie on a line the derivative across it is zero. See `to_tangent_vectors` for where they are steep.
+    Where these lie on a line, the derivative across it is zero. For steep rows see `to_tangent_vectors`.
     """
     crow, col, laplacian = from_scipy(matrix)
     length = crow.diff()

@@ -1,4 +1,4 @@
-"""What stencils need to know of a shape: points, frames, neighbourhoods, boundary, areas and low-order rows."""
+"""Data of a shape for its stencils: points, frames, neighbourhoods, boundary, areas and low-order rows."""
 
 from __future__ import annotations
 
@@ -40,19 +40,19 @@ class Shape(Placed):
     Attributes
     ----------
     normal_order
-        (N,), the degree q of the fit behind each frame; 0 for a frame that stayed the initial one.
+        (N,), degree q of the fit behind each frame; 0 for an initial frame.
     neighborhoods
-        Its neighbourhoods; None where all is decided.
+        k-hop neighbourhoods; None where the rows are planned already.
     areas
-        (N,), ℓ^d, positive: a first-order share of the area.
+        (N,), positive, shares of the area to first order, ℓ^d.
     low_order
-        M-matrix rows for points without a stencil; None if there are none to be had.
+        Rows for points without a stencil; None if there are none.
     condition
-        What holds at the boundary.
+        Boundary condition.
     on_mesh
-        Whether the triangles are given, and know the surface where points do not resolve it.
+        Whether triangles are given, which follow the surface where its points do not resolve it.
     plan, fits
-        What is decided, and the fits that follow from it; None for a cloud without simplices.
+        Plan of the shape, and the fits evaluated from it; None for a cloud without simplices.
     """
 
     normal_order: Int[Tensor, " N"]
@@ -66,7 +66,7 @@ class Shape(Placed):
 
     @property
     def held(self) -> Bool[Tensor, " N"] | None:
-        """Points whose values are zero by the condition; None if there are none."""
+        """Points where the condition fixes zero values; None if there are none."""
         return self.boundary.mask if self.boundary is not None and self.condition.fixes else None
 
 
@@ -84,12 +84,12 @@ def mesh_shape(
     shares: Float[Tensor, " F"] | None = None,
     on_mesh: bool = True,
 ) -> Shape:
-    """A mesh of triangles (or of segments, or tetrahedra in Rⁿ): graph and frames from the faces.
+    """Shape of a mesh of segments, triangles or tetrahedra in Rⁿ, with graph and frames from its cells.
 
-    `condition` holds on its boundary, or on the part of it that is the mask `boundary`; None leaves it alone. With
-    `areas` given there are no low-order rows. `fit_degrees` asks for `fits` of the first of them that passes. Where
-    faces overlap, `shares` says which part of each counts, and only `boundary` where the shape ends. Triangles that are
-    not given, but found through a cloud, are not `on_mesh`.
+    `condition` holds on the boundary, or on the part of it in the mask `boundary`; None imposes nothing. With `areas`
+    given there are no low-order rows. `fit_degrees` requests `fits` of the first of these degrees that passes. Where
+    faces overlap, `shares` weights each of them, and `boundary` alone marks where the shape ends. Triangles
+    reconstructed from a cloud are not `on_mesh`.
     """
     sides = None
     hypersurface = faces.shape[1] == vertices.shape[1] and faces.shape[1] < 4
@@ -129,10 +129,10 @@ def surface_shape(
     fit_degrees: tuple[int, ...] = (),
     progress: bool = True,
 ) -> Shape:
-    """A cloud in R² or R³ with a surface through it, whose triangles and normals it starts from.
+    """Shape of a cloud in R² or R³, from the triangles and normals of a surface through it.
 
-    The boundary is that of the surface, but for points at local stars; or the mask `boundary`. Lone points are in no
-    neighbourhood but their own.
+    The boundary is that of the surface, except for points of local stars, or the mask `boundary`. Lone points belong to
+    no neighbourhood but their own.
     """
     flat, points = given.shape[1] == 2, surface.points[:, : given.shape[1]]
     triangles = torch.cat([surface.cells, surface.stars])
@@ -176,7 +176,7 @@ def _shape(
     condition: Condition | None,
     on_mesh: bool = False,
 ) -> Shape:
-    """What follows from a plan where it was made, with what is needed to look for stencils."""
+    """Shape of a plan at the points that it was made for, with the data that the search for stencils needs."""
     placed = plan.placed(fits)
     return Shape(
         **vars(placed),
@@ -194,7 +194,7 @@ def _shape(
 
 
 def _part(boundary: BoundaryPlan | None, mask: Bool[Tensor, " N"]) -> BoundaryPlan | None:
-    """The boundary of a mesh where the mask is set; InputError if points of it lie inside."""
+    """Boundary of a mesh, restricted to the mask; InputError if masked points lie inside."""
     astray = (mask if boundary is None else mask & ~boundary.mask).nonzero()[:, 0]
     if len(astray):
         raise InputError(
@@ -205,7 +205,7 @@ def _part(boundary: BoundaryPlan | None, mask: Bool[Tensor, " N"]) -> BoundaryPl
 
 
 def _follow(sides: Tensor | None, frames: Tensor) -> Tensor | None:
-    """The sides by the normals of the refined frames, where they were set."""
+    """Sides from the normals of the refined frames, where they were set."""
     if sides is None:
         return None
     return turned(normals_of_frames(frames), sides) * (sides != 0).any(1, keepdim=True)
@@ -218,7 +218,7 @@ def _searched(
     progress: bool,
     fit_degrees: tuple[int, ...] = (),
 ) -> tuple[FitPlan, LocalFits]:
-    """Tangent planes of order q, in chunks, the initial ones if q = 0 or in a flat space; and fits of functions."""
+    """Fit tangent planes of order q (initial ones if q = 0 or in a flat space), and functions."""
     flat = neighborhoods.dim == neighborhoods.points.shape[1]
     search = FitSearch(neighborhoods, 0 if flat else degree, fit_degrees, num_neighbors)
     if flat or degree == 0:
