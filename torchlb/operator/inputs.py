@@ -40,7 +40,7 @@ def warn_of_gradients(points: ArrayLike, what: str) -> None:
 
 
 def check_points(points: ArrayLike, what: str = "points") -> Float[Tensor, "N n"]:
-    """Points as (N, n) float64 on the CPU, detached; ValueError for a wrong shape or type, no points, NaN or infinity."""
+    """Points as (N, n) float64 on the CPU, detached; ValueError for a wrong shape or type, no points, NaN, infinity."""
     try:
         points = as_tensor(points)
     except (TypeError, ValueError, RuntimeError) as error:

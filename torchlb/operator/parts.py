@@ -171,7 +171,7 @@ class Modes(Tensors):
     def counted(
         self, vectors: Float[Tensor, "N k"], free: Bool[Tensor, " N"], sizes: tuple[int, ...]
     ) -> Modes:
-        """Set `count` from the eigenvectors, whose padding columns are zero, and the mask of free points; return self."""
+        """Set `count` from the eigenvectors, whose padding columns are zero, and the free points; return self."""
         parts = zip(vectors.split(sizes), free.split(sizes), strict=True)
         counts = [(int((modes != 0).any(0).sum()), int(inside.sum())) for modes, inside in parts]
         most = max(sizes)
