@@ -87,7 +87,7 @@ class LaplaceBeltramiTransform(BaseTransform):
         write "norm" or "normal"); None to ignore them. Missing normals are estimated.
     on_error
         "raise", or "skip": a warning says why a shape has no operator, and its data are returned without the keys, so
-        that ``[d for d in map(transform, shapes) if "lb_info" in d]`` are the others.
+        that ``[d for d in map(transform, shapes) if "lb_info" in d]`` keeps the others.
     **options
         Options of `LaplaceBeltrami.from_mesh` (for data with `face`) or `from_points` (without).
 
