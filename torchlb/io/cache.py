@@ -234,10 +234,7 @@ def load_operator(path: str | Path) -> LaplaceBeltrami:
 
 
 def describe_file(path: str | Path) -> dict[str, Any]:
-    """Contents of a file of `save_operator`: "version" of torchlb, "key", and "operator", read and checked in full.
-
-    Raises as `load_operator`.
-    """
+    """Contents of a file of `save_operator`: "version" of torchlb, "key", and "operator"; errors of `load_operator`."""
     lb, header = _read(Path(path))
     return {"version": header["version"], "key": header["key"], "operator": lb}
 

@@ -111,8 +111,7 @@ def _triangulated(
 def _sewn(vertices: Float[Tensor, "N 3"], faces: Int[Tensor, "F 3"]) -> tuple[Tensor, Tensor]:
     """Merge the corners of triangles into vertices: equal corners, and at open edges those that differ by rounding.
 
-    An open edge belongs to one triangle, and the ends of an edge are never merged. So no vertices of a closed mesh are
-    merged, however fine it is.
+    An open edge belongs to one triangle; ends of an edge are never merged. So a closed mesh keeps all its vertices.
     """
     vertices, number = torch.unique(vertices, dim=0, return_inverse=True)
     faces = number[faces]

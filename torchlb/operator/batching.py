@@ -81,10 +81,7 @@ def shapes_of(batch: Any) -> tuple[Any, ...]:
 
 
 def join_states(states: Sequence[dict[str, Any]], sizes: Sequence[int]) -> dict[str, Any]:
-    """The extra state of a batch, as of `OperatorStorage.get_extra_state`, which contains those of its shapes.
-
-    Its options are those that all shapes share.
-    """
+    """The extra state of a batch, with those of its shapes and the options that all shapes share."""
     known, options = ([state[key] for state in states] for key in ("radius", "options"))
     first = options[0]
     parts = [part for state in states for part in state.get("parts") or [state]]

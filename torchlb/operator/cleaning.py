@@ -243,8 +243,7 @@ def _left_of(start: np.ndarray, end: np.ndarray, points: np.ndarray) -> np.ndarr
 def turned_faces(faces: Int[Tensor, "F v"]) -> Bool[Tensor, " F"]:
     """Mask of the triangles to reverse so that the two triangles at an edge run along it in opposite directions.
 
-    Of the two orientations of a component the one with fewer reversed faces is taken; a non-orientable component stays
-    as it is.
+    The orientation of a component with fewer reversed faces is taken; a non-orientable component stays as it is.
 
     >>> turned_faces(torch.tensor([[0, 1, 2], [1, 2, 3], [3, 2, 4]])).tolist()
     [True, False, False]

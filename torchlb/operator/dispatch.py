@@ -28,8 +28,7 @@ def build_operator(
 ) -> LaplaceBeltrami:
     """Build the operator of a mesh, or of a cloud where `faces` is None or empty, by the builder that fits.
 
-    Parameters are those of `torchlb.load_or_build`. Raises what the builder raises, and InputTypeError for an option
-    that it does not have.
+    Parameters as for `torchlb.load_or_build`. Raises the builder's errors, and InputTypeError for unknown options.
     """
     builder, _, faces = builder_of(vertices, faces, operator)
     options = complete_options(builder, options)

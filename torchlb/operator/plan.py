@@ -81,10 +81,7 @@ class Plan:
 
 
 def evaluate(plan: Plan, points: Float[Tensor, "N n"]) -> AssembledOperator:
-    """Evaluate a plan at points, float64 on the CPU.
-
-    Raises InputError where stencils are certified, or points of a noisy curve were moved.
-    """
+    """Evaluate a plan at points, float64 on the CPU; InputError with a certificate or moved points of a noisy curve."""
     here, options = plan._sorted(points), plan.options
     if plan.rows is None:
         raise InputError(

@@ -1,4 +1,4 @@
-"""What each point's stencil reached, to be read before the operator is trusted."""
+"""The order that each point's stencil reached, to be read before the operator is trusted."""
 
 from __future__ import annotations
 

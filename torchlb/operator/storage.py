@@ -98,10 +98,7 @@ class OperatorStorage(Tensors):
         state: dict[str, Any],
         basis: Eigenbasis | None = None,
     ) -> Storage:
-        """Create an operator from tensors, matrices and records by name, and an extra state as of `get_extra_state`.
-
-        Parts that are left out stay empty.
-        """
+        """Create an operator from parts by name, the others empty, and the state that `get_extra_state` returns."""
         lb = cls()
         for name, part in parts.items():
             setattr(lb, name, part)

@@ -46,13 +46,7 @@ class WithConductivity:
 
 
 def elements_of(lb: LaplaceBeltrami) -> Forms:
-    """The elements of an operator's weak pair; computed once and kept with it.
-
-    Raises
-    ------
-    InputError
-        For batches, and operators without a weak pair.
-    """
+    """The elements of an operator's weak pair, cached with it; InputError for batches and without a weak pair."""
     if lb.cache.elements is None:
         if lb.source == "batch" or not lb.has_weak_form:
             remedy = "solve shape by shape, lb.unbatch()"
@@ -69,10 +63,7 @@ def elements_of(lb: LaplaceBeltrami) -> Forms:
 def with_conductivity(lb: LaplaceBeltrami, conductivity: Tensor) -> WithConductivity:
     """The operator with the stiffness of div κ∇, for κ > 0 at the vertices (N,) or on the faces (F,).
 
-    Raises
-    ------
-    InputError
-        For another shape, values that are not positive, and operators without elements.
+    Raises InputError for another shape, values that are not positive, and operators without elements.
     """
     check_tensor(conductivity, "conductivity")
     forms = elements_of(lb)

@@ -84,10 +84,7 @@ def heat_flow(
 def flow(
     lb: LaplaceBeltrami, x: Tensor, time: Tensor, method: str, k: int, tolerance: float
 ) -> Tensor:
-    """e^{tΔ}x in the type of x, which is float32 or float64; autocast has to be off.
-
-    A stack (B, N, C) is treated as further channels.
-    """
+    """e^{tΔ}x, (N, C) or (B, N, C), in the type of x, which is float32 or float64; autocast has to be off."""
     check_tolerance(tolerance)
     if x.ndim == 3:
         columns, times = x.transpose(0, 1).flatten(1), time.repeat(len(x))

@@ -60,10 +60,7 @@ def solve_columns(
     time: Float[Tensor, " C"] | None,
     tolerance: float | None,
 ) -> Float[Tensor, "N C"]:
-    """(M + tK)⁻¹b of every column by its time, or K⁻¹b for a time of None.
-
-    A time of 0 inverts M. A tolerance of None takes the solution by P1 elements.
-    """
+    """(M + tK)⁻¹b of every column by its time, or K⁻¹b for a time of None; by P1 elements for a tolerance of None."""
     shapes = shapes_of(lb)
     if shapes:
         blocks = zip(shapes, b.split([shape.num_points for shape in shapes]), strict=True)
@@ -121,10 +118,10 @@ class PairSystem:
     def solve(
         self, b: Float[Tensor, "N C"], time: Float[Tensor, " C"] | None, tolerance: float | None
     ) -> Float[Tensor, "N C"]:
-        """The solution, zero at Dirichlet points, for a Poisson problem of mean zero on components where K1 = 0.
+        """The solution, zero at Dirichlet points; for a Poisson problem, of mean zero on components where K1 = 0.
 
-        There, constants are split off, for which M + tK is M: they and the mass are exact to rounding. A tolerance of
-        None takes the solution by the factors, of P1 elements.
+        On these components constants are split off, for which M + tK is M: constants and the mass are exact to
+        rounding. A tolerance of None takes the solution by the factors, of P1 elements.
         """
         if b.shape[1] == 0:
             return b.double()
@@ -216,8 +213,7 @@ class PairSystem:
     def _levels(self, time: Tensor | None, columns: int) -> list[tuple[float | None, int]]:
         """Times of factors and the number of columns for each: for several times, the nearest powers of four.
 
-        Times so short that tK is small beside M share one factor; if too many powers remain, every second or third is
-        taken.
+        Times so short that tK is small beside M share one factor; of too many powers every second or third is taken.
         """
         if time is None or len(time) == 1:
             return [(None if time is None else float(time), columns)]

@@ -180,10 +180,9 @@ def paint(
 def isolines_of(
     values: np.ndarray, faces: np.ndarray, levels: Sequence[float] | np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Segments on which the linear interpolant has one of the levels.
+    """Segments on which the linear interpolant has one of the levels, none in triangles with a NaN or infinity.
 
-    Each end is given by its edge, (S, 2, 2), and its fraction of the edge, (S, 2, 1) in 0 … 1. Triangles with a corner
-    that is not finite have none.
+    Each end is given by its edge, (S, 2, 2), and its fraction of the edge, (S, 2, 1) in 0 … 1.
     """
     finite = faces[np.isfinite(values[faces]).all(axis=1)]
     edges = np.stack([finite, np.roll(finite, -1, axis=1)], axis=-1)  # (F, 3, 2)

@@ -130,7 +130,7 @@ def plot_points(
     ax = axes_of(ax)
     places = cloud_of(points)
     numbers = values_of(values, places)
-    # Unlike "RdBu_r", "coolwarm" has no white middle, which would hide disks.
+    # The middle of "coolwarm" is not white.
     shades, extend = color_map(numbers, cmap, symmetric, limits, "coolwarm")
     draw_dots(ax, places, shades.to_rgba(numbers), view, size)
     return finish(ax, title, shades, extend, label)

@@ -154,7 +154,7 @@ class Eigenbasis:
 
     @staticmethod
     def _typed(functions: Tensor, f: Tensor) -> tuple[Tensor, Tensor, torch.dtype]:
-        """Both in the type to multiply in, that of f and at least float32, and the type of the result.
+        """The factors in the type to multiply in, that of f and at least float32, and the type of the result.
 
         Integers and masks take the type of the basis. In half precision, masses and functions of small shapes are 0.
         """

@@ -146,10 +146,7 @@ def _parts(
     pattern: Sparse,
     areas: np.ndarray,
 ) -> list[_Part]:
-    """The components without their fixed points.
-
-    They are numbered by reverse Cuthill–McKee, which halves the time of the products.
-    """
+    """The components without fixed points, numbered by reverse Cuthill–McKee, which halves the time of products."""
     order = csgraph.reverse_cuthill_mckee(pattern, symmetric_mode=True)
     parts = []
     for own in members(component[order]):

@@ -113,8 +113,8 @@ class Surface:
     def points(self, n: int, seed: int = 0) -> Points:
         """n ≥ 8 quasi-uniform points: a low-discrepancy sequence, then short-range repulsion.
 
-        Boundary points come first, equally spaced and exactly on the boundary. On a curve all spacings are 0.75 to 1.25
-        times the mean.
+        Boundary points come first, equally spaced and exactly on the boundary. Spacings of a curve are 0.75 to 1.25 of
+        the mean.
         """
         require(n >= 8, "n", "at least 8", n)
         source = torch.Generator().manual_seed(seed)

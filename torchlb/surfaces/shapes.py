@@ -87,7 +87,7 @@ class Ellipsoid(_Radial):
         return _unit(x / x.new_tensor(self.semi_axes)) * x.new_tensor(self.semi_axes)
 
     def _chart(self, cube: Float[Tensor, "N d"]) -> Points:
-        return _directions(cube) * cube.new_tensor(self.semi_axes)  # more even than uniform directions
+        return _directions(cube) * cube.new_tensor(self.semi_axes)  # more even than by direction
 
 
 @dataclass(frozen=True)
