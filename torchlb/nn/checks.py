@@ -18,12 +18,8 @@ def check_features(
     """The type to compute in: that of features and parameters, at least float32; the operator is cast to it.
 
     Warns where the operator holds a basis of fewer than k pairs: the forward pass solves for more and only that
-    operator keeps them, so that operators made for every step, as by a data loader, pay for it each time.
-
-    Raises
-    ------
-    InputError
-        For a wrong shape, and for features of another type than the parameters, unless autocast made them so.
+    operator keeps them, so that operators made for every step, as by a data loader, pay for it each time. Raises
+    InputError for a wrong shape, and for features of another type than the parameters, unless autocast made them so.
     """
     check_shape(x, lb)
     if x.shape[-1] != channels:
