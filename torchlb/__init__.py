@@ -1,10 +1,10 @@
 """High-order Laplace–Beltrami operators on meshes and point clouds, for PyTorch.
 
 The packages, lowest first: `linalg`, matrices without shapes; `fits`, weights from local polynomials; `geometry`,
-neighbours, frames, boundaries; `baseline`, libigl's cotangents; `galerkin`, the weak pair; `stencils`, rows of Δ
-and ∇; `certified`, their certificate; `spectral`, eigenpairs and signatures; `operator`, the module that holds it
-all; `pde`, solves and flows; `nn`, layers; `io` and `interop`, files and other libraries. `surfaces` are shapes with
-exact answers; `cloud`, above `geometry`, goes from points to cells.
+neighbours, frames, boundaries; `cloud`, from points to cells; `baseline`, libigl's cotangents; `galerkin`, the weak
+pair; `stencils`, rows of Δ and ∇; `certified`, their certificate; `spectral`, eigenpairs and signatures; `operator`,
+the module that holds them; `pde`, solves and flows; `nn`, layers; `io` and `interop`, files and other libraries.
+`surfaces` are shapes with exact answers.
 """
 
 from importlib import import_module
@@ -103,7 +103,7 @@ __all__ = [
 
 
 def __getattr__(name: str) -> Any:
-    """`torchlb.interop` and `torchlb.plot`, loaded when they are asked for."""
+    """Import `torchlb.interop` and `torchlb.plot` on first use."""
     if name in ("interop", "plot"):
         return import_module(f"torchlb.{name}")
     raise AttributeError(f"module 'torchlb' has no attribute {name!r}")

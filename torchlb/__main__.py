@@ -38,10 +38,10 @@ SETTINGS = {"help_option_names": ["-h", "--help"], "show_default": True}
 
 
 class _Commands(click.Group):
-    """Commands whose errors are messages."""
+    """Commands that report errors as messages."""
 
     def invoke(self, ctx: click.Context) -> Any:
-        """Run a command; what is wrong with the input ends it with a message and code 1."""
+        """Run a command; an error of the input ends it with a message and code 1."""
         try:
             with warnings.catch_warnings():
                 warnings.showwarning = _show
@@ -56,7 +56,7 @@ def _show(message: Warning | str, category: type[Warning], *_: Any) -> None:
 
 
 def _stencil_options(command: Callable[..., Any]) -> Callable[..., Any]:
-    """The options of the operator that the commands share."""
+    """Add the operator's options that the commands share."""
     projections, weights = (click.Choice(get_args(names)) for names in (Projection, WeightsName))
     for name, settings in (
         ("--order", {"type": COUNT, "default": 3, "help": "Order p of accuracy."}),
@@ -70,7 +70,7 @@ def _stencil_options(command: Callable[..., Any]) -> Callable[..., Any]:
 
 
 def _stability(lb: LaplaceBeltrami) -> str:
-    """What is known of it."""
+    """What is known of an operator's stability."""
     pair = "stable: symmetric, positive by its weak pair" if lb.has_weak_form else ""
     known = [pair, "" if lb.certificate is None else str(lb.certificate)]
     return "\n".join(filter(None, known)) or "no certificate"

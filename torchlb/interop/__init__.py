@@ -1,8 +1,8 @@
-"""At home in other libraries: each module speaks the words of the one that it is named after.
+"""Adapters to other libraries, each in the words of the library that it is named after.
 
 `trimesh`: shapes from files and back. `conventions`: signs, factors and masses of igl, potpourri3d, LaPy and PyG.
 `pyg`: PyTorch Geometric's data, batches and loaders. `diffusion_net`: the operators that DiffusionNet code expects.
-Each needs its own library, and is loaded when it is asked for.
+Each needs its own library, and is imported on first use.
 """
 
 from importlib import import_module

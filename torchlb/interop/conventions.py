@@ -1,4 +1,4 @@
-"""The operator in the signs, factors and masses of other libraries; the table of them is in `docs/conventions.md`.
+"""The operator in the signs, factors and masses of other libraries; tabulated in `docs/conventions.md`.
 
 Most libraries give a weak matrix C and a mass M, with M⁻¹C the operator; half of them give −C. torchlb's matrix is
 strong: Δ = M⁻¹C, M the diagonal of `lb.mass`.
@@ -17,7 +17,7 @@ from torchlb.operator.laplace_beltrami import LaplaceBeltrami
 __all__ = ["SIGNS", "edge_weights", "weak_matrices"]
 
 SIGNS = {"igl": 1, "potpourri3d": -1, "robust_laplacian": -1, "lapy": -1, "diffusion_net": -1}
-"""Of the weak matrix: +1 if it is negative semidefinite like Δ, −1 if positive."""
+"""Sign of the weak matrix: +1 if it is negative semidefinite like Δ, −1 if positive."""
 
 
 def weak_matrices(
@@ -28,7 +28,7 @@ def weak_matrices(
     For the cotangent operator C is that library's, entry by entry, on a mesh without boundary trouble or degenerate
     triangles; M is Voronoi, as igl has it by default, where potpourri3d and LaPy's `lump=True` give a third of the
     triangles' areas. For the stencil C is not symmetric; with certify=True its columns sum to zero like its rows, and
-    its symmetric part is semidefinite. What needs symmetry (Cholesky, eigsh) has the weak pair, `lb.stiffness`.
+    its symmetric part is semidefinite. Methods that need symmetry (Cholesky, eigsh) take the weak pair, `lb.stiffness`.
 
     Parameters
     ----------
@@ -69,8 +69,8 @@ def edge_weights(
     lb
         Operator.
     normalization
-        None for the weak matrix, "rw" for the strong one, Δ itself. PyG's "sym" makes a symmetric matrix symmetric
-        again; the stencil is none.
+        None for the weak matrix, "rw" for the strong one, Δ itself. PyG's "sym" presumes a symmetric weak matrix, which
+        the stencil does not have.
 
     Raises
     ------

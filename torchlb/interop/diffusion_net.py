@@ -26,7 +26,7 @@ coalesced COO, type and device of verts                kept           kept      
 With ``symmetric=False`` L is −ΠΔ of the certified stencil, L / mass the Laplacian at a point at order p. A cloud has
 the stiffness of the surface through it.
 
-What differs on purpose: a float64 shape is not rounded to float32 in the cache; the key holds normals, options and
+Intended differences: a float64 shape is not rounded to float32 in the cache; the key holds normals, options and
 version; int32 and int64 faces are one entry; k_eig > V gives V pairs; NaN, vertices without a face and duplicates
 in a cloud are errors that say what to do; normals of a cloud are those of the surface through it, and face out.
 """
@@ -71,12 +71,12 @@ def get_operators(
 ) -> Operators:
     """(frames, mass, L, evals, evecs, gradX, gradY) of a mesh or cloud, as the original gives them.
 
-    What it keeps of the original's promises, and what it does better: the table at the head of this module.
+    The table at the head of this module lists the original's promises, and which are kept or improved.
 
     Parameters
     ----------
     verts
-        (V, 3) tensor, ℓ; the results are constants, as a warning says if it requires a gradient.
+        (V, 3) tensor, ℓ; the results are constants (a warning says so if it requires a gradient).
     faces
         (F, 3) tensor; None or empty for a point cloud.
     k_eig
@@ -84,17 +84,17 @@ def get_operators(
     op_cache_dir
         Folder of a cache (`load_or_build`), or None.
     normals
-        (V, 3). They orient the frames, made consistent, and on a cloud are the first guess of the tangent planes.
+        (V, 3). Made consistent, they orient the frames; on a cloud they are the first guess of the tangent planes.
     overwrite_cache
         Whether to compute anew.
     truncate_cache
-        Of the original; without effect, since a file with more pairs serves already.
+        Argument of the original; without effect, since a file with more pairs serves already.
     operator
         "stencil" or "cotangent".
     symmetric
         Whether L is symmetric; see above.
     **options
-        Of `LaplaceBeltrami.from_mesh` or `from_points`, such as ``order=3``.
+        Options of `LaplaceBeltrami.from_mesh` or `from_points`, such as ``order=3``.
 
     Raises ValueError for bad input.
     """
@@ -114,7 +114,7 @@ def get_operators(
         arguments |= {"cache": op_cache_dir, "k": k_eig, "overwrite": overwrite_cache}
         lb = load_or_build(double, None if cloud else faces, **arguments)
     if cloud:
-        normals = None  # which the operator has
+        normals = None  # the operator's own are oriented by them
     return _tuple(lb, k_eig, normals, symmetric, verts)
 
 
@@ -133,7 +133,7 @@ def get_all_operators(
     normals: Sequence[Tensor | None] | None = None,
     **options: Any,
 ) -> tuple[list[Tensor], ...]:
-    """Seven lists, one entry a shape, in the order of `verts_list`; arguments as for `get_operators`.
+    """Seven lists with one entry for each shape, in the order of `verts_list`; arguments as for `get_operators`.
 
     To fill a cache with all cores first: `torchlb.precompute_operators`.
     """
@@ -151,9 +151,9 @@ def get_all_operators(
 def _tuple(
     lb: LaplaceBeltrami, k_eig: int, normals: Tensor | None, symmetric: bool, like: Tensor
 ) -> Operators:
-    """The seven results of an operator in float64, in the type and on the device of `like`."""
+    """The seven results for an operator in float64, in the type and on the device of `like`."""
     frames = _frames(lb, normals)
-    turn = torch.einsum("vxn,vnd->vxd", frames[:, :2], lb.frames)  # of the frame's components
+    turn = torch.einsum("vxn,vnd->vxd", frames[:, :2], lb.frames)  # change of tangent basis
     row = lb.stencil.row
     index = torch.stack([row, lb.stencil.col])
     gradient = torch.einsum("exd,de->xe", turn[row], lb.stencil.values[1:])
@@ -168,7 +168,7 @@ def _tuple(
         matrix = _coo(index, weak, like)
     if k_eig > 0:
         basis = lb.eigenbasis(k_eig)
-        # Orthonormal in M; in the diagonal mass after Gram–Schmidt, which leaves the first constant.
+        # From orthonormal in M to orthonormal in the diagonal mass by Gram–Schmidt; the first stays constant.
         gram = basis.eigenvectors.mT @ (lb.mass[:, None] * basis.eigenvectors)
         lower = torch.linalg.cholesky(gram)
         vectors = torch.linalg.solve_triangular(lower, basis.eigenvectors.mT, upper=False).mT
@@ -181,7 +181,7 @@ def _tuple(
 
 
 def _frames(lb: LaplaceBeltrami, side: Tensor | None) -> Float[Tensor, "V 3 3"]:
-    """Rows X, Y, normal: X is e₁ in the tangent plane, or e₂ where e₁ is steep, and Y = normal × X."""
+    """Rows X, Y, normal: X is e₁ projected on the tangent plane, or e₂ where e₁ is steep, and Y = normal × X."""
     normal, known = lb.normals, False
     if side is not None:
         near = nearest_neighbors(lb.points, min(NEAREST, len(normal)))

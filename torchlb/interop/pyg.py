@@ -1,6 +1,6 @@
 """PyTorch Geometric (`pip install ".[pyg]"` in a clone): operators as keys of its `Data`, which its loaders batch.
 
-Shapes get theirs once, then loaders batch them::
+Build the operators once; loaders then batch them::
 
     transform = LaplaceBeltramiTransform(order=3, k=64, cache="operators")
     for batch in torch_geometric.loader.DataLoader([transform(data) for data in shapes], batch_size=8):
@@ -45,7 +45,7 @@ __all__ = ["LaplaceBeltramiTransform", "to_operator"]
 
 @functional_transform("laplace_beltrami")
 class LaplaceBeltramiTransform(BaseTransform):
-    """Adds the Laplace–Beltrami operator of a shape to its `Data`, under keys that PyG batches rightly.
+    """Add the Laplace–Beltrami operator of a shape to its `Data`, under keys that PyG batches correctly.
 
     =================  ===========  ============================================================================
     key                shape        what
@@ -56,15 +56,15 @@ class LaplaceBeltramiTransform(BaseTransform):
     lb_order_t         (nnz,)       the entries sorted by column, within the shape: the transpose, for the backward pass
     lb_mass            (N,)         quadrature weights, ℓ^d
     lb_frames          (N, n, d)    orthonormal tangent vectors
-    lb_pos             (N, n)       the points, by which `to_operator` sees whether `pos` was changed since
+    lb_pos             (N, n)       the points, by which `to_operator` detects a change of `pos`
     lb_normals         (N, n)       unit normals of a hypersurface
     lb_face_index      (d + 1, F)   faces of the mesh, or of the surface through the cloud; F = 0 for other clouds
-    lb_boundary        (N,)         mask of the points where the boundary condition holds; of none on a closed shape
+    lb_boundary        (N,)         mask of the points where the boundary condition holds; all False on a closed shape
     lb_weak_index      (2, nnz)     [j; i] of every entry of the weak pair, none where there is no pair
-    lb_weak_values     (nnz, 3)     stiffness, mass matrix, mass matrix of the boundary; (nnz, 4) with Robin's term
-    lb_linear_…                     the same of the linear pair
+    lb_weak_values     (nnz, 3)     stiffness, mass matrix, boundary mass matrix; (nnz, 4) with Robin's term
+    lb_linear_…                     the same for P1 elements
     lb_basis           (…,)         with k > 0: all parts of the eigenbasis in one vector, for `to_operator`
-    lb_nodes           (N,)         lb_first and the numbers after it: nodes that are permuted take theirs along
+    lb_nodes           (N,)         lb_first, lb_first + 1, …: they reveal a permutation of the nodes
     lb_first           (1,)         checksum of the positions
     lb_basis_size      (1,)         number of eigenpairs
     lb_info            str          source, options, certificate, radius as JSON
@@ -83,20 +83,20 @@ class LaplaceBeltramiTransform(BaseTransform):
     cache
         Folder, so that each shape is computed once (`load_or_build`); None to compute at every call.
     normals
-        Key, or keys of which the first present counts, of the normals of a cloud, which orient it (PyG's own transforms
-        write "norm" or "normal"); None to ignore them. A shape without has them estimated.
+        Key, or keys of which the first present one is used, of the normals that orient a cloud (PyG's own transforms
+        write "norm" or "normal"); None to ignore them. Missing normals are estimated.
     on_error
-        "raise", or "skip": a warning says why a shape has no operator, and its data come back without the keys, so that
-        ``[d for d in map(transform, shapes) if "lb_info" in d]`` goes on with the others.
+        "raise", or "skip": a warning says why a shape has no operator, and its data are returned without the keys, so
+        that ``[d for d in map(transform, shapes) if "lb_info" in d]`` keeps the others.
     **options
-        Of `LaplaceBeltrami.from_mesh` (for data with `face`) or `from_points` (without).
+        Options of `LaplaceBeltrami.from_mesh` (for data with `face`) or `from_points` (without).
 
     Raises
     ------
     ValueError
         When called, for data without `pos`, and for bad shapes.
 
-    `FaceToEdge` drops `face`, and the shape is a cloud then; a warning says so where there are no normals either.
+    `FaceToEdge` drops `face`, which makes the shape a cloud; a warning says so where there are no normals either.
     """
 
     def __init__(
@@ -116,7 +116,7 @@ class LaplaceBeltramiTransform(BaseTransform):
         self.options = options
 
     def forward(self, data: Data) -> Data:
-        """The data with the keys added; `pos` (N, n) and, for a mesh, `face` (d + 1, F) are read."""
+        """The data with the keys added; reads `pos` (N, n) and, for a mesh, `face` (d + 1, F)."""
         if data.pos is None:
             raise InputError(f"expected data with pos, got {data}")
         try:
@@ -131,7 +131,7 @@ class LaplaceBeltramiTransform(BaseTransform):
         return data
 
     def _operator(self, data: Data) -> LaplaceBeltrami:
-        """Out of the cache or built, of the mesh or the cloud."""
+        """The operator of the mesh or the cloud, from the cache or built."""
         faces = None if data.get("face") is None else data["face"].T
         options: dict[str, Any] = {"operator": self.operator, "progress": False, **self.options}
         normals = [data[key] for key in self.normals if data.get(key) is not None]
@@ -152,7 +152,7 @@ class LaplaceBeltramiTransform(BaseTransform):
 
 
 def _keys(lb: LaplaceBeltrami, k: int) -> dict[str, Any]:
-    """What is stored in the data of one shape."""
+    """The keys and values to store in the data of one shape."""
     closed = torch.zeros(lb.num_points, dtype=torch.bool)
     first = zlib.crc32(lb.points.cpu().numpy().tobytes())
     keys: dict[str, Any] = {
@@ -169,7 +169,7 @@ def _keys(lb: LaplaceBeltrami, k: int) -> dict[str, Any]:
     if len(lb.normals):
         keys["lb_normals"] = lb.normals
     kind = kind_of(lb.options.get("condition"))
-    width = 3 if kind.conserves or kind.fixes else 4  # of every shape with this condition
+    width = 3 if kind.conserves or kind.fixes else 4  # the same for every shape with this condition
     for name, pair in {"stencil": lb.stencil, "weak": lb.weak, "linear": lb.weak.near}.items():
         more = 0 if name == "stencil" else width - len(pair.values)
         keys[f"lb_{name}_index"] = torch.stack([pair.col, pair.row])
@@ -186,13 +186,13 @@ def to_operator(data: Any) -> LaplaceBeltrami:
     """The operator of a `Data` or `Batch` that went through `LaplaceBeltramiTransform`, on the device of the data.
 
     Of a `Batch` it is block-diagonal, as `LaplaceBeltrami.batch` makes it, and `lb(x)` acts on the features of all
-    nodes. Eigenbases, if they were stored, come along. Nothing is solved or sorted: cheap enough for every step.
+    nodes. It holds the eigenbases, if they were stored. Nothing is solved or sorted: cheap enough for every step.
 
     Raises
     ------
     ValueError
-        For data without the keys, whose `pos` was changed since by more than a translation, or whose nodes were put
-        into another order, since transforms permute nodes, not matrices.
+        For data without the keys, for `pos` changed since by more than a translation, and for nodes in another order,
+        since transforms permute nodes, not matrices.
     """
     if "lb_stencil_index" not in data:
         raise InputError(f"expected data that went through LaplaceBeltramiTransform, got {data}")
@@ -209,7 +209,7 @@ def to_operator(data: Any) -> LaplaceBeltrami:
 
 
 def _parts(data: Any, sizes: Int[Tensor, " S"]) -> dict[str, Any]:
-    """The block-diagonal matrices, and what else is known of the points."""
+    """The block-diagonal matrices, and the other tensors of the operator."""
     points = data.pos.to(data.lb_mass)
     boundary = data.lb_boundary
     parts = {
@@ -241,7 +241,7 @@ def _parts(data: Any, sizes: Int[Tensor, " S"]) -> dict[str, Any]:
 
 
 def _check_unchanged(data: Any, sizes: Int[Tensor, " S"]) -> None:
-    """ValueError unless `pos` is what the operator was built from, in its order, but for a translation of a shape."""
+    """Raise ValueError unless `pos` is that of the operator, in its order, up to a translation of each shape."""
     built, pos = data.lb_pos, data.pos
     count = max(
         len(built), int(data.lb_stencil_index.max()) + 1
@@ -271,7 +271,7 @@ def _check_unchanged(data: Any, sizes: Int[Tensor, " S"]) -> None:
 
 
 def _bases(data: Any, sizes: list[int]) -> list[Eigenbasis]:
-    """The eigenbasis of each shape out of the common vector."""
+    """The eigenbasis of each shape, from the concatenated vector."""
     shapes = []
     for n, k in zip(sizes, data.lb_basis_size.tolist(), strict=True):
         parts = [(k,), (n, k), (n, k), (k,)]

@@ -1,4 +1,4 @@
-"""trimesh in and out, and shapes from files: meshes through trimesh, arrays through NumPy."""
+"""Conversion from and to trimesh, and shapes from files: meshes through trimesh, arrays through NumPy."""
 
 from __future__ import annotations
 
@@ -21,11 +21,11 @@ def from_trimesh(shape: Any, *, operator: Operator = "stencil", **options: Any) 
     Parameters
     ----------
     shape
-        Vertices in ℓ. The geometries of a scene are joined, each in its place; they stay components of their own.
+        Vertices in ℓ. The geometries of a scene are placed and joined; they stay separate components.
     operator
         "stencil", or "cotangent" for libigl's.
     **options
-        Of `LaplaceBeltrami.from_mesh` or `from_points`.
+        Options of `LaplaceBeltrami.from_mesh` or `from_points`.
 
     Raises
     ------
@@ -48,12 +48,12 @@ def to_trimesh(lb: LaplaceBeltrami, faces: Any = None, **attributes: Any) -> Any
     Parameters
     ----------
     lb
-        Of N points in R³.
+        Operator of N points in R³.
     faces
         (F, 3), instead of the operator's own.
     **attributes
         (N,) or (N, C) data, such as ``curvature=lb.mean_curvature_normal()``, for `vertex_attributes`; files such as
-        .ply keep them. A point cloud has no place for them but in `metadata`.
+        .ply keep them. A point cloud holds them in `metadata`.
 
     Raises
     ------

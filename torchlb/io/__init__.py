@@ -1,5 +1,5 @@
 """Shapes and operators on disk.
 
-`files`: meshes and clouds from files. `formats`: those that are read here. `cache`: operators, found by what they were
-computed from. `precompute`: a data set at once, in parallel.
+`files`: meshes and clouds from files. `formats`: file formats that are read here. `cache`: operators, stored under a
+hash of their input. `precompute`: the operators of a data set, in parallel.
 """

@@ -1,9 +1,9 @@
-"""Operators on disk: one file each, found by what it was computed from.
+"""Operators on disk: one file each, named by a hash of its input.
 
 The file is a NumPy archive (.npz) of the `state_dict`, opened with ``allow_pickle=False``: no code is ever run from it,
-nothing but NumPy is needed to look inside, and the archive's checksums notice a single flipped bit, which neither
-safetensors nor `torch.load` do. It is written beside its place and renamed, so that a file is there whole or not at
-all, whoever else writes the same.
+only NumPy is needed to look inside, and the archive's checksums detect a single flipped bit, which neither safetensors
+nor `torch.load` do. It is written under a temporary name and renamed, so that a file is complete or absent, even if
+several processes write it.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ from torchlb.stencils.conditions import Condition
 from torchlb.version import __version__
 
 FORMAT = 3
-"""Of the file. It changes when another torchlb could not read it."""
+"""Version of the file format; it changes when other versions of torchlb could not read the file."""
 
 
 def load_or_build(
@@ -44,9 +44,9 @@ def load_or_build(
     progress: bool = True,
     **options: Any,
 ) -> LaplaceBeltrami:
-    """The operator of a mesh or cloud out of the folder `cache`; built and stored there if it is not in it yet.
+    """Load the operator of a mesh or cloud from the folder `cache`, or build and store it there.
 
-    What is stored is float64 whatever the input's type, and it is found by its content (`operator_key`): by positions,
+    The stored operator is float64 whatever the input's type, under a hash of its input (`operator_key`): positions,
     faces, every option, and the version of torchlb. Float32 positions and their float64 copy, int32 and int64 faces,
     arrays and tensors share an entry. Any number of processes may use one folder at the same time.
 
@@ -61,13 +61,13 @@ def load_or_build(
     k
         Number of eigenpairs to have in the file. A file with fewer is completed; one with more serves.
     overwrite
-        Whether to build it anew even so.
+        Whether to build the operator even if it is stored.
     progress, **options
-        Of the builder, such as ``order=5``.
+        Arguments of the builder, such as ``order=5``.
 
     Returns what the builder returns, in the floating type of `vertices`, on the CPU, and raises what it raises; an
-    InputError if `cache` is a file, an OSError if the folder cannot be read. A `CacheWarning` tells of a file that is
-    damaged or of another torchlb, which is replaced, and of a folder that cannot be written.
+    InputError if `cache` is a file, an OSError if the folder cannot be read. A `CacheWarning` reports a file that is
+    damaged or of another version, which is replaced, and a folder that cannot be written.
 
     >>> import tempfile
     >>> from torchlb.surfaces import Sphere
@@ -102,7 +102,7 @@ def operator_key(
     operator: Operator = "stencil",
     **options: Any,
 ) -> str:
-    """Name of an operator in a cache: SHA-256 over positions, faces, options and version, 64 hexadecimal digits.
+    """Name of an operator in a cache: SHA-256 of positions, faces, options and version, 64 hexadecimal digits.
 
     Parameters are those of `load_or_build`; defaults and the same values spelt out give the same key, as do integers
     and floats of any width. Faces that repeat a corner, which no operator uses, do not count.
@@ -117,7 +117,7 @@ def operator_key(
 
 
 def _key(operator: str, points: Tensor, faces: Tensor | None, options: dict[str, Any]) -> str:
-    """SHA-256 of a canonical form: JSON for what is small, little-endian bytes for arrays."""
+    """SHA-256 of a canonical form: JSON for plain values, little-endian bytes for arrays."""
     digest = hashlib.sha256()
     arrays = {"points": points, "faces": faces}
     plain: dict[str, Any] = {"operator": operator, "version": __version__}
@@ -139,7 +139,7 @@ def _key(operator: str, points: Tensor, faces: Tensor | None, options: dict[str,
 
 
 def _cached(path: Path, key: str) -> LaplaceBeltrami | None:
-    """The operator in a file, None if there is no file or a damaged one, which a warning names."""
+    """The operator in a file; None without a file, or with a warning for a damaged one."""
     try:
         lb, header = _read(path)
         if header["key"] != key:
@@ -153,7 +153,7 @@ def _cached(path: Path, key: str) -> LaplaceBeltrami | None:
 
 
 def _store(lb: LaplaceBeltrami, path: Path, key: str) -> None:
-    """Into the cache, or with a warning not: what was computed is not lost over it."""
+    """Store an operator in the cache; warn if that fails, since the result must not be lost."""
     try:
         save_operator(lb, path, key=key)
     except OSError as error:
@@ -168,15 +168,15 @@ def save_operator(lb: LaplaceBeltrami, path: str | Path, *, key: str = "") -> No
     lb
         Any operator, also a batch.
     path
-        Of the file, best with the ending .npz. Its folder is made if missing; a file that is there is replaced at once
-        and as a whole, also if the program is killed or several write it.
+        Path of the file, best with the ending .npz. Its folder is made if missing; an existing file is replaced as a
+        whole, even if the program is killed or several write it.
     key
-        What `operator_key` calls it, for a file of a cache.
+        Its `operator_key`, for a file of a cache.
 
     Raises
     ------
     OSError
-        Where the file cannot be written; nothing is left of it then.
+        Where the file cannot be written; no part of it remains.
     """
     check_operator(lb)
     path = Path(path).expanduser()
@@ -195,7 +195,7 @@ def save_operator(lb: LaplaceBeltrami, path: str | Path, *, key: str = "") -> No
 
 @contextmanager
 def written_whole(path: Path, mode: str, **options: Any) -> Iterator[IO[Any]]:
-    """A file beside its place, which takes it when all is on the disk; nothing is left of it where that fails."""
+    """A temporary file that is renamed to `path` once all data are on disk, and removed on failure."""
     # Not tempfile: its files are readable by their owner alone, and a cache is shared.
     beside = path.with_name(f".{path.name}.{uuid.uuid4().hex}.tmp")
     try:
@@ -207,14 +207,14 @@ def written_whole(path: Path, mode: str, **options: Any) -> Iterator[IO[Any]]:
     except BaseException:
         beside.unlink(missing_ok=True)
         raise
-    if os.name == "posix":  # the name, too, is on the disk then
+    if os.name == "posix":  # flush the directory entry, too
         folder = os.open(path.parent, os.O_RDONLY)
         os.fsync(folder)
         os.close(folder)
 
 
 def _compact(tensor: Tensor) -> Tensor:
-    """Indices in half the bytes where they fit, and the half types, which NumPy lacks in part, as float32."""
+    """Indices as int32 where they fit, and half-precision types, which NumPy lacks in part, as float32."""
     if tensor.dtype == torch.int64 and (len(tensor) == 0 or int(tensor.max()) < 2**31):
         return tensor.to(torch.int32)
     return tensor.float() if tensor.dtype in (torch.bfloat16, torch.float16) else tensor
@@ -226,24 +226,21 @@ def load_operator(path: str | Path) -> LaplaceBeltrami:
     Raises
     ------
     FileNotFoundError
-        If there is none.
+        If there is no such file.
     OperatorFileError
-        If it is something else, damaged, or of a torchlb with another format.
+        If it is something else, damaged, or of a version with another format.
     """
     return _read(Path(path))[0]
 
 
 def describe_file(path: str | Path) -> dict[str, Any]:
-    """What a file of `save_operator` holds: "version" of torchlb, "key", and "operator", read and checked in full.
-
-    Raises as `load_operator`.
-    """
+    """Contents of a file of `save_operator`: "version" of torchlb, "key", and "operator"; errors of `load_operator`."""
     lb, header = _read(Path(path))
     return {"version": header["version"], "key": header["key"], "operator": lb}
 
 
 def _read(path: Path) -> tuple[LaplaceBeltrami, dict[str, Any]]:
-    """Operator and header of a file, in full: every checksum is looked at."""
+    """Operator and header of a file, read in full, so that every checksum is verified."""
     path = path.expanduser()
     try:
         with np.load(path, allow_pickle=False) as archive:

@@ -17,14 +17,14 @@ from torchlb.operator.cleaning import merged, proper_faces, triangles_of
 from torchlb.operator.inputs import as_tensor
 
 SUFFIXES = tuple(sorted([".glb", ".gltf", ".npy", ".npz", ".stl", *READERS]))
-"""Of files that `read_shape` takes."""
+"""Endings of the files that `read_shape` takes."""
 STEPS = 4
-"""Of single precision at the largest coordinate, by which corners of an .stl that are one vertex may differ."""
+"""Largest difference of coinciding corners in an .stl, in steps of float32 at the largest coordinate."""
 Shape = tuple[Float[Tensor, "N n"], Int[Tensor, "F v"] | None]
 
 
 def arrays_of(shape: Any) -> Shape:
-    """Vertices, and faces or None, of what trimesh read."""
+    """Vertices, and faces or None, of an object of trimesh."""
     import trimesh
 
     if isinstance(shape, trimesh.Scene):
@@ -51,7 +51,7 @@ def read_shape(path: str | Path) -> Shape:
     Raises
     ------
     FileNotFoundError
-        If there is none.
+        If there is no such file.
     ValueError
         If it is no shape; the message names the file.
     """
@@ -73,7 +73,7 @@ def read_shape(path: str | Path) -> Shape:
             vertices, faces = arrays_of(loaded)
         if vertices.ndim != 2 or vertices.numel() == 0:
             raise InputError(f"vertices of shape {tuple(vertices.shape)}, expected (N, n)")
-    except Exception as error:  # each reader has its own
+    except Exception as error:  # each reader raises its own
         raise InputError(
             f"{path}: not a mesh or cloud that can be read; {', '.join(SUFFIXES)} can ({error})"
         ) from error
@@ -91,7 +91,7 @@ def may_be_shape(path: Path) -> bool:
 def _triangulated(
     vertices: Float[np.ndarray, "N n"], corners: Int[np.ndarray, " C"], sizes: Int[np.ndarray, " P"]
 ) -> Shape:
-    """With polygons as triangles, in their order; what has less than three corners is left out."""
+    """Split polygons into triangles, in their order; those with fewer than three corners are left out."""
     places, every = torch.from_numpy(vertices), torch.from_numpy(corners)
     bad = corners[(corners < 0) | (corners >= len(vertices))]
     if len(bad):
@@ -109,10 +109,9 @@ def _triangulated(
 
 
 def _sewn(vertices: Float[Tensor, "N 3"], faces: Int[Tensor, "F 3"]) -> tuple[Tensor, Tensor]:
-    """The corners of triangles as vertices: equal ones are one, and at open edges those that differ by rounding.
+    """Merge the corners of triangles into vertices: equal corners, and at open edges those that differ by rounding.
 
-    An open edge is that of one triangle, and the ends of an edge stay two. So no vertices of a closed mesh are merged,
-    however fine it is.
+    An open edge belongs to one triangle; ends of an edge are never merged. So a closed mesh keeps all its vertices.
     """
     vertices, number = torch.unique(vertices, dim=0, return_inverse=True)
     faces = number[faces]

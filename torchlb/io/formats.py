@@ -1,7 +1,7 @@
-"""What is read here, and not by trimesh: polygons of .obj, .off and .ply, points of .pcd, tables of numbers.
+"""Readers of polygons in .obj, .off and .ply, points in .pcd, and tables of numbers.
 
-Each reader gives the vertices, (N, 3) or (N, n), and the corners of all polygons, one after the other, with the number
-of corners of each; without polygons the shape is a cloud.
+Each reader returns the vertices, (N, 3) or (N, n), the concatenated corners of all polygons, and the number of corners
+of each; a shape without polygons is a cloud.
 """
 
 from __future__ import annotations
@@ -23,11 +23,11 @@ TYPES = {
     **{"float": "f4", "double": "f8", "int8": "i1", "uint8": "u1", "int16": "i2", "uint16": "u2"},
     **{"int32": "i4", "uint32": "u4", "float32": "f4", "float64": "f8"},
 }
-"""Those of .ply, in NumPy's words."""
+"""Types of .ply, as NumPy names them."""
 
 
 def _polygons(vertices: Any, faces: Any) -> Polygons:
-    """Of faces as rows of an array, or as lists of corners."""
+    """Vertices and polygons, from faces as rows of an array or as lists of corners."""
     if isinstance(faces, np.ndarray):
         sizes, corners = np.full(len(faces), faces.shape[1]), faces.ravel()
     else:
@@ -71,7 +71,7 @@ def read_off(path: Path) -> Polygons:
 
 
 def read_ply(path: Path) -> Polygons:
-    """Vertices, faces and strips of triangles of a .ply, ascii or binary."""
+    """Vertices, faces and triangle strips of a .ply, ascii or binary."""
     data = path.read_bytes()
     end = re.search(rb"end_header[ \t]*\r?\n", data)
     if end is None or not data.startswith(b"ply"):
@@ -107,16 +107,16 @@ def read_ply(path: Path) -> Polygons:
 
 
 def _type(name: str, order: str) -> str:
-    """A type in NumPy's words; an ascii file is taken as a binary one of doubles alone."""
+    """NumPy's name of a type; an ascii file is read as a binary one of doubles."""
     return order + TYPES[name] if order else "<f8"
 
 
 def _element(
     data: bytes, at: int, count: int, properties: list[tuple[str, str, str | None]]
 ) -> tuple[dict[str, Any], int]:
-    """Of each property its values in every row, lists of them for a list; and where the next element starts.
+    """Values of each property in every row, a list of arrays for a list, and the offset of the next element.
 
-    Where all rows are as long as the first, at once.
+    If all rows are as long as the first, they are read at once.
     """
     if count == 0:
         return {name: [] for name, *_ in properties}, at
@@ -154,7 +154,7 @@ def _row(
 
 
 def _strip(corners: Int[np.ndarray, " C"]) -> Iterator[np.ndarray]:
-    """Triangles of strips, one after the other with −1 between them; every second one is wound the other way.
+    """Triangles of concatenated strips, separated by −1; every second one has the opposite orientation.
 
     >>> [triangle.tolist() for triangle in _strip(np.array([0, 1, 2, 3, -1, 4, 5, 6]))]
     [[0, 1, 2], [3, 2, 1], [4, 5, 6]]
@@ -163,12 +163,12 @@ def _strip(corners: Int[np.ndarray, " C"]) -> Iterator[np.ndarray]:
         strip = strip[strip != -1]
         for i in range(len(strip) - 2):
             triangle = strip[i : i + 3]
-            if len(set(triangle)) == 3:  # others only lead on
+            if len(set(triangle)) == 3:  # degenerate triangles only continue the strip
                 yield triangle[::-1] if i % 2 else triangle
 
 
 def read_pcd(path: Path) -> Polygons:
-    """The points of a .pcd, ascii or binary, of which NaN stands for none."""
+    """The points of a .pcd, ascii or binary, without those that are NaN."""
     data, header = path.read_bytes(), {}
     at = 0
     while "DATA" not in header and at < len(data):
@@ -196,8 +196,8 @@ def read_pcd(path: Path) -> Polygons:
 def read_table(path: Path) -> Polygons:
     """Points from the columns x, y and z of a table of numbers, or its first three (two, if it has no more).
 
-    Columns are parted by commas, semicolons or blanks. Lines before the numbers, such as names of the columns or
-    the number of points, and comments by # or // are left out.
+    Columns are separated by commas, semicolons or blanks. Lines before the numbers, such as names of the columns or the
+    number of points, and comments by # or // are left out.
     """
     lines = _numbers(path)
     names, first = next(lines, ([], []))
@@ -221,7 +221,7 @@ def begins_with_points(path: Path) -> bool:
 
 
 def _numbers(path: Path) -> Iterator[tuple[list[str], list[float]]]:
-    """Rows of a table, with the words of the line before the first, in small letters."""
+    """Rows of a table, each with the lower-case words of the line before the first row."""
     names: list[str] = []
     begun = False
     with open(path, encoding="utf-8-sig", errors="replace") as file:
@@ -254,4 +254,4 @@ READERS: dict[str, Callable[[Path], Polygons]] = {
     ".ply": read_ply,
     **dict.fromkeys((".asc", ".csv", ".pts", ".txt", ".xyz"), read_table),
 }
-"""By the ending of the file."""
+"""Readers by file ending."""

@@ -1,7 +1,7 @@
-"""A data set at once: every shape's operator into one cache, in parallel, over and over until all is there.
+"""The operators of a data set in one cache, in parallel; repeated calls complete it.
 
-What is there already is not computed again, so that a run that was killed goes on by the same call; a shape that fails
-does not stop the others. The workers are joblib's: the cores of this machine, or within ``joblib.parallel_config`` the
+Stored operators are not computed again, so that the same call resumes a run that was killed; a shape that fails does
+not stop the others. The workers are joblib's: the cores of this machine, or within ``joblib.parallel_config`` the
 machines of a Dask or Ray cluster (`docs/precompute.md`).
 """
 
@@ -26,29 +26,29 @@ from torchlb.operator.cleaning import cleaned
 from torchlb.operator.dispatch import Operator, check_options_of
 
 TABLE = "precompute.csv"
-"""File in the cache that lists what became of every shape in the last run."""
+"""File in the cache that lists the result of every shape in the last run."""
 STALE = 24 * 3600
-"""Age, s, at which what a killed writer left is removed. Nobody writes one file for a day."""
+"""Age, s, after which temporary files of killed writers are removed. Nobody writes one file for a day."""
 
 
 @dataclass(frozen=True)
 class ShapeResult:
-    """What became of one shape.
+    """Result of one shape.
 
     Attributes
     ----------
     name
         File, relative to the folder, or "shape 7" for arrays.
     status
-        "built", "cached" (it was there) or "failed".
+        "built", "cached" (stored before) or "failed".
     points
         Number of points; 0 if failed.
     seconds
-        That it took.
+        Time taken.
     file
-        Its operator, for `load_operator`; empty if failed.
+        File of its operator, for `load_operator`; empty if failed.
     message
-        Why it failed, or what it was warned of.
+        Reason of the failure, or the warnings.
     """
 
     name: str
@@ -61,12 +61,12 @@ class ShapeResult:
 
 @dataclass(frozen=True)
 class PrecomputeReport:
-    """What became of every shape, in the order given. `print` it for the counts and a table of failures.
+    """Results of all shapes, in their order. `print` it for the counts and a table of failures.
 
     Attributes
     ----------
     results
-        One for each shape.
+        A `ShapeResult` for each shape.
     skipped
         Files of the folder that are no shapes, by their endings or, of .txt and .csv, by their first lines.
     """
@@ -76,16 +76,16 @@ class PrecomputeReport:
 
     @property
     def failed(self) -> tuple[ShapeResult, ...]:
-        """Those that failed."""
+        """Results of the shapes that failed."""
         return tuple(result for result in self.results if result.status == "failed")
 
     @property
     def files(self) -> dict[str, Path]:
-        """File of each shape's operator by its name, those that failed left out."""
+        """File of each shape's operator by its name, without failed shapes."""
         return {result.name: Path(result.file) for result in self.results if result.file}
 
     def __str__(self) -> str:
-        """Counts, then a line for each shape that failed or was warned of."""
+        """Counts, then a line for each shape that failed or had warnings."""
         counts = Counter(result.status for result in self.results)
         parts = [f"{counts[status]} {status}" for status in ("built", "cached", "failed")]
         lines = [", ".join([f"{len(self.results)} shapes", *parts])]
@@ -127,12 +127,12 @@ def precompute_operators(
     progress: bool = True,
     **options: Any,
 ) -> PrecomputeReport:
-    """Build and store the operators of a data set; a training script then has each from `load_or_build` at once.
+    """Build and store the operators of a data set; a training script then loads each by `load_or_build`.
 
     Parameters
     ----------
     shapes
-        A folder, searched in depth for files that `torchlb.read_shape` takes, of .txt and .csv those whose rows have
+        A folder, searched recursively for files that `torchlb.read_shape` takes, of .txt and .csv those whose rows have
         three numbers or more; or a list of files or of (vertices, faces) pairs, faces None for a cloud.
     out
         Folder of the cache. ``load_or_build(vertices, faces, cache=out, …)`` with the same options finds the entries.
@@ -142,15 +142,14 @@ def precompute_operators(
         Processes, each with one thread; −1 for one per core. Within ``joblib.parallel_config(backend="dask")`` the
         workers are those of the Dask client.
     clean
-        Whether meshes go through `clean_mesh` first, and clouds through `clean_points`; the data set then has to do the
-        same.
+        Whether to apply `clean_mesh` to meshes, and `clean_points` to clouds; the data set then has to do the same.
     progress
         Whether to show a bar, on a terminal.
     **options
-        Of `LaplaceBeltrami.from_mesh` or `from_points`.
+        Options of `LaplaceBeltrami.from_mesh` or `from_points`.
 
-    Returns what became of each shape; also in `out`/precompute.csv. No exception of a shape gets out. Raises ValueError
-    or TypeError for options that are none, a folder that is missing or has no shapes, before any work.
+    Returns the result of each shape; also in `out`/precompute.csv. Exceptions of shapes are caught. Raises ValueError
+    or TypeError for unknown options, a folder that is missing or has no shapes, before any work.
     """
     check_options_of(operator, options)
     cache = Path(out).expanduser()
@@ -177,7 +176,7 @@ def precompute_operators(
 def _sources(
     shapes: str | Path | Iterable[Any], cache: Path
 ) -> tuple[list[tuple[str, Any]], tuple[str, ...]]:
-    """Name and file, or arrays, of every shape; and the names of files in the folder that are none."""
+    """Name and file, or arrays, of every shape, and the names of other files in the folder."""
     if isinstance(shapes, str | Path):
         folder = Path(shapes).expanduser()
         if not folder.is_dir():
@@ -209,7 +208,7 @@ def _sources(
 
 
 def _run(tasks: Sequence[_Task], workers: int) -> Iterator[tuple[int, ShapeResult]]:
-    """Results as they come. Where a worker dies, those that may have killed it run again, each by itself."""
+    """Yield results as they come. Where a worker dies, the tasks that may have killed it run again, each by itself."""
     import joblib
 
     pending = dict(enumerate(tasks))
@@ -218,7 +217,7 @@ def _run(tasks: Sequence[_Task], workers: int) -> Iterator[tuple[int, ShapeResul
             for index, result in _parallel(workers, pending):
                 del pending[index]
                 yield index, result
-        except Exception:  # not of a shape, which the worker catches: the worker itself is gone
+        except Exception:  # the worker catches errors of a shape: here the worker itself died
             in_flight = 2 * joblib.effective_n_jobs(workers)
             for index in list(pending)[:in_flight]:
                 task = pending.pop(index)
@@ -243,7 +242,7 @@ def _parallel(workers: int, tasks: dict[int, _Task]) -> Iterable[tuple[int, Shap
 
 
 def _solve(index: int, task: _Task) -> tuple[int, ShapeResult]:
-    """One shape on one thread; whatever goes wrong with it becomes its result."""
+    """Compute one shape on one thread; any exception becomes its result."""
     start = time.perf_counter()
     try:
         with threads_for(0), warnings.catch_warnings(record=True) as caught:
@@ -260,12 +259,12 @@ def _solve(index: int, task: _Task) -> tuple[int, ShapeResult]:
 
 
 def concerns_the_shape(warning: Warning | str) -> bool:
-    """Whether a warning tells the user of a shape something; torch's about its own sparse tensors does not."""
+    """Whether a warning concerns the shape; torch's about its own sparse tensors does not."""
     return isinstance(warning, UserWarning) and not str(warning).startswith("Sparse ")
 
 
 def _stored(task: _Task, vertices: Any, faces: Any) -> tuple[str, int, str]:
-    """Status, number of points and file of one shape, whose operator is in the cache then."""
+    """Store the operator of one shape; return its status, number of points and file."""
     if task.clean:
         vertices, faces = cleaned(vertices, faces)
     key = operator_key(vertices, faces, operator=task.operator, **task.options)
@@ -280,7 +279,7 @@ def _stored(task: _Task, vertices: Any, faces: Any) -> tuple[str, int, str]:
 
 
 def _identity(path: Path) -> tuple[int, int] | None:
-    """What changes when a file is replaced."""
+    """Inode and time of a file, which change when it is replaced; None without a file."""
     try:
         found = path.stat()
     except FileNotFoundError:
@@ -289,7 +288,7 @@ def _identity(path: Path) -> tuple[int, int] | None:
 
 
 def _remove_stale(cache: Path) -> None:
-    """Remove what writers that were killed left long ago."""
+    """Remove old temporary files of writers that were killed."""
     for path in cache.glob(".*.tmp"):
         try:
             if time.time() - path.stat().st_mtime > STALE:

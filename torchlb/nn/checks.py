@@ -1,4 +1,4 @@
-"""What every layer asks of its features."""
+"""Checks of the features that layers take."""
 
 from __future__ import annotations
 
@@ -17,13 +17,9 @@ def check_features(
 ) -> torch.dtype:
     """The type to compute in: that of features and parameters, at least float32; the operator is cast to it.
 
-    Warns where the operator holds a basis of fewer than k pairs: it is solved anew in the forward pass and kept by
-    that operator alone, so that those made for every step, as by a data loader, pay for it at each.
-
-    Raises
-    ------
-    InputError
-        For a wrong shape, and for features of another type than the parameters, unless autocast made them so.
+    Warns where the operator holds a basis of fewer than k pairs: the forward pass solves for more and only that
+    operator keeps them, so that operators made for every step, as by a data loader, pay for it each time. Raises
+    InputError for a wrong shape, and for features of another type than the parameters, unless autocast made them so.
     """
     check_shape(x, lb)
     if x.shape[-1] != channels:
@@ -45,9 +41,9 @@ def check_features(
 
 
 def unrounded(x: Tensor, lb: LaplaceBeltrami, channels: int, parameter: Tensor) -> Tensor:
-    """Features in the type of the parameters, where autocast made them shorter, for layers whose results are derived.
+    """Features in the type of the parameters, where autocast rounded them, for layers that are differentiated.
 
-    Rounding that comes before a gradient grows by 1/h. Errors as for `check_features`.
+    Rounding before a gradient grows by 1/h. Errors as for `check_features`.
     """
     check_features(x, lb, channels, parameter)
     return x.to(parameter.dtype)

@@ -1,4 +1,4 @@
-"""Heat flow for times that are learned, one of each channel."""
+"""Heat flow for learned times, one for each channel."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ SHARPNESS = 100.0
 
 
 class LearnedTimes(nn.Module):
-    """A time of its own for each channel, positive by parametrisation."""
+    """A learned time for each channel, positive by parametrisation."""
 
     def __init__(self, channels: int, init_time: float) -> None:
         super().__init__()
@@ -37,21 +37,21 @@ class LearnedTimes(nn.Module):
 
 
 class Diffusion(LearnedTimes):
-    """Diffusion of each channel for a time of its own, which is learned: y_c = e^{t_c Δ}x_c.
+    """Diffusion of each channel for a learned time: y_c = e^{t_c Δ}x_c.
 
     Parameters
     ----------
     channels
         C.
     method
-        "deflated" (exact at every scale), "spectral" (of the original DiffusionNet: Φe^{−λt}Φᵀπ, which drops everything
-        beyond the basis), "rational" (no basis; solves on the CPU).
+        "deflated" (exact at every scale), "spectral" (as in the original DiffusionNet: Φe^{−λt}Φᵀπ, which drops
+        everything beyond the basis), "rational" (no basis; solves on the CPU).
     k
         Number of eigenpairs for the first two.
     init_time
-        ℓ², at the start. Shapes of radius about one are expected.
+        Initial time, ℓ². Shapes of radius about one are expected.
     tolerance
-        Of all but "spectral", see `heat_flow`.
+        Tolerance of the methods other than "spectral", see `heat_flow`.
 
     Attributes
     ----------
@@ -100,7 +100,7 @@ class Diffusion(LearnedTimes):
 
 
 def raw_of_time(time: Float[Tensor, " C"]) -> Float[Tensor, " C"]:
-    """The parameter of `Diffusion` whose time is the given one, t > 0.
+    """The parameter of `Diffusion` for given times t > 0.
 
     >>> bool(softplus(raw_of_time(torch.tensor([1e-8, 0.5])), beta=100.0).allclose(torch.tensor([1e-8, 0.5])))
     True

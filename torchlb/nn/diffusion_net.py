@@ -1,8 +1,8 @@
 """DiffusionNet (Sharp, Attaiki, Crane, Ovsjanikov 2022) on any operator: diffusion, gradients, pointwise networks.
 
-What differs from the original: the operator comes in as one argument, `forward(x, lb)`; learned times are positive by
-parametrisation; batches of different shapes are one operator; diffusion may be other than "spectral". Weights trained
-on the original load: `load_original_state_dict`.
+Differences from the original: the operator is one argument, `forward(x, lb)`; learned times are positive by
+parametrisation; batches of different shapes are one operator; diffusion has other methods than "spectral". Weights
+trained on the original load: `load_original_state_dict`.
 """
 
 from __future__ import annotations
@@ -28,11 +28,11 @@ from torchlb.pde.heat import Method
 Place = Literal["vertices", "edges", "faces", "global_mean"]
 Block = Literal["diffusion", "implicit", "poisson"]
 LEAST_TIME = 1e-8
-"""What the original cuts its times to before it uses them, ℓ²."""
+"""Least time in the original, which clamps its times to it before use, ℓ²."""
 
 
 class DiffusionNetBlock(nn.Module):
-    """Diffusion, gradient features of what has diffused, a pointwise network of all three, and a skip connection.
+    """Diffusion, gradient features of the result, a pointwise network of x and both, and a skip connection.
 
     Parameters
     ----------
@@ -41,11 +41,11 @@ class DiffusionNetBlock(nn.Module):
     hidden
         Widths of the hidden layers of the pointwise network; [width, width] by default.
     dropout
-        Whether that network drops half of its hidden values while it trains.
+        Whether that network drops half of its hidden values in training.
     gradient_features, rotations
-        Whether there are any, and whether they turn: see `GradientFeatures`.
+        Whether there are gradient features, and whether they rotate gradients: see `GradientFeatures`.
     method, k
-        Of `Diffusion`; method="implicit" takes `ImplicitDiffusion` in its place.
+        Arguments of `Diffusion`; method="implicit" uses `ImplicitDiffusion` instead.
     """
 
     def __init__(
@@ -91,7 +91,7 @@ class DiffusionNet(nn.Module):
     Parameters
     ----------
     in_channels, out_channels
-        Of the features and of the output.
+        Channels of the features and of the output.
     width
         Channels of the blocks.
     num_blocks
@@ -103,14 +103,14 @@ class DiffusionNet(nn.Module):
     last_activation
         Applied to the output, such as ``lambda y: y.log_softmax(-1)``.
     hidden, dropout, gradient_features, rotations
-        Of the blocks.
+        Arguments of the blocks.
     method, k
-        Of "diffusion" blocks.
+        Arguments of "diffusion" blocks.
 
     Raises
     ------
     InputError
-        For a block, a method or a place that is none.
+        For an unknown block, method or value of `outputs_at`.
 
     Examples
     --------
@@ -162,7 +162,7 @@ class DiffusionNet(nn.Module):
         faces: Int[Tensor, "F corners"] | None = None,
         edges: Int[Tensor, "E ends"] | None = None,
     ) -> Tensor:
-        """Outputs (…, N, out_channels), or (…, F, ·), (…, E, ·), (…, ·) at the place asked for.
+        """Outputs (…, N, out_channels), or (…, F, ·), (…, E, ·), (…, ·), according to `outputs_at`.
 
         Parameters
         ----------
@@ -171,7 +171,7 @@ class DiffusionNet(nn.Module):
         lb
             Operator of one shape or of a batch, whose global mean is (S, out_channels), one for each shape.
         faces, edges
-            For outputs there; in a batch, those of shape s moved by ``lb.offsets[s]``.
+            For outputs at faces or edges; in a batch, the indices of shape s moved by ``lb.offsets[s]``.
         """
         check_features(x, lb, self.in_channels, self.first_lin.weight)
         y = self.first_lin(x)
@@ -186,24 +186,23 @@ class DiffusionNet(nn.Module):
         return y if self.last_activation is None else self.last_activation(y)
 
     def load_original_state_dict(self, state: Mapping[str, Tensor]) -> None:
-        """Take the weights of a trained network of the original code; strict.
+        """Load the weights of a trained network of the original code; strict.
 
-        ===============================================  ==========================================
-        original                                         here
-        ===============================================  ==========================================
-        first_lin.*, last_lin.*                          the same
-        block_{i}.diffusion.diffusion_time               blocks.{i}.diffusion.raw_time, by its time
-        block_{i}.gradient_features.A_re.weight (…)      blocks.{i}.gradient_features.A_re.weight
-        block_{i}.mlp.miniMLP_mlp_layer_{jjj}.weight     blocks.{i}.mlp.linear_{j}.weight
-        ===============================================  ==========================================
+        ===============================================  ========================================== original
+        here ===============================================  ========================================== first_lin.*,
+        last_lin.*                          the same block_{i}.diffusion.diffusion_time
+        blocks.{i}.diffusion.raw_time, by its time block_{i}.gradient_features.A_re.weight (…)
+        blocks.{i}.gradient_features.A_re.weight block_{i}.mlp.miniMLP_mlp_layer_{jjj}.weight
+        blocks.{i}.mlp.linear_{j}.weight ===============================================
+        ==========================================
 
-        Times below 1e-8, which the original raises to it when it runs, become 1e-8. With method="spectral" and
-        the same operators the network then computes what the original did.
+        Times below 1e-8, which the original raises to it when it runs, become 1e-8. With method="spectral" and the same
+        operators the network then computes the original's results.
 
         Raises
         ------
         InputError
-            That lists the missing and the unexpected keys, or a shape that differs.
+            For missing or unexpected keys, which it lists, or a shape that differs.
         """
         own = self.state_dict()
         names = {_original_name(key): key for key in own}
@@ -240,7 +239,7 @@ def _original_name(key: str) -> str:
 
 
 def _checked_corners(place: str, corners: Tensor | None, lb: LaplaceBeltrami) -> Tensor:
-    """The corners of faces or edges, where they are those of every shape."""
+    """The corners of faces or edges, checked to have valid indices and, in a batch, to be moved by the offsets."""
     if corners is None:
         raise InputError(f"outputs_at={place!r} needs {place}, got None")
     expected = 3 if place == "faces" else 2

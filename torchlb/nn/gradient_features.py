@@ -1,4 +1,4 @@
-"""Features of gradients that no choice of tangent frames changes."""
+"""Features of gradients that do not depend on the choice of tangent frames."""
 
 from __future__ import annotations
 
@@ -13,15 +13,15 @@ from torchlb.operator.laplace_beltrami import LaplaceBeltrami
 
 
 class TangentMap(nn.Module):
-    """A learned linear map of the gradients of C channels, Σ_j A_cj ∇x_j, that commutes with turns of the frames.
+    """A learned linear map of the gradients of C channels, Σ_j A_cj ∇x_j, that commutes with rotations of the frames.
 
     Parameters
     ----------
     channels
         C.
     rotations
-        Whether A is complex, so that it also turns gradients in the tangent plane; that needs a surface whose normals
-        are oriented consistently (a mesh, or a cloud with oriented normals). Without it, any dimension.
+        Whether A is complex, so that it also rotates gradients in the tangent plane; that needs a surface whose normals
+        are oriented consistently (a mesh, or a cloud with oriented normals). A real A takes any dimension.
     """
 
     def __init__(self, channels: int, *, rotations: bool = True) -> None:
@@ -34,7 +34,7 @@ class TangentMap(nn.Module):
             self.A = nn.Linear(channels, channels, bias=False)
 
     def gradients(self, x: Tensor, lb: LaplaceBeltrami) -> tuple[Tensor, Tensor]:
-        """∇x in the frames, and what the map makes of it, (…, N, d, C); x of (N, C) or (B, N, C)."""
+        """∇x in the frames, and its image under the map, (…, N, d, C); x of (N, C) or (B, N, C)."""
         dtype = check_features(x, lb, self.channels, next(self.parameters()))
         if self.rotations and lb.dim != 2:
             raise InputError(f"rotations need a surface, got dim={lb.dim}; use rotations=False")
@@ -42,7 +42,7 @@ class TangentMap(nn.Module):
         gradient = torch.stack(rows, dim=-2)
         if not self.rotations:
             return gradient, self.A(gradient)
-        # z ↦ Az of complex numbers is a real map of both parts side by side
+        # the complex z ↦ Az as a real map of real and imaginary parts, concatenated
         upper = torch.cat([self.A_re.weight, -self.A_im.weight], dim=1)
         lower = torch.cat([self.A_im.weight, self.A_re.weight], dim=1)
         mapped = linear(gradient.flatten(-2), torch.cat([upper, lower]))

@@ -1,4 +1,4 @@
-"""Diffusion by one implicit step, for learned times: a solve, and no eigenbasis."""
+"""Diffusion by one implicit step for learned times: a linear solve, without an eigenbasis."""
 
 from __future__ import annotations
 
@@ -14,20 +14,20 @@ from torchlb.pde.solves import TOLERANCE, implicit_step
 
 
 class ImplicitDiffusion(LearnedTimes):
-    """One implicit step of each channel for a time of its own, which is learned: y_c = (1 − t_c Δ)⁻¹x_c.
+    """One implicit step of each channel for a learned time: y_c = (1 − t_c Δ)⁻¹x_c.
 
-    It decays as 1/(1 + tλ) where `Diffusion` does as e^{−tλ}: as far, and less sharply. No eigenbasis is needed, and
-    nothing is dropped. With a weak pair, conjugate gradients with the factors of a few times that all channels share,
-    kept with the operator; without one, an LU for each time (`method.md`, section 10).
+    It decays as 1/(1 + tλ) where `Diffusion` does as e^{−tλ}: as far, and less sharply. It needs no eigenbasis and
+    drops nothing. Conjugate gradients use the factors of a few times that all channels share, kept with the operator
+    (`method.md`, section 10).
 
     Parameters
     ----------
     channels
         C.
     init_time
-        ℓ², at the start. Shapes of radius about one are expected.
+        Initial time, ℓ². Shapes of radius about one are expected.
     tolerance
-        Of the solves, relative; None for 1e-5 in float32, 1e-10 in float64. 1e-3 is enough to train by.
+        Relative tolerance of the solves; None for 1e-5 in float32, 1e-10 in float64. 1e-3 is enough for training.
 
     Attributes
     ----------

@@ -1,4 +1,4 @@
-"""Networks that act on every point by itself."""
+"""Networks that act at each point."""
 
 from __future__ import annotations
 
@@ -10,13 +10,13 @@ from torch import Tensor, nn
 
 
 class Dropout(nn.Dropout):
-    """`nn.Dropout`, but where half is dropped on the CPU a random bit decides, and not a random number for each value.
+    """`nn.Dropout` that, on the CPU at p = ½, draws one random bit for each value instead of a random number.
 
-    Except with Intel's library the numbers take ten times as long, a sixth of a training step.
+    Without Intel's library random numbers take ten times as long, a sixth of a training step.
     """
 
     def forward(self, input: Tensor) -> Tensor:
-        """Half of the values doubled, the others zero, while training."""
+        """Half of the values doubled, the others zero, in training."""
         if not self.training or self.p != 0.5 or input.device.type != "cpu":
             return super().forward(input)
         count, place = input.numel(), torch.arange(8, dtype=torch.uint8)

@@ -1,8 +1,9 @@
-"""A block that solves a Poisson problem for learned sources: global in one step, and no eigenbasis.
+"""A block that solves a Poisson problem for learned sources: global in one step, without an eigenbasis.
 
-After PoissonNet (Maesumi, Thambiraja and others 2025), which maps gradients and comes back by such a solve. Sources at
-the points are added here, since mapped gradients alone give back what came in: by them a segmentation of bodies from
-coordinates stays at half of the points, by sources alone it reaches nine tenths (benchmarks/README.md, learning).
+After PoissonNet (Maesumi, Thambiraja and others 2025), which maps gradients and returns to functions by such a solve.
+Sources at the points are added, since mapped gradients alone reproduce the input: with them a segmentation of bodies
+from coordinates stays at half of the points, with sources alone it reaches nine tenths (benchmarks/README.md,
+learning).
 """
 
 from __future__ import annotations
@@ -20,26 +21,26 @@ from torchlb.operator.laplace_beltrami import LaplaceBeltrami
 from torchlb.pde.solves import potential
 
 SOURCE = 3.0
-"""Size of the sources at the start in units of the features', 1/ℓ²: about λ_1 of a shape of radius one."""
+"""Initial size of the sources relative to the features, 1/ℓ²: about λ_1 of a shape of radius one."""
 
 
 class PoissonFeatures(nn.Module):
     """u_c with −Δu_c = s_c − ∇·v_c, of mean zero, for learned sources s = Wx and fields v.
 
-    The fields, if there are any, are g_c Σ_j A_cj ∇x_j: a linear map A of the gradients and gates g = sigmoid(Bx + b),
-    where they close the field stops, as at an edge. With gates and A of one and no source u is x less its mean.
+    The optional fields are g_c Σ_j A_cj ∇x_j: a linear map A of the gradients and gates g = sigmoid(Bx + b); where a
+    gate closes the field ends, as at an edge. With gates and A equal to one and no source u is x less its mean.
 
     Parameters
     ----------
     channels
         C.
     fields
-        Whether there are fields; a step of a network takes a third as long again.
+        Whether there are fields; they make a training step a third longer.
     rotations
         Whether A is complex, see `TangentMap`.
     tolerance
-        Of the solves with the weak pair, relative; by default linear elements are taken, one exact solve, since what is
-        learned has no need of more. Without a weak pair the stencil's.
+        Relative tolerance of the solves with the weak pair; None for one exact solve by P1 elements, which is accurate
+        enough for learning.
     """
 
     def __init__(
@@ -79,11 +80,11 @@ class PoissonBlock(nn.Module):
     hidden
         Widths of the hidden layers of the pointwise network; [width, width] by default.
     dropout
-        Whether that network drops half of its hidden values while it trains.
+        Whether that network drops half of its hidden values in training.
     gradient_features, rotations
-        Whether there are any, and whether they turn: see `GradientFeatures`.
+        Whether there are gradient features, and whether they rotate gradients: see `GradientFeatures`.
     fields, tolerance
-        Of `PoissonFeatures`.
+        Arguments of `PoissonFeatures`.
 
     Examples
     --------

@@ -16,12 +16,12 @@ class SpectralConv(nn.Module):
     """Learned filters in the spectrum that mix channels: y = Φ G(λ) Φᵀ(πx) + b.
 
     G_{oi}(λ) = Σ_f w_{foi} T_f(2u − 1), u = λ/(λ + scale): the filters are polynomials in u, functions of the
-    eigenvalue and not of its number, so that they mean the same on every shape.
+    eigenvalue and not of its index, so that they mean the same on every shape.
 
     Parameters
     ----------
     in_channels, out_channels
-        Of features (…, N, C).
+        Channels of the features (…, N, C).
     num_filters
         Number of polynomials, T_0, ….
     k
@@ -29,7 +29,7 @@ class SpectralConv(nn.Module):
     scale
         1/ℓ², the eigenvalue in the middle of the filters' range; about 10 suits shapes of radius one.
     bias
-        Whether b is there.
+        Whether to add b.
 
     Examples
     --------

@@ -22,7 +22,7 @@ from torchlb.stencils.shape import Shape
 
 @dataclass(frozen=True)
 class AssembledOperator:
-    """A finished operator, in the user's numbers; None for what was not asked for or cannot be there.
+    """A finished operator, in the user's numbering; None for what was not asked for or does not exist.
 
     Attributes
     ----------
@@ -59,7 +59,7 @@ class AssembledOperator:
         fit_counts: Int[Tensor, "4 N"] | None = None,
         certificate: Certificate | None = None,
     ) -> AssembledOperator:
-        """That of a shape."""
+        """Collect the rows and the pair of a shape."""
         mask = None if shape.boundary is None else shape.boundary.mask
         of_shape = shape.points, shape.frames, shape.normals, shape.normal_order, shape.areas, mask
         faces = torch.zeros(0, shape.frames.shape[-1] + 1, dtype=torch.int64)
@@ -68,7 +68,7 @@ class AssembledOperator:
 
     @property
     def whole_pair(self) -> WeakPair | None:
-        """The pair with what the condition adds."""
+        """The weak pair with the term that the boundary condition adds to K."""
         condition = condition_of(self.options.get("condition"))
         share = None if condition is None else condition.share
         if self.pair is None or self.on_boundary is None or share is None:
@@ -80,7 +80,7 @@ class AssembledOperator:
     def restored(
         self, numbering: Numbering, points: Float[Tensor, "N n"], faces: Int[Tensor, "F v"]
     ) -> AssembledOperator:
-        """From a numbering to the user's, in which points, faces and pair are."""
+        """The operator in the user's numbering, in which points, faces and pair are already."""
         names = "frames", "normals", "normal_order", "mass", "on_boundary"
         tensors = {name: getattr(self, name) for name in names}
         values = {name: numbering.restored(t) for name, t in tensors.items() if t is not None}

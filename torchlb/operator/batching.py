@@ -17,7 +17,7 @@ Parts = dict[str, Any]
 
 
 def check_alike(shapes: Sequence[OperatorStorage]) -> None:
-    """InputError for shapes that differ in dimension, in floating type or in device."""
+    """Raise InputError for shapes that differ in dimension, in floating type or in device."""
     kinds = [
         f"of dimension {s.dim} in R^{s.points.shape[1]}, {s.dtype}, on {s.device}" for s in shapes
     ]
@@ -30,7 +30,7 @@ def check_alike(shapes: Sequence[OperatorStorage]) -> None:
 
 
 def joined_parts(shapes: Sequence[OperatorStorage]) -> Parts:
-    """What the block-diagonal operator stores, from what its shapes store."""
+    """The tensors, matrices and records of the block-diagonal operator, from those of its shapes."""
     parts: Parts = {
         n: torch.cat([getattr(s, n) for s in shapes]) for n in ("mass", "points", "frames")
     }
@@ -48,7 +48,7 @@ def joined_parts(shapes: Sequence[OperatorStorage]) -> Parts:
 
 
 def split_parts(batch: OperatorStorage, sizes: Sequence[int]) -> list[Parts]:
-    """The inverse of `joined_parts`."""
+    """Inverse of `joined_parts`."""
     names = [
         n for n in ("mass", "points", "frames", "normals", "_on_boundary") if len(getattr(batch, n))
     ]
@@ -59,7 +59,7 @@ def split_parts(batch: OperatorStorage, sizes: Sequence[int]) -> list[Parts]:
     faces = batch.faces.split(torch.bincount(of_shape, minlength=len(sizes)).tolist())
     columns["faces"] = [own - start for own, start in zip(faces, first, strict=True)]
     columns["stencil"], columns["weak"] = batch.stencil.split(sizes), batch.weak.split(sizes)
-    if len(batch._record.order):  # data of PyG do not carry it
+    if len(batch._record.order):  # PyG data carry no report
         columns["_record"] = batch._record.split(sizes)
     shapes = [dict(zip(columns, row, strict=True)) for row in zip(*columns.values(), strict=True)]
     for shape in shapes:
@@ -69,22 +69,19 @@ def split_parts(batch: OperatorStorage, sizes: Sequence[int]) -> list[Parts]:
 
 
 def remember_shapes(batch: OperatorStorage, shapes: Sequence[OperatorStorage]) -> None:
-    """So that what is kept of the shapes (factors, say) serves their batch, too."""
+    """Let the caches of the shapes (their factors, for example) serve the batch."""
     batch.cache.shapes = tuple((shape, shape.weak.values) for shape in shapes)
 
 
 def shapes_of(batch: Any) -> tuple[Any, ...]:
-    """The operators that a batch was made of, as long as neither has been copied, cast, moved or loaded; else none."""
+    """The operators that a batch was made of, while none of them has been copied, cast, moved or loaded; else none."""
     known = batch.cache.shapes
     same = all(shape.weak.values is values for shape, values in known)
     return tuple(shape for shape, _ in known) if same else ()
 
 
 def join_states(states: Sequence[dict[str, Any]], sizes: Sequence[int]) -> dict[str, Any]:
-    """What `OperatorStorage.get_extra_state` has beside the tensors, for the batch; it keeps those of the shapes.
-
-    Its options are those that the shapes share.
-    """
+    """The extra state of a batch, with those of its shapes and the options that all shapes share."""
     known, options = ([state[key] for state in states] for key in ("radius", "options"))
     first = options[0]
     parts = [part for state in states for part in state.get("parts") or [state]]
@@ -99,7 +96,7 @@ def join_states(states: Sequence[dict[str, Any]], sizes: Sequence[int]) -> dict[
 
 
 def _joined_certificate(certificates: Sequence[dict[str, Any] | None]) -> dict[str, Any] | None:
-    """The worst of each figure, and the sum of each count; None where one shape has none."""
+    """Join certificates: the worst of each figure and the sum of each count; None where one shape has none."""
     known = [each for each in certificates if each is not None]
     if len(known) < len(certificates):
         return None

@@ -1,4 +1,4 @@
-"""From input to a finished operator: checks, shape, stencils, certificate."""
+"""Build an operator on a mesh: checks, shape, weak pair, stencils, certificate."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ from torchlb.stencils.rows import Reason, matrix_rows
 from torchlb.stencils.shape import Shape, mesh_shape
 
 MANY = 0.5
-"""Share of low-order rows from which on a warning names them."""
+"""Share of low-order rows from which a warning reports them."""
 REMEDIES = {
     "mesh": "A finer mesh, or one without noise, has better ones",
     "points": "Do the points lie on a manifold of dimension {}? If not, pass its dimension as `dim`; else add points",
@@ -54,7 +54,7 @@ def with_plan(
     order: Int[Tensor, " G"],
     moved: Int[Tensor, " m"],
 ) -> AssembledOperator:
-    """The same with its plan, where there is one: of a weak pair."""
+    """Attach the plan of an operator that has a weak pair; any other is returned unchanged."""
     if pair is None or shape.plan is None:
         return built
     assert isinstance(shape.low_order, MeshLowOrder)
@@ -67,10 +67,10 @@ def with_plan(
 def numbered_mesh(
     points: Float[Tensor, "N n"], faces: Int[Tensor, "F v"], *, flip: bool
 ) -> tuple[Numbering, Float[Tensor, "N n"], Int[Tensor, "G v"], Int[Tensor, " G"]]:
-    """A numbering, the mesh in it, and of each face its place among those given.
+    """Number a mesh along a k-d tree; return the numbering, points, faces and the input index of each face.
 
-    Where there is to be a pair, triangles without area along the boundary are left out, folds and slivers flipped away;
-    for the stencil, too, whose neighbours and first normals come from the faces.
+    With `flip`, as where a weak pair is built, triangles without area along the boundary are left out and folds and
+    slivers flipped away. The stencil has these faces, too: they give its neighbours and first normals.
     """
     numbering = Numbering.along_tree(points)
     here, (corners, order) = numbering.sorted(points), numbering.faces(faces)
@@ -90,7 +90,7 @@ def build_mesh(
     boundary: ArrayLike | str | None,
     progress: bool,
 ) -> AssembledOperator:
-    """Operator on a mesh; arguments as for `LaplaceBeltrami.from_mesh`."""
+    """Build an operator on a mesh; arguments as for `LaplaceBeltrami.from_mesh`."""
     vertices = check_points(vertices, "vertices")
     check_scale(vertices)
     corners = check_faces(faces, len(vertices))
@@ -116,9 +116,9 @@ def on_cells(
     progress: bool,
     shares: Float[Tensor, " F"] | None = None,
 ) -> AssembledOperator:
-    """Operator of `given` points on a complex that reaches all vertices, which stand where it is.
+    """Build an operator of the points `given` on a complex whose vertices are these points, moved to `vertices`.
 
-    Where cells overlap, `shares` says which part of each counts.
+    Where cells overlap, `shares` are the fractions of them that count.
     """
     degree, degrees = options.elements
     numbering, here, corners, order = numbered_mesh(vertices, cells, flip=degree > 0)
@@ -151,7 +151,7 @@ def on_cells(
 
 
 def build_cotangent(vertices: ArrayLike, faces: ArrayLike) -> AssembledOperator:
-    """The cotangent operator with its mass; arguments as for `LaplaceBeltrami.from_cotangent`."""
+    """Build the cotangent operator with its mass; arguments as for `LaplaceBeltrami.from_cotangent`."""
     vertices = check_points(vertices, "vertices")
     check_scale(vertices)
     corners = check_faces(faces, len(vertices))
@@ -176,7 +176,7 @@ def build_cotangent(vertices: ArrayLike, faces: ArrayLike) -> AssembledOperator:
 
 
 def _warn_of_long_triangles(vertices: Float[Tensor, "N n"], faces: Int[Tensor, "F 3"]) -> None:
-    """A warning where much of the boundary is that of triangles that lie along it."""
+    """Warn where long triangles lie along much of the boundary."""
     nodes = lagrange_nodes(faces, len(vertices), 2)
     outer = nodes.sides[2].uses == 1
     of = torch.zeros_like(outer)
@@ -200,7 +200,7 @@ def finished(
     pair: WeakPair | None = None,
     plan: PairPlan | None = None,
 ) -> AssembledOperator:
-    """Rows from the candidates, certified if asked for; a warning if at most of the points there are only low ones."""
+    """Assemble the rows, certified if asked for; warn if most points have only low-order rows."""
     stencils = stencils_of(shape, options)
     rows, certificate = assemble(stencils, progress=progress), None
     if options.certify:

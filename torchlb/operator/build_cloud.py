@@ -1,4 +1,4 @@
-"""From a cloud of points to a finished operator: checks, a complex through it, and what is built on that."""
+"""Build an operator on a point cloud: checks, a complex through the points, the operator on that complex."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ from torchlb.stencils.conditions import condition_of
 from torchlb.stencils.shape import surface_shape
 
 Reconstruction = Callable[[Tensor], ArrayLike | Complex]
-"""From points, (N, n) float64, to cells through them."""
+"""Function from points, (N, n) float64, to cells through them."""
 
 
 def build_cloud(
@@ -61,7 +61,7 @@ def build_cloud(
     reconstruction: Reconstruction | None,
     progress: bool,
 ) -> AssembledOperator:
-    """Operator on a point cloud; arguments as for `LaplaceBeltrami.from_points`."""
+    """Build an operator on a point cloud; arguments as for `LaplaceBeltrami.from_points`."""
     points = check_points(points)
     check_scale(points)
     check_distinct(points)
@@ -113,7 +113,7 @@ def build_cloud(
 def _given_complex(
     points: Float[Tensor, "N n"], reconstruction: Reconstruction, dim: int | None
 ) -> Complex:
-    """What a user's function makes of the points."""
+    """The complex that a user's function makes of the points, checked."""
     found = reconstruction(points.clone())
     if isinstance(found, CloudSurface):
         return found
@@ -138,7 +138,7 @@ def _on_surface(
     numbering: Numbering,
     progress: bool,
 ) -> AssembledOperator:
-    """Operator on a cloud in R² or R³, by the surface through it."""
+    """Build an operator on a cloud in R² or R³ by the surface through it."""
     ambient = points.shape[1]
     warn_of_near_duplicates(points, surface.neighbors, 2)
     if ambient == 3:
@@ -174,10 +174,10 @@ def _on_surface(
 
 
 def built_again(lb: OperatorStorage) -> AssembledOperator:
-    """The operator of a mesh or a cloud, from what is stored of it.
+    """Build an operator on a mesh or a cloud again from its stored points, faces and options.
 
-    Raises InputError where that is another one: where points of a curve were moved, or cells through a cloud came from
-    normals or a function of the user's.
+    Raises InputError where the result differs: where points of a noisy curve were moved, or where cells through a cloud
+    came from normals or from a user's function.
     """
     points, options = lb.points.detach().cpu().double(), Options(**lb.options)
     boundary, cells = None if lb.boundary is None else lb.boundary.cpu(), lb.faces.cpu()
@@ -194,8 +194,6 @@ def built_again(lb: OperatorStorage) -> AssembledOperator:
             "plan: it was not kept, and what is decided anew by the points alone is not what the operator is of, where "
             "`normals`, `reconstruct`, noise of a curve, rounding or another version had a part; build it again"
         )
-    place = torch.empty_like(rows[0]).index_copy(
-        0, *rows
-    )  # of each face among those that the user has
+    place = torch.empty_like(rows[0]).index_copy(0, *rows)  # index of each face among the user's
     plan = replace(built.plan, faces=cells, order=place[built.plan.order])
     return replace(built, faces=cells, plan=plan)

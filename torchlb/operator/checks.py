@@ -1,4 +1,4 @@
-"""Input that cannot work is refused here, with the points named and the remedy."""
+"""Checks of the input: errors name the points and the remedy."""
 
 from __future__ import annotations
 
@@ -23,11 +23,11 @@ from torchlb.operator.cleaning import (
 from torchlb.operator.inputs import ArrayLike, check_corners, check_points
 
 MAX_EXTENT = 1e30
-"""Largest extent of the points, and the inverse of the smallest, with which all that is called keeps its digits."""
+"""Largest extent of the points, and inverse of the smallest, for which all libraries called keep their digits."""
 
 
 def check_scale(points: Float[Tensor, "N n"]) -> None:
-    """ValueError if the points extend so far, or so little, that 1/ℓ² leaves the range of numbers."""
+    """Raise ValueError if the points extend so far, or so little, that 1/ℓ² leaves the range of numbers."""
     extent = float((points - points[0]).abs().max())
     if len(points) > 1 and extent == 0:
         raise InputError(f"points: all {len(points)} share one place; remove duplicates")
@@ -39,7 +39,7 @@ def check_scale(points: Float[Tensor, "N n"]) -> None:
 
 
 def check_distinct(points: Float[Tensor, "N n"]) -> None:
-    """ValueError that names points which coincide."""
+    """Raise a ValueError that names coincident points."""
     spacing, other, bad = coincident(points)
     if len(bad):
         _warn_of_rounding(points, spacing)
@@ -52,7 +52,7 @@ def check_distinct(points: Float[Tensor, "N n"]) -> None:
 
 
 def _warn_of_rounding(points: Float[Tensor, "N n"], spacing: Float[Tensor, " N"]) -> None:
-    """UserWarning for single-precision positions so far from 0 that their rounding shows between neighbours."""
+    """Warn of single-precision positions so far from 0 that their rounding shows between neighbours."""
     step = torch.finfo(torch.float32).eps * float(points.abs().max())
     width = float(spacing.median())
     if step > SMALL * width and bool((points.float() == points).all()):
@@ -65,11 +65,11 @@ def _warn_of_rounding(points: Float[Tensor, "N n"], spacing: Float[Tensor, " N"]
 def check_dimension(
     points: Float[Tensor, "N n"], dim: int | None, *, hypersurface: bool = False
 ) -> int:
-    """`dim`, or its default n − 1; ValueError if points of R², R⁴, R⁵, … do not look like a hypersurface.
+    """Return `dim`, or its default n − 1; ValueError if points of R², R⁴, R⁵, … do not look like a hypersurface.
 
-    Judged is in how many directions the 3n nearest neighbours of a point spread, the median over up to 500 points
-    of at least 32n. In R³ surfaces are taken for granted. Of four columns and more the first three alone must not be
-    a surface: the others may be attributes.
+    The local dimension is estimated from the 3n nearest neighbours of a point, as the median over up to 500 points,
+    where there are at least 32n points. Clouds in R³ are taken for surfaces. In four columns or more the first three
+    alone must not form a surface: the others may be attributes.
     """
     count, n = points.shape
     if dim is not None or hypersurface or n in (1, 3) or count < 32 * n:
@@ -87,7 +87,7 @@ def check_dimension(
 
 
 def _local_dimension(points: Float[Tensor, "N n"], thin: float) -> int:
-    """Directions in which near points spread by more than `thin` of the largest; the median over a sample of points."""
+    """Median number of directions, over a sample, in which neighbours spread by more than `thin` of the largest."""
     centers = points[:: -(-len(points) // 500)].numpy()
     _, near = KDTree(points.numpy()).query(centers, k=3 * points.shape[1])
     around = points[torch.from_numpy(near)]
@@ -96,9 +96,9 @@ def _local_dimension(points: Float[Tensor, "N n"], thin: float) -> int:
 
 
 def mended_faces(vertices: Float[Tensor, "N n"], faces: Int[Tensor, "F v"]) -> Int[Tensor, "G v"]:
-    """Faces, each once and triangles wound alike; warnings name what was changed, and vertices that coincide.
+    """Faces without duplicates and with triangles oriented alike; warnings name changed faces and coincident vertices.
 
-    ValueError for quads, and for triangles none of which has an area.
+    Raises ValueError for quads, and for triangles none of which has an area.
     """
     if faces.shape[1] == 4 and are_quads(faces):
         raise InputError(
@@ -157,7 +157,7 @@ def mended_faces(vertices: Float[Tensor, "N n"], faces: Int[Tensor, "F v"]) -> I
 
 
 def check_faces(faces: ArrayLike, num_points: int) -> Int[Tensor, "F v"]:
-    """`check_corners`, and no face twice on a corner; ValueError for unreferenced vertices, too."""
+    """Faces with distinct corners, checked as by `check_corners`; ValueError also for unreferenced vertices."""
     faces = check_corners(faces, num_points)
     used = torch.zeros(num_points, dtype=torch.bool)
     used[proper_faces(faces).reshape(-1)] = True
@@ -203,7 +203,7 @@ def check_boundary(boundary: Any, num_points: int) -> Bool[Tensor, " N"] | str |
 
 
 def check_tolerance(tolerance: float | None) -> None:
-    """InputError unless it is between 0 and 1, or None for a default.
+    """Raise InputError unless the tolerance is between 0 and 1, or None for a default.
 
     >>> check_tolerance(0.0)
     Traceback (most recent call last):
@@ -229,7 +229,7 @@ def check_options(
     num_neighbors: int | None,
     **choices: tuple[str, list[str]],
 ) -> None:
-    """ValueError for options out of range, and for fewer points than one stencil has polynomials."""
+    """Raise ValueError for options out of range, and for fewer points than a stencil has polynomials."""
     for name, (value, allowed) in choices.items():
         if value not in allowed:
             raise InputError(f"{name}: expected one of {allowed}, got {value!r}")
@@ -266,7 +266,7 @@ def check_options(
 
 
 def check_same_points(points: Tensor, built: Float[Tensor, "N n"]) -> None:
-    """InputError unless the points are those that an operator was built from, to float32 rounding."""
+    """Raise InputError unless the points are those an operator was built from, to float32 rounding."""
     if points.shape != built.shape:
         raise InputError(
             f"points: expected the {tuple(built.shape)} that the operator was built from, got "

@@ -1,4 +1,4 @@
-"""Meshes and clouds as operators want them: no face or point twice, triangles for quads, one orientation."""
+"""Clean meshes and clouds: no duplicate faces or points, triangles for quads, one orientation."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from torchlb.operator.inputs import ArrayLike, as_tensor, check_corners, check_p
 def coincident(
     points: Float[Tensor, "N n"],
 ) -> tuple[Float[Tensor, " N"], Int[Tensor, " N"], Int[Tensor, " T"]]:
-    """(distance to the nearest other point, that point, those whose nearest is in the same place to rounding)."""
+    """Nearest other point of each: (distance, its index, indices of the points that coincide with it to rounding)."""
     tree = KDTree(points.numpy())
     distance, nearest = tree.query(points.numpy(), k=min(2, len(points)))
     distance = torch.from_numpy(distance).view(len(points), -1)[:, -1]
@@ -32,19 +32,19 @@ def coincident(
 
 
 def clean_points(points: ArrayLike, tolerance: float = 0.0) -> tuple[Tensor, Tensor]:
-    """Cloud without duplicates: of points in the same place, to rounding or within a tolerance, the first stays.
+    """Cloud without duplicates: of points that coincide, to rounding or within a tolerance, the first stays.
 
     Parameters
     ----------
     points
         (N, n), ℓ, finite.
     tolerance
-        ℓ; of points that are at most so far from one to the next the first stays. Far below the spacing.
+        ℓ, far below the spacing; points in a chain with steps of at most this length are merged into its first.
 
     Returns
     -------
     points
-        (N', n), in their order.
+        (N', n), in the order of the input.
     kept
         (N',), their indices in the input: `values[kept]` carries data over.
 
@@ -72,11 +72,11 @@ def clean_points(points: ArrayLike, tolerance: float = 0.0) -> tuple[Tensor, Ten
 def clean_mesh(
     vertices: ArrayLike, faces: ArrayLike, *, merge: bool = False
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Mesh without unreferenced vertices and repeated faces, quads split into triangles, all wound alike.
+    """Mesh without unreferenced vertices and duplicate faces, with quads split into triangles and one orientation.
 
-    Faces that repeat a corner go, and all but the first of those with the same corners. Quads are split along the
-    shorter diagonal that lies inside. Triangles are turned so that they agree with their neighbours, the fewer of each
-    component; a component with one side only, such as a Möbius band, stays as it is.
+    Faces that repeat a corner are removed, and all but the first of those with the same corners. Quads are split along
+    the shorter diagonal that lies inside. Triangles are reversed so that they agree with their neighbours, the fewer of
+    each component; a non-orientable component, such as a Möbius band, stays as it is.
 
     Parameters
     ----------
@@ -85,17 +85,16 @@ def clean_mesh(
     faces
         (F, 3) indices; (F, 4) for quads (or tetrahedra, which stay).
     merge
-        Whether of vertices in the same place, to rounding, the first stays and has the faces of the others: what was
-        cut open along them is closed.
+        Whether to merge vertices that coincide, to rounding, into the first of them, which closes cuts along them.
 
     Returns
     -------
     vertices
-        (N', n), those in use, in their order.
+        (N', n), the referenced vertices, in the order of the input.
     faces
         (F', 3), renumbered.
     kept
-        (N',), their indices in the input: `values[kept]` carries data over.
+        (N',), indices of the vertices in the input: `values[kept]` carries data over.
 
     Examples
     --------
@@ -132,7 +131,7 @@ def proper_faces(faces: Int[Tensor, "F v"]) -> Int[Tensor, "G v"]:
 
 
 def first_of_each(faces: Int[Tensor, "F v"]) -> Bool[Tensor, " F"]:
-    """Whether a face is the first with its corners, in whatever order they come."""
+    """Mask of the faces that are the first with their corners, in any order of the corners."""
     corners = faces.sort(dim=1).values.numpy()
     order = np.lexsort(corners.T)
     repeated = (corners[order[1:]] == corners[order[:-1]]).all(1)
@@ -142,7 +141,7 @@ def first_of_each(faces: Int[Tensor, "F v"]) -> Bool[Tensor, " F"]:
 
 
 def are_quads(faces: Int[Tensor, "F 4"]) -> bool:
-    """Whether faces of four corners are quads: tetrahedra share three corners with the next one, quads but two.
+    """Whether faces with four corners are quads: tetrahedra share three corners with a neighbour, quads only two.
 
     >>> [are_quads(torch.tensor([[0, 1, 2, 3], other])) for other in ([2, 3, 4, 5], [1, 2, 3, 4])]
     [True, False]
@@ -156,9 +155,9 @@ def are_quads(faces: Int[Tensor, "F 4"]) -> bool:
 def merged(
     places: Float[Tensor, "N n"], reach: float, apart: Int[Tensor, "E 2"] | None = None
 ) -> Int[Tensor, " N"]:
-    """Of each point the first of those that it is one with: chains of points with at most `reach` from one to the next.
+    """First point of each point's cluster (single linkage: clusters are chains with steps of at most `reach`).
 
-    Pairs of points `apart` are never made one, nor what a chain would join besides.
+    Where a cluster contains both points of a pair in `apart`, only points of it with equal coordinates are merged.
 
     >>> merged(torch.tensor([[0.0], [2.0], [0.1]]), 0.2).tolist()
     [0, 1, 0]
@@ -180,8 +179,8 @@ def merged(
 def triangles_of(vertices: Float[Tensor, "N n"], polygons: Int[Tensor, "F c"]) -> Tensor:
     """Triangles (F, c − 2, 3) of polygons with c corners each, in space or in the plane.
 
-    A fan from the corner whose longest diagonal is shortest among those from which all triangles face as the polygon
-    does; where there is none, as it is not star-shaped from a corner, ears are cut off.
+    A polygon becomes a fan around the corner whose longest diagonal is shortest, among corners from which all triangles
+    have the orientation of the polygon. A polygon that is star-shaped from none of its corners is cut by ears.
 
     >>> dart = torch.tensor([[0.0, 0.0], [1.0, 0.2], [0.0, 1.0], [0.4, 0.3]])
     >>> triangles_of(dart, torch.tensor([[0, 1, 2, 3]])).tolist()
@@ -189,7 +188,7 @@ def triangles_of(vertices: Float[Tensor, "N n"], polygons: Int[Tensor, "F c"]) -
     """
     count, size = polygons.shape
     places = pad(vertices, (0, max(3 - vertices.shape[1], 0)))[polygons]
-    space = places.shape[-1] == 3  # beyond it no side of a polygon is inside
+    space = places.shape[-1] == 3  # in higher dimensions a polygon has no interior side
     offset = (places - places[:, :1])[..., :3]
     normal = torch.linalg.cross(offset, offset.roll(-1, 1)).sum(1, keepdim=True)
     costs, diagonals = [], []
@@ -202,7 +201,7 @@ def triangles_of(vertices: Float[Tensor, "N n"], polygons: Int[Tensor, "F c"]) -
         costs.append(torch.where(inside, diagonals[-1], torch.inf))
     cost = torch.stack(costs, 1)
     none = cost.isinf().all(1)
-    if size == 4:  # without an area: by the shorter diagonal
+    if size == 4:  # a quad without area is split by its shorter diagonal
         cost, none = torch.where(none[:, None], torch.stack(diagonals, 1), cost), none & False
     order = (cost.argmin(1, keepdim=True) + torch.arange(size)) % size
     turned = polygons.gather(1, order)
@@ -214,10 +213,7 @@ def triangles_of(vertices: Float[Tensor, "N n"], polygons: Int[Tensor, "F c"]) -
 
 
 def _ears(corners: Float[np.ndarray, "c 3"], normal: Float[np.ndarray, " 3"]) -> Tensor:
-    """Triangles of a polygon: in turn a corner is cut off whose ear has no other corner in it, by the shortest cut.
-
-    G. H. Meisters, Polygons have ears, 1975.
-    """
+    """Triangles of a polygon by ear clipping (Meisters 1975), the shortest cut first."""
     axes = np.delete(np.arange(3), np.abs(normal).argmax())
     flat = corners[:, axes]
     if _left_of(flat[0], flat, np.roll(flat, -1, 0)).sum() < 0:
@@ -230,7 +226,7 @@ def _ears(corners: Float[np.ndarray, "c 3"], normal: Float[np.ndarray, " 3"]) ->
             others = flat[[i for i in left if not (flat[i] == (a, b, c)).all(1).any()]]
             sides = np.stack([_left_of(p, q, others) for p, q in ((a, b), (b, c), (c, a))])
             ear = _left_of(a, b, c[None])[0] > 0 and not (sides >= 0).all(0).any()
-            length = np.linalg.norm(c - a) * (1.0 if ear else 1e30)  # there is one but for rounding
+            length = np.linalg.norm(c - a) * (1.0 if ear else 1e30)  # rounding may leave no ear
             if length < best:
                 best, cut = length, k
         triangles.append([left[cut - 1], left[cut], left[(cut + 1) % len(left)]])
@@ -239,16 +235,15 @@ def _ears(corners: Float[np.ndarray, "c 3"], normal: Float[np.ndarray, " 3"]) ->
 
 
 def _left_of(start: np.ndarray, end: np.ndarray, points: np.ndarray) -> np.ndarray:
-    """Twice the area of the triangles over an edge in the plane, positive on its left."""
+    """Twice the signed area of the triangles over an edge in the plane, positive on its left."""
     (x, y), (u, v) = (end - start).T, (points - start).T
     return x * v - y * u
 
 
 def turned_faces(faces: Int[Tensor, "F v"]) -> Bool[Tensor, " F"]:
-    """Which triangles to turn round so that the two at an edge run along it in opposite directions.
+    """Mask of the triangles to reverse so that the two triangles at an edge run along it in opposite directions.
 
-    Of the two orientations of a component the one with fewer turned faces is taken. One that has one side only stays as
-    it is.
+    The orientation of a component with fewer reversed faces is taken; a non-orientable component stays as it is.
 
     >>> turned_faces(torch.tensor([[0, 1, 2], [1, 2, 3], [3, 2, 4]])).tolist()
     [True, False, False]

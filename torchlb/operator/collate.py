@@ -1,4 +1,4 @@
-"""Samples that hold operators, as one batch of a `DataLoader`."""
+"""Collate samples that hold operators into one batch of a `DataLoader`."""
 
 from __future__ import annotations
 
@@ -14,16 +14,16 @@ from torchlb.errors import InputError
 from torchlb.operator.laplace_beltrami import LaplaceBeltrami
 
 INDICES = ("faces", "face_index", "edges")
-"""Keys of what holds indices of points, (·, corners)."""
+"""Keys of tensors that hold indices of points, (·, corners)."""
 
 
 def collate(samples: Sequence[Any]) -> Any:
     """`collate_fn` of a `DataLoader` whose samples, tuples or dicts, hold an operator each.
 
-    Operators become one by `LaplaceBeltrami.batch`. Tensors with a row for every point of their sample's operator go
-    below each other, as every layer takes them; those under the keys "faces", "face_index" and "edges" do too, their
-    indices moved by ``lb.offsets``, and so do tensors with a row for every one of these. The rest is torch's
-    `default_collate`: a label for each shape, say.
+    Operators become one by `LaplaceBeltrami.batch`. Tensors with a row for every point of their sample's operator are
+    concatenated, as every layer takes them; those under the keys "faces", "face_index" and "edges" are, too, their
+    indices moved by ``lb.offsets``, and so are tensors with a row for each of their rows. The rest is torch's
+    `default_collate`: a label for each shape, for example.
 
     Raises
     ------
@@ -59,7 +59,7 @@ def collate(samples: Sequence[Any]) -> Any:
 
 
 def _joined(key: Any, column: list[Any], counts: list[list[int]]) -> Any:
-    """By the numbers of points of the shapes, and of whatever else has rows."""
+    """Join the values of one key; `counts` are the numbers of rows, of points and of indices, to concatenate by."""
     if isinstance(column[0], LaplaceBeltrami):
         return LaplaceBeltrami.batch(column)
     if all(isinstance(each, Tensor) and each.ndim > 0 for each in column):

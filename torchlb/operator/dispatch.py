@@ -1,4 +1,4 @@
-"""One way to ask for any operator: "stencil" or "cotangent", of a mesh or of a cloud, with its options by name."""
+"""Any operator by name: "stencil" or "cotangent", of a mesh or of a cloud, with its options as keywords."""
 
 from __future__ import annotations
 
@@ -26,10 +26,9 @@ def build_operator(
     progress: bool = True,
     **options: Any,
 ) -> LaplaceBeltrami:
-    """The operator of a mesh, or of a cloud where `faces` is None or empty, by whichever builder fits.
+    """Build the operator of a mesh, or of a cloud where `faces` is None or empty, by the builder that fits.
 
-    Parameters are those of `torchlb.load_or_build`; raises what the builder raises, and InputTypeError for an option
-    that it does not have.
+    Parameters as for `torchlb.load_or_build`. Raises the builder's errors, and InputTypeError for unknown options.
     """
     builder, _, faces = builder_of(vertices, faces, operator)
     options = complete_options(builder, options)
@@ -55,7 +54,7 @@ def builder_of(
 
 
 def complete_options(builder: Builder, options: dict[str, Any]) -> dict[str, Any]:
-    """All options with their defaults, but `progress`, which changes nothing; InputTypeError for another."""
+    """All options with their defaults, except `progress`, which changes no result; InputTypeError for unknown ones."""
     known = _defaults(builder)
     _check_names(builder.__name__, options, known)
     if options.get("reconstruct") is not None:
@@ -67,7 +66,7 @@ def complete_options(builder: Builder, options: dict[str, Any]) -> dict[str, Any
 
 
 def check_options_of(operator: str, options: dict[str, Any]) -> None:
-    """InputError for what is no operator, or an option of it for neither meshes nor clouds."""
+    """Raise InputError for an unknown operator, or for an option that it has neither for meshes nor for clouds."""
     _check_operator(operator)
     known = _defaults(LaplaceBeltrami.from_mesh) | _defaults(LaplaceBeltrami.from_points)
     known = _defaults(LaplaceBeltrami.from_cotangent) if operator == "cotangent" else known

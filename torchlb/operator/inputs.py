@@ -1,4 +1,4 @@
-"""Points and faces as they come, tensors or arrays or lists, as tensors; what is neither is refused."""
+"""Points and faces as they come, as tensors, arrays or lists, become checked tensors."""
 
 from __future__ import annotations
 
@@ -14,24 +14,24 @@ from torch import Tensor
 from torchlb.errors import InputError, first_few, warn
 
 ArrayLike = Tensor | np.ndarray | Sequence[Any]
-"""What becomes a tensor."""
+"""Input that becomes a tensor."""
 
 
 def as_tensor(values: ArrayLike) -> Tensor:
-    """As `torch.as_tensor`, for arrays of any byte order and stride, too."""
+    """As `torch.as_tensor`, also for arrays of any byte order and stride."""
     if isinstance(values, np.ndarray):
         values = np.ascontiguousarray(values, values.dtype.newbyteorder("="))
     return torch.as_tensor(values)
 
 
 def float_type(values: ArrayLike) -> torch.dtype:
-    """Floating type of the input, and of what is computed from it; torch's default for integers."""
+    """Floating type of the input and of the result; torch's default for integers."""
     dtype = as_tensor(values).dtype
     return dtype if dtype.is_floating_point else torch.get_default_dtype()
 
 
 def warn_of_gradients(points: ArrayLike, what: str) -> None:
-    """UserWarning for positions that require a gradient, which an operator, a constant, does not hand on to them."""
+    """Warn of positions that require a gradient: an operator is constant and passes none on to them."""
     if isinstance(points, Tensor) and points.requires_grad and torch.is_grad_enabled():
         warn(
             f"{what}: they require gradients, but an operator is a constant of what is computed with it, so that the "
@@ -40,7 +40,7 @@ def warn_of_gradients(points: ArrayLike, what: str) -> None:
 
 
 def check_points(points: ArrayLike, what: str = "points") -> Float[Tensor, "N n"]:
-    """As (N, n) float64 on the CPU, detached; ValueError for a wrong shape or type, none at all, NaN or infinity."""
+    """Points as (N, n) float64 on the CPU, detached; ValueError for a wrong shape or type, no points, NaN, infinity."""
     try:
         points = as_tensor(points)
     except (TypeError, ValueError, RuntimeError) as error:
@@ -61,7 +61,7 @@ def check_points(points: ArrayLike, what: str = "points") -> Float[Tensor, "N n"
         )
     if points.is_complex() or points.dtype == torch.bool:
         raise InputError(f"{what}: expected real numbers, got {points.dtype}")
-    points = points.detach().to("cpu", torch.float64, copy=True)  # it is kept
+    points = points.detach().to("cpu", torch.float64, copy=True)  # the operator keeps it
     bad = (~points.isfinite()).any(1).nonzero()[:, 0]
     if len(bad):
         raise InputError(

@@ -1,4 +1,4 @@
-"""The operator as a module: it stores what the functions below it computed, and multiplies."""
+"""The operator as a module: it stores the results of the functions below it, and multiplies."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ class LaplaceBeltrami(StencilMethods, PairMethods):
     mass
         (N,), ℓ^d: positive quadrature weights that sum to the area; π of the certificate where there is one.
     certificate
-        What is proved of the stability of Δ; None where it was not asked for, and for the cotangent.
+        Proof of the stability of Δ; None where it was not asked for, and for the cotangent.
     points, frames
         (N, n), ℓ, and (N, n, d), orthonormal tangent vectors.
     normals
@@ -65,7 +65,7 @@ class LaplaceBeltrami(StencilMethods, PairMethods):
     sizes
         Numbers of points of the shapes of a `batch`; None for a single shape.
     source, options
-        "points", "mesh", "cotangent" or "batch", and those of the constructor, as given.
+        "points", "mesh", "cotangent" or "batch", and the options of the constructor, as passed.
 
     Examples
     --------
@@ -111,25 +111,25 @@ class LaplaceBeltrami(StencilMethods, PairMethods):
             (N, n) tensor or array, length ℓ, without duplicates. Computed in float64 on the CPU; the result has the
             floating type of the points. If they require a gradient, see `at`.
         dim, order, normal_order
-            d of the manifold, n − 1 by default; p ≥ 1 of the Laplacian, whose error falls like h^p; q of the tangent
-            frames, p + 1 by default.
+            Dimension d of the manifold, n − 1 by default; order p ≥ 1 of the Laplacian, whose error falls like h^p;
+            order q of the tangent frames, p + 1 by default.
         projection
             "tangent" (more accurate) or "normal" (the note's), see `method.md`, section 3.
         weights, num_neighbors
             "least_squares" (robust) or "polyharmonic" (for evenly spread points); the size of every stencil.
         normals
-            (N, n), if known (d = n − 1): which way is out, where neighbours agree; a warning says where not.
+            (N, n), if known (d = n − 1): they orient the surface where neighbours agree; a warning says where not.
         boundary
             (N,) mask of the points on the boundary; by default, or for "detect", that of the complex through the cloud.
         condition
-            There: "neumann", ∂_ν f = 0; "dirichlet", f = 0; or `torchlb.Robin(a)`, ∂_ν f + a f = 0. With Dirichlet's
-            the values of f at boundary points are not used elsewhere, and have rows of their own. None uses no datum:
-            stencils there are one-sided, hardly one passes, and low-order rows in their place have ∂_ν f = 0.
+            Boundary condition: "neumann", ∂_ν f = 0; "dirichlet", f = 0; or `torchlb.Robin(a)`, ∂_ν f + a f = 0. With
+            Dirichlet's the values of f at boundary points enter only the rows of these points. None uses no boundary
+            data: stencils there are one-sided, hardly one passes, and low-order rows in their place have ∂_ν f = 0.
         reconstruct
-            From points (N, n) to cells through them, (F, d + 1), or a `torchlb.cloud.Complex`. By default
-            `torchlb.cloud.reconstruct`, of d ≤ 3; `lb.faces` are what it found.
+            Function from points (N, n) to cells through them, (F, d + 1), or to a `torchlb.cloud.Complex`; by default
+            `torchlb.cloud.reconstruct`, for d ≤ 3. `lb.faces` are its cells.
         weak_form, certify
-            Whether to build the weak pair (K, M), which eigenpairs, flows and solves are of; whether to lower rows of
+            Whether to build the weak pair (K, M), on which eigenpairs, flows and solves rest; whether to lower rows of
             the stencil until the certificate of stability holds, whose π is then the mass.
         progress
             Whether to show a bar, on a terminal.
@@ -140,7 +140,7 @@ class LaplaceBeltrami(StencilMethods, PairMethods):
         options = Options(
             order, normal_order, projection, weights, num_neighbors, condition, weak_form, certify
         )
-        with torch.inference_mode(False):  # what is kept serves a training, too
+        with torch.inference_mode(False):  # the tensors may be used in training
             given = {"normals": normals, "boundary": boundary, "reconstruction": reconstruct}
             built = build_cloud(points, dim, options, **given, progress=progress)
             lb = cls._from_assembled(built, points)
@@ -163,18 +163,18 @@ class LaplaceBeltrami(StencilMethods, PairMethods):
         certify: bool = False,
         progress: bool = True,
     ) -> LaplaceBeltrami:
-        """Operator on the vertices of a mesh; its faces say who is whose neighbour and give the first normals.
+        """Operator on the vertices of a mesh; its faces give the neighbours and the first normals.
 
         Parameters
         ----------
         vertices
             (N, n) tensor or array, length ℓ; if they require a gradient, see `at`.
         faces
-            (F, 3) indices. Any triangle mesh: several components, non-manifold edges, zero-area triangles. Also (F, 2)
-            polylines and (F, 4) tetrahedra, for manifolds of dimension 1 and 3 in Rⁿ.
+            (F, 3) indices of any triangle mesh: several components, non-manifold edges, zero-area triangles. Also
+            (F, 2) polylines and (F, 4) tetrahedra, for manifolds of dimension 1 and 3 in Rⁿ.
         boundary
             (N,) mask of the part of the boundary where the condition holds; the rest has none. By default, or for
-            "detect", all the boundary that the faces have, if any.
+            "detect", all the boundary of the faces, if any.
         order, normal_order, projection, weights, num_neighbors, condition, weak_form, certify, progress
             As for `from_points`. The order chooses the weak pair, too (degree of elements, of fits of functions): 1 and
             2 (2, 2), 3 (2, 3), 4 (3, 4), 5 and above (4, 6); its surface is that of the frames, of degree q.
@@ -203,9 +203,9 @@ class LaplaceBeltrami(StencilMethods, PairMethods):
         faces
             (F, 3) indices.
 
-        Its gradient is the first-order fit to the vertices around each point, and ∂_ν f = 0 at a boundary.
-        Long triangles along a boundary tie its vertices to lines: a warning says so, and `from_mesh` is right there.
-        Raises InputError for bad input and for vertices without area.
+        Its gradient is the first-order fit to the vertices around each point, and ∂_ν f = 0 at a boundary. Long
+        triangles along a boundary tie its vertices to lines: a warning says so, and `from_mesh` is right there. Raises
+        InputError for bad input and for vertices without area.
         """
         warn_of_gradients(vertices, "vertices")
         with torch.inference_mode(False):
@@ -215,11 +215,10 @@ class LaplaceBeltrami(StencilMethods, PairMethods):
     def batch(cls, shapes: Sequence[LaplaceBeltrami]) -> LaplaceBeltrami:
         """Several shapes as one block-diagonal operator, which every layer takes like any other.
 
-        Features are the shapes' below each other, (ΣN, C). Indices of shape s (its faces, say) move by
-        ``lb.offsets[s]``. The weak pair is there if all have one. Eigenbases that the shapes hold are taken over; the
-        others are solved when asked for.
-        Raises InputError for shapes of different dimension, floating type or device, or for none; InputTypeError for
-        what is no sequence of operators.
+        Features are those of the shapes, concatenated, (ΣN, C). Indices of shape s (its faces, for example) move by
+        ``lb.offsets[s]``. The batch has a weak pair if all shapes have one. Eigenbases that all shapes hold are taken
+        over; others are solved when asked for. Raises InputError for shapes of different dimension, floating type or
+        device, or for none; InputTypeError for anything but a sequence of operators.
         """
         if isinstance(shapes, LaplaceBeltrami) or not all(
             isinstance(shape, LaplaceBeltrami) for shape in shapes
@@ -232,7 +231,7 @@ class LaplaceBeltrami(StencilMethods, PairMethods):
         if all(shape.has_weak_form for shape in shapes):
             _ = [
                 shape.weak.radius for shape in shapes
-            ]  # of one that was loaded it is found here, once
+            ]  # where one was loaded, it is computed here, once
         state = join_states([shape.get_extra_state() for shape in shapes], sizes)
         bases = [shape._basis for shape in shapes if shape._basis and not shape.sizes]
         with torch.inference_mode(False):
@@ -243,7 +242,7 @@ class LaplaceBeltrami(StencilMethods, PairMethods):
 
     @property
     def plan(self) -> Plan:
-        """What is decided about the operator: integers and flags. Copies, and what comes from files, decide anew.
+        """The decisions behind the operator, integers and flags; copies and operators from files make them again.
 
         Raises InputError for batches, the cotangent operator, and operators without a weak pair.
         """
@@ -258,14 +257,14 @@ class LaplaceBeltrami(StencilMethods, PairMethods):
 
     @plan.deleter
     def plan(self) -> None:
-        """``del lb.plan`` lets it go, with some kilobytes a point; it is made again when it is asked for."""
+        """``del lb.plan`` frees it, some kilobytes a point; it is made again when it is asked for."""
         self._plan = None
 
     def at(self, points: ArrayLike) -> LaplaceBeltrami:
-        """The operator of the shape that has moved to other points, by the same decisions: neighbours, degrees, cells.
+        """The operator of the shape moved to other points, by the same decisions: neighbours, degrees, cells.
 
-        Takes some two thirds of the time of a build. For points that moved a little, as in an animation or a flow;
-        what was decided for others may not fit them, and `from_mesh` or `from_points` decides anew.
+        Takes some two thirds of the time of a build. It is meant for points that moved a little, as in an animation or
+        a flow; for others the decisions may not fit, and `from_mesh` or `from_points` makes new ones.
 
         Parameters
         ----------
@@ -295,8 +294,9 @@ class LaplaceBeltrami(StencilMethods, PairMethods):
     def product(self, name: MatrixName, f: Tensor) -> Tensor:
         """A matrix of the operator times f, of the shape of f, differentiable in f any number of times.
 
-        In the wider of the types of f and the operator, at least float32, also under autocast; a half-precision f gives
-        its own. ``lb.stiffness @ f`` is torch's product, which takes one type alone, and no half precision on the CPU.
+        Computed in the wider of the types of f and the operator, at least float32, also under autocast; only a
+        half-precision f gets its own type back. ``lb.stiffness @ f`` is torch's product, which needs equal types and,
+        on the CPU, no half precision.
 
         Parameters
         ----------
@@ -312,9 +312,9 @@ class LaplaceBeltrami(StencilMethods, PairMethods):
         return through_product(self, name, f, result) if self.points.requires_grad else result
 
     def unbatch(self) -> list[LaplaceBeltrami]:
-        """The operators of the shapes of a `batch`, with all that they had: certificates, spectral radii, eigenbases.
+        """The operators of the shapes of a `batch`, with their certificates, spectral radii and eigenbases.
 
-        But weak pairs only if all of them had one.
+        They have weak pairs only if all shapes of the batch had one.
         """
         if self.sizes is None or self._states is None:
             raise InputError(f"unbatch: expected a batch of operators, got one from {self.source}")
@@ -325,7 +325,7 @@ class LaplaceBeltrami(StencilMethods, PairMethods):
 
     @classmethod
     def _from_assembled(cls, built: build.AssembledOperator, given: ArrayLike) -> LaplaceBeltrami:
-        """Store what was built, in the floating type of the input."""
+        """Store a finished operator, in the floating type of the input."""
         rows, points, pair = built.rows, built.points, built.whole_pair
         none = rows.length.new_zeros(4, len(points))
         fits = none if built.fit_counts is None else built.fit_counts
@@ -347,7 +347,7 @@ class LaplaceBeltrami(StencilMethods, PairMethods):
         lb = cls.of_parts(parts, {"source": built.source, "options": built.options})
         lb.certificate, lb.surface, lb._plan = built.certificate, built.surface, built.plan
         if lb.has_weak_form:
-            _ = lb.weak.radius  # from values that are not yet rounded
+            _ = lb.weak.radius  # before the values are rounded
         return lb.to(float_type(given))
 
     def __repr__(self) -> str:

@@ -1,4 +1,4 @@
-"""The choices that a user makes of an operator, and what follows from those that are left open."""
+"""A user's choices for an operator, and the defaults that follow from them."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from torchlb.stencils.conditions import Condition, ConditionName, condition_of
 
 @dataclass(frozen=True)
 class Options:
-    """The choices that a user makes, as given."""
+    """A user's choices, as passed."""
 
     order: int
     normal_order: int | None
@@ -28,27 +28,27 @@ class Options:
 
     @property
     def q(self) -> int:
-        """Order of the tangent frames: p + 1 unless given."""
+        """Order q of the tangent frames: p + 1 by default."""
         return self.order + 1 if self.normal_order is None else self.normal_order
 
     @property
     def plain(self) -> dict[str, Any]:
-        """By name, in plain types."""
+        """The options by name, in plain types."""
         condition = condition_of(self.condition)
         return vars(self) | {"condition": condition and condition.plain}
 
     def held(self, numbering: Numbering) -> Condition | None:
-        """The condition at the boundary of the points in another order; InputError for what is none."""
+        """The boundary condition, in another numbering of the points; InputError for an invalid one."""
         condition = condition_of(self.condition)
         return condition and condition.taken(numbering.given, len(numbering.given))
 
     @property
     def elements(self) -> tuple[int, tuple[int, ...]]:
-        """Degree of the elements and degrees of the fits of the weak pair, where there is to be one."""
+        """Degree of the elements and degrees of the fits of the weak pair; (0, ()) without one."""
         return ELEMENTS[min(self.order, max(ELEMENTS))] if self.weak_form else (0, ())
 
     def check(self, num_points: int, ambient_dim: int, dim: int) -> None:
-        """InputError for a choice that is none."""
+        """Raise InputError for an invalid choice."""
         check_options(
             num_points,
             ambient_dim,

@@ -1,4 +1,4 @@
-"""What an operator says by its weak pair: spectrum, and the matrices behind diffusion and solves."""
+"""Methods of an operator by its weak pair: spectrum, and the matrices behind diffusion and solves."""
 
 from __future__ import annotations
 
@@ -33,26 +33,26 @@ NO_PAIR = (
 
 
 def check_pair(lb: Any) -> None:
-    """InputError for an operator without a weak pair, which eigenpairs, flows and solves are of."""
+    """Raise InputError for an operator without a weak pair, on which eigenpairs, flows and solves rest."""
     if not lb.has_weak_form:
         raise InputError(NO_PAIR.format("eigenpairs, flows and solves"))
 
 
 class PairMethods(OperatorStorage):
-    """Stiffness and mass matrix where there is a weak pair, and its eigenbasis."""
+    """Stiffness and mass matrix of the weak pair, and its eigenbasis."""
 
     @property
     def has_weak_form(self) -> bool:
-        """Whether there is a weak pair, as there is unless built with weak_form=False."""
+        """Whether the operator has a weak pair; only one built with weak_form=False has none."""
         return self.weak.num_rows > 0
 
     @property
     def stiffness(self) -> Tensor:
         """K, torch sparse CSR (N, N), ℓ^{d−2}: uᵀKv = ∫∇u·∇v. Symmetric, positive semidefinite, K1 = 0.
 
-        A view of the buffers. A condition leaves it as it is: K also says what values at a Dirichlet boundary, where
-        `fixed` is set, do inside, and solves take out its rows and columns; what Robin's adds to it is in `pair`.
-        Raises InputError without a weak pair.
+        A view of the buffers, without boundary conditions: the rows and columns of Dirichlet points (`fixed`) are
+        there, and solves take them out; the term of a Robin condition is in `pair`. Raises InputError without a weak
+        pair.
         """
         return self._tensor("stiffness")
 
@@ -74,7 +74,7 @@ class PairMethods(OperatorStorage):
         return matrices.tensor(channel)
 
     def _channel(self, name: str) -> tuple[Csr, int]:
-        """Where a matrix is: "laplacian", "stiffness", "mass" or "boundary_mass"."""
+        """The matrices that hold "laplacian", "stiffness", "mass" or "boundary_mass", and its channel in them."""
         if name not in get_args(MatrixName):
             raise InputError(f"name: expected one of {list(get_args(MatrixName))}, got {name!r}")
         if name == "laplacian":
@@ -104,17 +104,17 @@ class PairMethods(OperatorStorage):
     ) -> Eigenbasis:
         """The k smallest eigenpairs of −Δ: real, ascending, orthonormal in the mass; min(k, N) of them.
 
-        Solved once, in float64 on the CPU (`method.md`, sections 7 and 10), and kept: a smaller k is a slice of what
-        there is, a larger one or a smaller tolerance is solved anew. For a batch each shape has its own, solved where
-        that shape has too few.
+        Solved once, in float64 on the CPU (`method.md`, sections 7 and 10), and kept: a smaller k is a slice of the
+        stored basis, a larger k or a smaller tolerance is solved anew. In a batch each shape has its own basis, solved
+        where that shape has too few pairs.
 
         Parameters
         ----------
         k
             Number of pairs, the constants among them.
         tolerance
-            Bound on the estimated relative errors of the eigenvalues of a weak pair as against those of its matrices,
-            which the basis has as `relative_errors`. By default 1.5e-8 k², at order 4 1e-9, above 1e-11.
+            Bound on the estimated relative errors of the eigenvalues against those of the matrices (K, M); the basis
+            has the estimates as `relative_errors`. By default 1.5e-8 k², at order 4 1e-9, above 1e-11.
         store
             Whether `state_dict` holds the basis from now on; it then loads into any operator.
 
@@ -147,12 +147,12 @@ class PairMethods(OperatorStorage):
     def invariant_basis(
         self, k: int, *, tolerance: float | None = None, store: bool = False
     ) -> Eigenbasis:
-        """At least k eigenpairs, all that are solved, so that their span is invariant under Δ; else as `eigenbasis`."""
+        """All eigenpairs known, at least k, so that their span is invariant under Δ; otherwise as `eigenbasis`."""
         k = check_num_pairs(k)
         check_tolerance(tolerance)
         errors = self.modes.relative_errors[..., :k]
         if not self.modes.has(k) or (tolerance is not None and (errors > tolerance).any()):
-            # It is kept, and a training may follow.
+            # The basis is kept, and may be used in training.
             with torch.inference_mode(False), threads_for(self.num_points):
                 self._keep_basis(self._solved_basis(max(k, self.modes.count), tolerance))
         if store:
@@ -162,7 +162,7 @@ class PairMethods(OperatorStorage):
         return basis
 
     def _solved_basis(self, k: int, tolerance: float | None) -> Eigenbasis:
-        """Of a batch those of its shapes, which keep them, as long as they are known."""
+        """Solve for k eigenpairs; the shapes of a batch solve for their own and keep them, where they are known."""
         check_pair(self)
         shapes = shapes_of(self)
         if shapes:
@@ -171,7 +171,7 @@ class PairMethods(OperatorStorage):
         return self._pair_eigenbasis(k, tolerance)
 
     def _pair_eigenbasis(self, k: int, tolerance: float | None) -> Eigenbasis:
-        """From the weak pair of each shape; the more exact, the higher the order."""
+        """Eigenpairs of the weak pair of each shape; the default tolerance falls with the order."""
         (stiffness, mass), linear = (
             [to_scipy(crow, col, v.double(), self.shape) for v in values]
             for crow, col, values in (self.weak.pair, self.weak.linear_pair)

@@ -1,4 +1,4 @@
-"""Parts of an operator: matrices of its weak pair, its eigenbasis as far as it is known, and what is kept with it."""
+"""Parts of an operator: matrices of its weak pair, the known part of its eigenbasis, and its cache."""
 
 from __future__ import annotations
 
@@ -20,15 +20,15 @@ BASIS = ("eigenvalues", "eigenvectors", "left", "relative_errors")
 
 
 class PairMatrices(Csr):
-    """The weak pair, and that of linear elements beside it.
+    """The weak pair, and that of P1 elements beside it.
 
-    Its channels are stiffness K and mass matrix M; on a shape with a boundary the mass matrix B of that; and what a
-    condition adds to K.
+    Channels are the stiffness K and the mass matrix M; with a boundary its mass matrix B; the term a condition adds to
+    K.
 
     Attributes
     ----------
     linear
-        The same of linear elements; of no rows where they are the same.
+        The same matrices of P1 elements; without rows where they are equal to the pair.
     """
 
     linear: Csr
@@ -46,21 +46,21 @@ class PairMatrices(Csr):
 
     @property
     def near(self) -> Csr:
-        """The matrices of linear elements, close to the pair and 20 times sparser."""
+        """The matrices of P1 elements, close to the pair and 20 times sparser."""
         return self.linear if self.linear.num_rows else self
 
     @property
     def pair(self) -> tuple[Tensor, Tensor, Tensor]:
-        """(crow, col, values (2, nnz)) of K, with what a condition adds to it, and M: what all is computed by."""
+        """(crow, col, values (2, nnz)) of K, with the term of a condition, and of M: the pair in every computation."""
         return self.crow, self.col, _with_added(self.values)
 
     @property
     def linear_pair(self) -> tuple[Tensor, Tensor, Tensor]:
-        """As `pair`, of linear elements."""
+        """As `pair`, of P1 elements."""
         return self.near.crow, self.near.col, _with_added(self.near.values)
 
     def losing(self, fixed: Bool[Tensor, " N"] | None) -> Bool[Tensor, " N"]:
-        """Mask of the points where a condition keeps constants out of the null space, of those `fixed` by one, too."""
+        """Mask of the points where a condition keeps constants out of the null space of K, `fixed` ones included."""
         diagonal = self.near.row == self.near.col
         found = torch.zeros(self.num_rows, dtype=torch.bool, device=self.col.device)
         if len(self.near.values) > 3:
@@ -69,9 +69,9 @@ class PairMatrices(Csr):
 
     @property
     def radius(self) -> Tensor:
-        """Bound on the eigenvalues of D⁻¹K₁, the linear pair with lumped mass, for flows beyond the basis.
+        """Bound on the eigenvalues of D⁻¹K₁, the P1 pair with lumped mass, for flows beyond the basis.
 
-        1/ℓ², a float64 tensor () on the CPU, which compiled code can take; found once.
+        1/ℓ², a float64 tensor () on the CPU, which compiled code can take; computed once.
         """
         if self._radius is None:
             crow, col, values = self.linear_pair
@@ -84,7 +84,7 @@ class PairMatrices(Csr):
 
     @property
     def known_radius(self) -> float | None:
-        """The same, None where it has not been asked for; it is neither rounded nor moved with the buffers."""
+        """The radius, or None before it is asked for; it is neither rounded nor moved with the buffers."""
         return None if self._radius is None else float(self._radius)
 
     @known_radius.setter
@@ -94,7 +94,7 @@ class PairMatrices(Csr):
 
     @staticmethod
     def join(records: Sequence[PairMatrices]) -> PairMatrices:  # pyright: ignore[reportIncompatibleMethodOverride]
-        """The pairs of shapes, if all have one, and, if any has one of its own, the linear ones."""
+        """The joint pair of several shapes, if all have one; with P1 matrices if any shape has its own."""
         if not all(pair.num_rows for pair in records):
             return PairMatrices()
         whole = Csr.join(records)
@@ -104,7 +104,7 @@ class PairMatrices(Csr):
         return PairMatrices(whole.crow, whole.col, whole.values, linear)
 
     def split(self, sizes: Sequence[int]) -> list[PairMatrices]:  # pyright: ignore[reportIncompatibleMethodOverride]
-        """The inverse of `join`: without what a shape has because others have it."""
+        """Inverse of `join`, without matrices that a shape has only because others do."""
         if not self.num_rows:
             return [PairMatrices() for _ in sizes]
         linear = self.linear.split(sizes) if self.linear.num_rows else [None] * len(sizes)
@@ -113,7 +113,7 @@ class PairMatrices(Csr):
 
     @staticmethod
     def trimmed(whole: Csr, near: Csr | None = None) -> PairMatrices:
-        """A pair without the last matrices where they are zero, and without linear ones that are the same."""
+        """A pair without trailing matrices that are zero, and without P1 matrices that are equal to it."""
         values = _without_zeros(whole.values)
         if near is not None:
             near = Csr(near.crow, near.col, _without_zeros(near.values))
@@ -123,7 +123,7 @@ class PairMatrices(Csr):
 
 
 def _with_added(values: Float[Tensor, "terms nnz"]) -> Float[Tensor, "2 nnz"]:
-    """K + R and M, of K, M, B, R; R is what a condition adds, and there is none unless it has been stored."""
+    """K + R and M, from K, M, B, R; the term R of a condition is stored only where there is one."""
     return values[:2] if len(values) < 4 else torch.stack([values[0] + values[3], values[1]])
 
 
@@ -132,14 +132,14 @@ def _without_zeros(values: Float[Tensor, "terms nnz"]) -> Float[Tensor, "_ nnz"]
 
 
 class Modes(Tensors):
-    """The eigenpairs that are known.
+    """The known eigenpairs.
 
     Parameters
     ----------
     basis
-        They; None for none.
+        Their source; None for no pairs.
     like
-        Of the floating type and on the device of the operator.
+        Tensor of the floating type and on the device of the operator.
     stored
         Whether `state_dict` has them.
     """
@@ -157,11 +157,11 @@ class Modes(Tensors):
         held = {name: none if t is None else t.to(none) for name, t in held.items()}
         super().__init__(held, persistent=stored)
         self.stored = stored
-        self._counts = torch.empty(0, 1)  # in the shape of a tensor, since numbers are compiled in
+        self._counts = torch.empty(0, 1)  # a shape, since torch.compile specialises on numbers
 
     @property
     def count(self) -> int:
-        """Number of pairs of each shape of a batch, but for those that have no more."""
+        """Number of known pairs of each shape of a batch, except shapes that have no more."""
         return self._counts.shape[0]
 
     def has(self, k: int) -> bool:
@@ -171,7 +171,7 @@ class Modes(Tensors):
     def counted(
         self, vectors: Float[Tensor, "N k"], free: Bool[Tensor, " N"], sizes: tuple[int, ...]
     ) -> Modes:
-        """Itself, with `count` from the eigenvectors: a batch pads short ones, and there are as many as free points."""
+        """Set `count` from the eigenvectors, whose padding columns are zero, and the free points; return self."""
         parts = zip(vectors.split(sizes), free.split(sizes), strict=True)
         counts = [(int((modes != 0).any(0).sum()), int(inside.sum())) for modes, inside in parts]
         most = max(sizes)
@@ -180,7 +180,7 @@ class Modes(Tensors):
         return self
 
     def basis(self, mass: Float[Tensor, " N"], sizes: tuple[int, ...] | None) -> Eigenbasis | None:
-        """All of them, with the mass and the sizes of the operator; None for none."""
+        """The eigenbasis of all known pairs, with the mass and the sizes of the operator; None if there are none."""
         if len(self.left) == 0:
             return None
         errors = self.relative_errors if len(self.relative_errors) else None
@@ -188,18 +188,18 @@ class Modes(Tensors):
 
 
 class OperatorCache:
-    """What was computed of an operator and is kept with it, in memory alone: copies and files are without.
+    """Results that are computed once and kept with an operator, in memory only: copies and files lack them.
 
     Attributes
     ----------
     values
-        Those of the weak pair that all is of; where an operator has others, it has another cache.
+        Values of the weak pair that the results belong to; an operator with other values gets a new cache.
     systems
         Linear systems with their factors.
     elements
-        Those of the weak pair, once a conductivity has asked for them.
+        Elements of the weak pair, made for the first conductivity.
     shapes
-        Of a batch its shapes, whose caches serve it, each with the values that it had.
+        Shapes of a batch, whose caches serve it, each with the values that it had.
     """
 
     def __init__(self, values: Tensor) -> None:

@@ -1,8 +1,8 @@
-"""What is decided about an operator, and what follows from it at given points.
+"""The decisions behind an operator, and their evaluation at given points.
 
 A `Plan` holds neighbours, degrees, which edges are curved, where the boundary is, and the points of every row: integers
-and flags, nothing that has a unit of length. `evaluate` makes numbers of it, by the same functions as a build: at the
-points that the plan was made from those of the operator, at points that moved a little those of the moved shape.
+and flags, nothing that has a unit of length. `evaluate` computes the operator by the same functions as a build: at the
+points that the plan was made from it gives that operator, at points that moved a little that of the moved shape.
 """
 
 from __future__ import annotations
@@ -31,22 +31,22 @@ from torchlb.stencils.shape import Shape, ShapePlan
 
 @dataclass(frozen=True)
 class Plan:
-    """What is decided about an operator with a weak pair; points and cells are in the order of `numbering`.
+    """The decisions behind an operator with a weak pair; points and cells are in the order of `numbering`.
 
     Attributes
     ----------
     numbering
-        From the user's order of the points, and back.
+        Map from the user's order of the points, and back.
     shape, rows, pair
-        Frames, normals and boundary; the stencils, None with a certificate; the weak pair.
+        Plans of frames, normals and boundary; of the stencils, None with a certificate; of the weak pair.
     flips
-        Those that make the triangles Delaunay which low-order rows are of.
+        Edge flips that lead to the Delaunay triangles of the low-order rows.
     faces, order
-        (F, d + 1), the cells as the user has them, in the user's numbers; (G,), of each of those here its place there.
+        (F, d + 1), the cells in the user's order and numbering; (G,), the index among these of each cell of the plan.
     on_mesh
-        Whether they are given, and not a surface through a cloud.
+        Whether the cells are the user's, and not a surface through a cloud.
     moved
-        Points of a noisy curve, which were put elsewhere.
+        Points of a noisy curve that were moved.
     source, options
         As of the operator.
     """
@@ -69,7 +69,7 @@ class Plan:
         return len(self.numbering.given)
 
     def forms(self, points: Float[Tensor, "N n"]) -> Forms:
-        """The elements of the weak pair at the user's points, in the user's numbers."""
+        """The elements of the weak pair at the user's points, in the user's numbering."""
         here = self._sorted(points)
         _, fits = self.shape.at(here)
         return self.pair.forms(fits).restored(self.numbering, self.order, len(self.faces))
@@ -95,10 +95,7 @@ class Plan:
 
 
 def evaluate(plan: Plan, points: Float[Tensor, "N n"]) -> AssembledOperator:
-    """The operator that follows from a plan at these points, float64 on the CPU.
-
-    Raises InputError where stencils are certified, or points of a noisy curve were moved.
-    """
+    """Evaluate a plan at points, float64 on the CPU; InputError with a certificate or moved points of a noisy curve."""
     here, options = plan._sorted(points), plan.options
     if plan.rows is None:
         raise InputError(
@@ -124,7 +121,7 @@ def evaluate(plan: Plan, points: Float[Tensor, "N n"]) -> AssembledOperator:
 
 
 def stencils_of(shape: Shape, options: Options) -> Stencils:
-    """What decides rows, and evaluates them."""
+    """The stencils of a shape: they decide rows, and evaluate them."""
     return Stencils(
         shape,
         options.order,

@@ -1,4 +1,4 @@
-"""What became of every point's stencil, to be looked at before the operator is trusted."""
+"""The order that each point's stencil reached, to be read before the operator is trusted."""
 
 from __future__ import annotations
 
@@ -16,38 +16,38 @@ from torchlb.stencils.rows import Reason
 
 @dataclass(frozen=True, eq=False, repr=False)
 class StencilReport:
-    """Numbers of each point's stencil (`method.md`, section 4). `print(lb.report)` for a summary.
+    """Figures of each point's stencil (`method.md`, section 4). `print(lb.report)` for a summary.
 
     Attributes
     ----------
     requested_order
-        p asked for.
+        Order p asked for.
     dim
-        d of the manifold.
+        Dimension d of the manifold.
     order
         (N,), order of accuracy reached; 0 for a low-order row.
     normal_order
         (N,), degree q behind the tangent frame; 0 where it stayed the initial one.
     num_neighbors
-        (N,), points of the stencil, itself included.
+        (N,), points of the stencil, its centre included.
     growth
         (N,), ρ² Σ|w|: the factor of the a-priori error bound.
     condition
-        (N,), of the scaled weighted Vandermonde matrix; NaN in a low-order row.
+        (N,), condition number of the scaled weighted Vandermonde matrix; NaN in a low-order row.
     off_diagonal_ratio
         (N,), Σ_{j≠i}|w_ij| / |w_ii|; 1 for an M-matrix row.
     rule
-        (N,), place of the rule for the weights in `WEIGHT_RULES`; their number for a low-order row.
+        (N,), index of the weights' rule in `WEIGHT_RULES`; their number for a low-order row.
     reason
-        (N,), why the row is below the requested order, a `Reason`.
+        (N,), `Reason` for a row below the requested order.
     fit_degree
         (N,), degree of the surface of the weak pair; 0 where it is left flat.
     fit_reason
-        (N,), why that is not higher, a place in `REASONS`.
+        (N,), reason why that degree is not higher, an index in `REASONS`.
     edges, curved_edges
-        (N,), number of edges at each vertex, and of those that are curved; zero without a weak pair.
+        (N,), number of edges at each vertex, and of curved ones; zero without a weak pair.
     surface
-        What was found of the surface through a cloud; None on a mesh.
+        Summary of the surface through a cloud; None on a mesh.
     """
 
     requested_order: int
@@ -68,7 +68,7 @@ class StencilReport:
 
     @property
     def curved_share(self) -> float:
-        """Share of the edges that the weak pair takes as curved; 0 where there is none."""
+        """Share of curved edges in the weak pair; 0 where there is none."""
         return float(self.curved_edges.sum() / self.edges.sum().clamp_min(1))
 
     @property
@@ -91,7 +91,7 @@ class StencilReport:
 
     @property
     def summary(self) -> dict[str, int | float]:
-        """The same as numbers, with medians and maxima over the stencils, and the growth that good ones have."""
+        """The summary as numbers, with medians and maxima over the stencils, and the growth of a good stencil."""
         reached = int((self.order >= self.requested_order).sum()) if self.requested_order else 0
         numbers: dict[str, int | float] = {
             "points": len(self.order),
@@ -105,7 +105,7 @@ class StencilReport:
         return numbers
 
     def _quantiles(self) -> dict[str, tuple[float, float, float]]:
-        """Median, 95 % and maximum over the stencils that are none of low order."""
+        """Median, 95 % quantile and maximum over the stencils, low-order rows excluded."""
         found = {}
         for name in ("num_neighbors", "growth", "condition", "off_diagonal_ratio"):
             values = getattr(self, name)[self.order > 0].double().sort().values
@@ -115,7 +115,7 @@ class StencilReport:
         return found
 
     def __repr__(self) -> str:
-        """Summary of a screenful."""
+        """Summary of one screen."""
         total = len(self.order)
         lines = [f"{total} points, order {self.requested_order} requested"]
         for order, count in self.order_counts.items():

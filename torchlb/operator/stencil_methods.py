@@ -1,4 +1,4 @@
-"""What an operator says by its stencil: Δf, ∇f and curvature are at a point."""
+"""Methods of an operator by its stencil: Δf, ∇f and curvature at a point."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from torchlb.operator.storage import OperatorStorage
 
 
 class StencilMethods(OperatorStorage):
-    """Products with the rows of the stencil, and what they make of a function."""
+    """Products with the rows of the stencil, and the differential operators made of them."""
 
     @property
     def matrix(self) -> Tensor:
@@ -23,7 +23,7 @@ class StencilMethods(OperatorStorage):
 
     @property
     def report(self) -> StencilReport:
-        """What order each point reached, and why not more; print it."""
+        """The order that each point reached, and why not more; print it."""
         if len(self._record.order) != self.num_points:
             raise InputError("report: PyG's Data do not carry it; it is with the operator as built")
         order, fields = self.options.get("order", 0), self._record.tensors
@@ -32,8 +32,8 @@ class StencilMethods(OperatorStorage):
     def forward(self, f: Float[Tensor, "*batch N C"] | Float[Tensor, " N"]) -> Tensor:
         """Δf, of the shape of f: (N,), (N, C) or (B, N, C) on one surface. Units of f by 1/ℓ².
 
-        Near a boundary that of functions which satisfy its condition, ∂f/∂ν + a f = 0 or f = 0; of any other it is
-        far off there, and `divergence(gradient(f))` is right.
+        Near a boundary it is that of functions which satisfy the condition, ∂f/∂ν + a f = 0 or f = 0; for any other
+        function it is far off there, and `divergence(gradient(f))` is right.
         """
         return self.stencil.product(0, f)
 
@@ -75,7 +75,7 @@ class StencilMethods(OperatorStorage):
     def divergence(self, v: Tensor) -> Tensor:
         """div v = Σ_c E_c · ∂_c v of space vectors v: (N,) for (N, n), (N, C) for (N, n, C), batches (B, N, C) too.
 
-        The divergence on the manifold of its tangential part plus, for a normal part φν, the term −Hφ of its mean
+        The divergence on the manifold of the tangential part of v plus, for a normal part φν, the term −Hφ of the mean
         curvature. Units of v by 1/ℓ. It is consistent, but neither −1 times the adjoint of `gradient` nor exactly
         conservative: ∫ div v = 0 on a closed surface, and div ∇f = Δf, up to the order of the stencils.
         """
@@ -109,7 +109,7 @@ class StencilMethods(OperatorStorage):
     def mean_curvature_normal(self) -> Float[Tensor, "N n"]:
         """Δx, 1/ℓ: the mean-curvature vector, −(κ₁ + κ₂) times the outer normal; −2x on the unit sphere.
 
-        Where rows of Δ hold a point of the boundary, and with it a condition that x does not satisfy, it is div ∇x.
+        In rows that contain a boundary point, and so a condition that x does not satisfy, it is computed as div ∇x.
         """
         normal, on_boundary = self(self.points), self._boundary_points()
         if not on_boundary.any():
@@ -119,7 +119,7 @@ class StencilMethods(OperatorStorage):
         return torch.where(free, normal, self.divergence(self.gradient(self.points)))
 
     def _boundary_points(self) -> Bool[Tensor, " N"]:
-        """Points of the boundary, whether a condition holds there or not."""
+        """Mask of the boundary points, whether or not a condition holds there."""
         on_boundary = torch.zeros_like(self.mass, dtype=torch.bool)
         if self.boundary is not None:
             on_boundary |= self.boundary

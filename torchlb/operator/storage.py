@@ -34,7 +34,7 @@ class OperatorStorage(Tensors):
     weak
         The matrices of the weak pair.
     modes
-        The eigenbasis, as far as it is known; `state_dict` has it where it is asked to.
+        The known part of the eigenbasis; `state_dict` has it if asked to.
     """
 
     mass: Tensor
@@ -67,12 +67,12 @@ class OperatorStorage(Tensors):
         self._record = Record(fields)
 
     def __getstate__(self) -> dict[str, Any]:
-        """For copies and files: without the plan, which is made again when it is asked for, and the cache."""
+        """State for copies and files, without the plan, which is made again on demand, and the cache."""
         return {**self.__dict__, "_plan": None, "_cache": None}
 
     @property
     def cache(self) -> OperatorCache:
-        """Factors and elements, kept as long as the operator and its matrices; ``del lb.cache`` lets them go."""
+        """Factors and elements, kept as long as the operator and its matrices; ``del lb.cache`` frees them."""
         if self._cache is None or self._cache.values is not self.weak.values:
             self._cache = OperatorCache(self.weak.values)
         return self._cache
@@ -88,7 +88,7 @@ class OperatorStorage(Tensors):
 
     @sizes.setter
     def sizes(self, sizes: Sequence[int] | None) -> None:
-        # In shapes of tensors, since numbers are compiled in.
+        # As shapes of tensors, since torch.compile specialises on numbers.
         self._sizes = None if sizes is None else [torch.empty(n, 0) for n in sizes]
 
     @classmethod
@@ -98,10 +98,7 @@ class OperatorStorage(Tensors):
         state: dict[str, Any],
         basis: Eigenbasis | None = None,
     ) -> Storage:
-        """An operator of given tensors, matrices and records by name, and of what `get_extra_state` has beside them.
-
-        What is left out stays empty.
-        """
+        """Create an operator from parts by name, the others empty, and the state that `get_extra_state` returns."""
         lb = cls()
         for name, part in parts.items():
             setattr(lb, name, part)
@@ -127,7 +124,7 @@ class OperatorStorage(Tensors):
 
     @property
     def condition(self) -> str | Condition | None:
-        """What holds at the boundary, "neumann", "dirichlet" or a `Robin`; None if no datum is used there."""
+        """Boundary condition, "neumann", "dirichlet" or a `Robin`; None if no boundary data are used."""
         plain = self.options.get("condition")
         return condition_of(plain) if isinstance(plain, dict) else plain
 
@@ -148,7 +145,7 @@ class OperatorStorage(Tensors):
 
     @property
     def _kinds(self) -> list[type[Condition]]:
-        """What kind of condition holds at the boundary of each shape."""
+        """Class of the boundary condition of each shape."""
         states = [{"options": self.options}] if self._states is None else self._states
         return [kind_of(state["options"].get("condition")) for state in states]
 
@@ -164,27 +161,27 @@ class OperatorStorage(Tensors):
 
     @property
     def device(self) -> torch.device:
-        """Where the buffers are."""
+        """Device of the buffers."""
         return self.stencil.values.device
 
     @property
     def offsets(self) -> tuple[int, ...]:
-        """Where the points of each shape of a batch start, and N at the end; (0, N) for a single shape."""
+        """Index of the first point of each shape of a batch, and N at the end; (0, N) for a single shape."""
         sizes = self.sizes or (self.num_points,)
         return tuple(sum(sizes[:i]) for i in range(len(sizes) + 1))
 
     @property
     def _basis(self) -> Eigenbasis | None:
-        """All eigenpairs that are known; None if there are none."""
+        """All known eigenpairs; None if there are none."""
         return self.modes.basis(self.mass, self.sizes)
 
     def _keep_basis(self, basis: Eigenbasis | None, *, stored: bool | None = None) -> None:
-        """Hold a basis (None: the one there is), in `state_dict` or not (None: as it was)."""
+        """Hold a basis (None: the present one), in `state_dict` or not (None: as before)."""
         stored = self.modes.stored if stored is None else stored
         self._hold(Modes(basis or self.modes, self.mass, stored=stored))
 
     def _hold(self, modes: Modes, vectors: Float[Tensor, "N k"] | None = None) -> None:
-        """Hold these eigenpairs, whose eigenvectors are to be loaded from `vectors` where that is given."""
+        """Hold eigenpairs; `vectors` are their eigenvectors where these are still to be loaded."""
         vectors, sizes = modes.eigenvectors if vectors is None else vectors, self.sizes
         free = torch.ones_like(self.mass, dtype=torch.bool) if self.fixed is None else ~self.fixed
         self.modes = (
@@ -192,14 +189,14 @@ class OperatorStorage(Tensors):
         )
 
     def check_points(self, points: Tensor) -> None:
-        """InputError unless the operator was built from these points: as many, each in its place to float32 rounding.
+        """Raise InputError unless the operator was built from these points, in their order, to float32 rounding.
 
         An operator does not follow its points: after scaling, turning, or taking a part of them it is another one.
         """
         check_same_points(points, self.points)
 
     def get_extra_state(self) -> dict[str, Any]:
-        """Source, options, certificate, spectral radius and what is known of the surface, plain types only."""
+        """Source, options, certificate, spectral radius and the surface's summary, plain types only."""
         return {
             "source": self.source,
             "options": self.options,
@@ -211,7 +208,7 @@ class OperatorStorage(Tensors):
         }
 
     def set_extra_state(self, state: dict[str, Any]) -> None:
-        """Inverse of `get_extra_state`; what is left out is not known."""
+        """Inverse of `get_extra_state`; entries that are left out are unknown."""
         self.source, self.options = state["source"], dict(state["options"])
         found, sizes, radius = (state.get(key) for key in ("certificate", "sizes", "radius"))
         surface = state.get("surface")
@@ -221,7 +218,7 @@ class OperatorStorage(Tensors):
         self.weak.known_radius = radius
 
     def _load_from_state_dict(self, state_dict: Any, prefix: str, *given: Any) -> None:
-        """Where that replaces an operator on other points a warning says so."""
+        """Load a state; warn where it replaces an operator on other points."""
         theirs = state_dict.get(f"{prefix}points")
         if self.num_points and theirs is not None:
             try:

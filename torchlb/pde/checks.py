@@ -1,4 +1,4 @@
-"""What solves, flows and layers ask of their input: one rule of shapes and types, one of names."""
+"""Checks of the input of solves, flows and layers: shapes, types and names."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ T = TypeVar("T")
 
 
 def check_shape(x: Tensor, lb: LaplaceBeltrami) -> None:
-    """InputError unless x is (N, C) or (B, N, C) with the N of the operator, InputTypeError unless a tensor."""
+    """Raise InputError unless x is (N, C) or (B, N, C) with the N of the operator, InputTypeError unless a tensor."""
     check_operator(lb)
     check_tensor(x)
     if x.ndim not in (2, 3) or x.shape[-2] != lb.num_points:
@@ -30,7 +30,7 @@ def check_shape(x: Tensor, lb: LaplaceBeltrami) -> None:
 
 
 def as_columns(f: Tensor, lb: LaplaceBeltrami) -> Tensor:
-    """(N, C) or (B, N, C) of the f of a user, which may be (N,), too; integers and masks in the operator's type.
+    """A user's f of shape (N,), (N, C) or (B, N, C) as (N, C) or (B, N, C); integers and masks in the operator's type.
 
     Errors as for `check_shape`, and InputError for complex numbers, NaN and infinity, and without a weak pair.
     """
@@ -51,7 +51,7 @@ def off_geometry(x: Tensor, lb: LaplaceBeltrami) -> Tensor:
 
 
 def as_times(t: float | Tensor, x: Tensor, dtype: torch.dtype) -> Tensor:
-    """Times for the channels of x, (C,); InputError unless they are one or C, finite and at least 0.
+    """Times for the channels of x, (C,); InputError unless one or C are given, finite and at least 0.
 
     >>> as_times(0.5, torch.ones(4, 2), torch.float32)
     tensor([0.5000, 0.5000])
@@ -67,7 +67,7 @@ def as_times(t: float | Tensor, x: Tensor, dtype: torch.dtype) -> Tensor:
 
 
 def uncompiled(function: Callable[P, T]) -> Callable[P, T]:
-    """`torch.compiler.disable`, put off until something is compiled: it loads the compiler, in more than a second."""
+    """`torch.compiler.disable`, deferred until something is compiled: importing the compiler takes over a second."""
 
     @wraps(function)
     def called(*args: P.args, **options: P.kwargs) -> T:
@@ -80,6 +80,6 @@ def uncompiled(function: Callable[P, T]) -> Callable[P, T]:
 
 
 def check_choice(name: str, value: str, choices: Any) -> None:
-    """InputError unless the value is one of a Literal."""
+    """Raise InputError unless the value is one of a Literal."""
     if value not in get_args(choices):
         raise InputError(f"{name}: expected one of {get_args(choices)}, got {value!r}")

@@ -1,4 +1,4 @@
-"""An operator whose stiffness is that of div κ∇, as far as the solves ask for one."""
+"""An operator with the stiffness of div κ∇, for the solves."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from torchlb.operator.parts import OperatorCache, PairMatrices
 
 @dataclass(frozen=True, eq=False)
 class WithConductivity:
-    """(K(κ), M) of an operator, with what its condition adds to K, and the derivatives of K in κ."""
+    """(K(κ), M) of an operator, with the term that its condition adds to K, and the derivative of K in κ."""
 
     lb: LaplaceBeltrami
     forms: Forms
@@ -30,7 +30,7 @@ class WithConductivity:
     cache: OperatorCache
 
     def __getattr__(self, name: str) -> Any:
-        """What κ does not change, as of the operator."""
+        """Return an attribute of the operator that does not depend on κ."""
         return getattr(self.lb, name)
 
     def slope(
@@ -46,13 +46,7 @@ class WithConductivity:
 
 
 def elements_of(lb: LaplaceBeltrami) -> Forms:
-    """The elements of an operator's weak pair; made once, and kept with it.
-
-    Raises
-    ------
-    InputError
-        For batches, and operators without a weak pair.
-    """
+    """The elements of an operator's weak pair, cached with it; InputError for batches and without a weak pair."""
     if lb.cache.elements is None:
         if lb.source == "batch" or not lb.has_weak_form:
             remedy = "solve shape by shape, lb.unbatch()"
@@ -67,12 +61,9 @@ def elements_of(lb: LaplaceBeltrami) -> Forms:
 
 
 def with_conductivity(lb: LaplaceBeltrami, conductivity: Tensor) -> WithConductivity:
-    """The operator with the stiffness of div κ∇, κ > 0 of the vertices (N,) or of the faces (F,).
+    """The operator with the stiffness of div κ∇, for κ > 0 at the vertices (N,) or on the faces (F,).
 
-    Raises
-    ------
-    InputError
-        For another shape, values that are not positive, and operators that are without elements.
+    Raises InputError for another shape, values that are not positive, and operators without elements.
     """
     check_tensor(conductivity, "conductivity")
     forms = elements_of(lb)
@@ -96,7 +87,7 @@ def with_conductivity(lb: LaplaceBeltrami, conductivity: Tensor) -> WithConducti
 
 
 def _with_rest(pair: Csr, matrix: Any) -> Csr:
-    """K(κ) with M, and with what the condition adds, whatever κ is."""
+    """K(κ) with M, and with the term of the condition, which does not depend on κ."""
     shape = pair.num_rows, pair.num_rows
     _, mass, *rest = (to_scipy(pair.crow, pair.col, v.double(), shape) for v in pair.values)
     upper = matrix.real + 1j * sparse.triu(mass, format="csr")

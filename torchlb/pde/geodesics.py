@@ -1,8 +1,8 @@
-"""Geodesic distance: shortest paths along edges, then straightened across the triangles between them.
+"""Geodesic distance: shortest paths along edges, straightened across the triangles between them.
 
-The heat method (Crane, Weischedel, Wardetzky 2013) solves for the same function in the least squares sense, which
-smooths the cut locus, and its heat is negative at up to half of the points where triangles are obtuse. Updates across
-triangles (Novotni, Klein 2002) need neither: their mean error is 0.2 to 0.6 of its on real shapes of 4.8k points.
+The heat method (Crane, Weischedel, Wardetzky 2013) computes the distance in the least-squares sense, which smooths the
+cut locus, and its heat is negative at up to half of the points where triangles are obtuse. Updates across triangles
+(Novotni, Klein 2002) avoid both: their mean error is 0.2 to 0.6 of its on real shapes of 4.8k points.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from torchlb.operator.laplace_beltrami import LaplaceBeltrami
 from torchlb.pde.checks import off_geometry
 
 FROM_MESH = ("mesh", "cotangent")
-"""Sources of operators whose faces are all there is."""
+"""Sources of operators for which all edges are those of the faces."""
 Side = Float[np.ndarray, " T"]
 Triangles = tuple[np.ndarray, np.ndarray, np.ndarray]
 
@@ -35,23 +35,23 @@ def geodesic_distance(
 ) -> Float[Tensor, " N"]:
     """Distance along the surface to the nearest of the sources, ℓ; infinite where no path leads to one.
 
-    On surfaces the error falls a little faster than the spacing: on a sphere of 2,000 vertices it is 0.4 % in the mean,
-    and of several sources about as of one: the least of the distances from each. It is never below the straight line.
-    On curves and in more dimensions, and where there are no triangles, paths follow edges. Computed on the
-    CPU, without derivatives.
+    On surfaces the error falls a little faster than the spacing: on a sphere of 2,000 vertices it is 0.4 % in the mean.
+    For several sources, the result is the least of their distances, with about the same error. It is never below the
+    straight line. On curves, in more dimensions, and without triangles, paths follow edges. Computed on the CPU,
+    without derivatives.
 
     Parameters
     ----------
     lb
         Operator of one shape or of a batch. Edges and triangles are those of its mesh, or of the surface through a
-        cloud; where there is none, edges are those of its stencils.
+        cloud; without one, edges are those of its stencils.
     sources
-        Number of a point, numbers of several, or a mask (N,).
+        Index of a point, indices of several, or a mask (N,).
 
     Raises
     ------
     InputError
-        For no sources, or numbers out of range.
+        For no sources, or indices out of range.
 
     Examples
     --------
@@ -72,7 +72,7 @@ def geodesic_distance(
         graph, indices=start.cpu().numpy(), min_only=True, return_predecessors=True
     )
     if lb.dim == 2 and len(row):
-        foot = points[np.maximum(nearest, 0)]  # any, where no path leads to one
+        foot = points[np.maximum(nearest, 0)]  # arbitrary where no path leads to a source
         enough = NEGLIGIBLE * float(length.mean())
         distance = _straightened(distance, foot, points, _triangles(lb), enough)
     return off_geometry(torch.from_numpy(distance).to(lb.mass), lb)
@@ -93,7 +93,7 @@ def _sources(lb: LaplaceBeltrami, sources: int | Sequence[int] | Tensor) -> Int[
 
 
 def _edges(lb: LaplaceBeltrami) -> tuple[np.ndarray, np.ndarray]:
-    """Pairs of neighbours, each in both directions: of faces and local stars; where there are none, of the stencils."""
+    """Edges in both directions, of faces and of the P1 pair; without a weak pair, those of the stencils."""
     matrix: Any = mesh_graph(lb.faces.cpu(), lb.num_points)
     if len(lb.faces) == 0 or lb.source not in FROM_MESH:
         crow, col = (
@@ -111,7 +111,7 @@ def _distances(points: np.ndarray, a: np.ndarray, b: np.ndarray) -> np.ndarray:
 
 
 def _triangles(lb: LaplaceBeltrami) -> Triangles:
-    """(i, j, k), sorted by i: each face from all its corners."""
+    """Corners (i, j, k) of the faces, each face once from every corner i, sorted by i."""
     faces = lb.faces.cpu().numpy()
     i, j, k = (np.concatenate([faces[:, (c + shift) % 3] for c in range(3)]) for shift in range(3))
     order = np.argsort(i, kind="stable")
@@ -125,11 +125,11 @@ def _straightened(
     triangles: Triangles,
     enough: float,
 ) -> Float[np.ndarray, " N"]:
-    """Sweeps over the triangles at points whose distances fell, until none falls any more by `enough`.
+    """Sweep over the triangles at points whose distances fell, until none falls by more than `enough`.
 
-    The path to a point i that crosses the edge jk of a triangle starts at the source of j or at that of k, its `foot`;
-    where no straight path crosses jk, it is through j or k. If the two have different sources, the distance of k from
-    that of j is not known: it is no less than the straight line, nor than its own.
+    The path to a point i that crosses the edge jk of a triangle starts at the source of j or of k, its `foot`; where no
+    straight path crosses jk, it passes through j or k. If the two have different sources, the distance of k from the
+    source of j is unknown, and bounded below by the straight line and by the distance of k.
     """
     i, j, k = triangles
     if len(i) == 0:
@@ -169,9 +169,9 @@ def _straightened(
 
 
 def _from_point(d_j: Side, d_k: Side, along: Side, height: Side, base: Side) -> Side:
-    """Distance from i to the point that is d_j and d_k away, across jk; NaN where the path does not cross jk.
+    """Distance from i, across jk, to the point at distances d_j and d_k from its ends; NaN where the path misses jk.
 
-    `along`, `height` : where i is, as in `_apex`.
+    `along` and `height` are the position of i, as in `_apex`.
     """
     source, depth = _apex(d_j, d_k, base)
     share = (source * height + along * depth) / ((height + depth) * base)
@@ -179,6 +179,6 @@ def _from_point(d_j: Side, d_k: Side, along: Side, height: Side, base: Side) -> 
 
 
 def _apex(left: np.ndarray, right: np.ndarray, base: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Along the base from its left end, and across it: where the point of these two distances to its ends is."""
+    """Position, along the base from its left end and across it, of the point at given distances from the ends."""
     along = (left**2 - right**2 + base**2) / (2 * base)
     return along, np.sqrt(np.maximum(left**2 - along**2, 0.0))

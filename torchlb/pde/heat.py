@@ -1,9 +1,9 @@
 """Heat flow e^{tΔ}f = e^{−tM⁻¹K}f (`method.md`, section 8).
 
 method="deflated", the layer's default, splits off the span of the slow eigenvectors, where the flow is exact; the rest,
-of which nothing is left after about 16/λ_k, takes a short Chebyshev series of the linear pair with lumped mass, since
-the mesh hardly resolves what is beyond the basis. "spectral" is the first part alone: everything beyond the basis is
-dropped, also as t → 0. "rational" needs no basis, and is exact to the tolerance: the solves of `pair_flow`.
+which has decayed after about 16/λ_k, takes a short Chebyshev series of the P1 pair with lumped mass, since the mesh
+hardly resolves functions beyond the basis. "spectral" is the first part alone: everything beyond the basis is dropped,
+also as t → 0. "rational" needs no basis and is exact to the tolerance: the solves of `pair_flow`.
 """
 
 from __future__ import annotations
@@ -37,9 +37,10 @@ def heat_flow(
     k: int = 128,
     tolerance: float = ROOT_EPS,
 ) -> Tensor:
-    """e^{tΔ}f: what f becomes when it diffuses over the surface for a time t; differentiable in f and t.
+    """e^{tΔ}f: f after diffusion over the surface for a time t; differentiable in f and t.
 
-    Computed in the wider of the types of f and the operator, at least float32; only a half-precision f gives its own.
+    Computed in the wider of the types of f and the operator, at least float32; only a half-precision f gets its own
+    type back.
 
     Parameters
     ----------
@@ -48,20 +49,20 @@ def heat_flow(
     f
         (N,), (N, C) or (B, N, C).
     t
-        Time ≥ 0 in ℓ², one for all channels or (C,). (In a time t a peak spreads to a width of √(2t).).
+        Time ≥ 0 in ℓ², one for all channels or (C,). (In a time t a peak spreads to a width of √(2t).)
     method
         "rational", which is exact to the tolerance, "deflated" or "spectral".
     k
         Number of eigenpairs, for the last two.
     tolerance
-        Of the error in the norm of M, relative to |f|. Values that are smaller than that everywhere around, as far away
-        from a heated point, are noise: logarithms and directions of them (geodesics) need an implicit step.
+        Bound on the error in the norm of M, relative to |f|. Where all values around are smaller, as far from a heated
+        point, they are noise: their logarithms and directions (geodesics) need an implicit step.
 
     Raises
     ------
     InputError
-        For times that are negative or not finite, for an unknown method and a wrong shape, a tolerance that is not
-        between 0 and 1, an operator without a weak pair.
+        For times that are negative or not finite, an unknown method, a wrong shape, a tolerance that is not between 0
+        and 1, an operator without a weak pair.
 
     Examples
     --------
@@ -83,10 +84,7 @@ def heat_flow(
 def flow(
     lb: LaplaceBeltrami, x: Tensor, time: Tensor, method: str, k: int, tolerance: float
 ) -> Tensor:
-    """e^{tΔ}x in the type of x, which is float32 or float64; autocast has to be off.
-
-    The surfaces of a stack (B, N, C) become channels.
-    """
+    """e^{tΔ}x, (N, C) or (B, N, C), in the type of x, which is float32 or float64; autocast has to be off."""
     check_tolerance(tolerance)
     if x.ndim == 3:
         columns, times = x.transpose(0, 1).flatten(1), time.repeat(len(x))
@@ -110,7 +108,7 @@ def _spectral(basis: Eigenbasis, x: Tensor, time: Tensor) -> Tensor:
 def _deflated(
     lb: LaplaceBeltrami, basis: Eigenbasis, x: Tensor, time: Tensor, tolerance: float
 ) -> Tensor:
-    """e^{−λt} on the span, the flow of the linear pair with lumped mass on the rest, from which it does not return."""
+    """e^{−λt} on the basis' span; on the rest, the flow of the P1 pair with lumped mass, projected off that span."""
     if lb.fixed is not None:
         x = x * ~lb.fixed[:, None]
     values, coefficients = basis.eigenvalues.to(x.dtype), basis.analyse(basis.left, x)
@@ -131,7 +129,7 @@ def _deflated(
 
 
 def _linear_flow(lb: LaplaceBeltrami) -> tuple[list[Tensor], Tensor, Tensor]:
-    """Pattern and values of −D^{−½}K₁D^{−½}, and D^½, D the row sums of M₁; nothing joins Dirichlet points."""
+    """Pattern and values of −D^{−½}K₁D^{−½}, zero for Dirichlet points, and D^½, where D are the row sums of M₁."""
     crow, col, (stiffness, mass, *_) = lb.weak.linear_pair
     row = torch.arange(lb.num_points, device=col.device).repeat_interleave(
         crow.diff(), output_size=len(col)

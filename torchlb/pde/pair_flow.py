@@ -18,9 +18,9 @@ from torchlb.pde.systems import pair_system
 def pair_flow(
     lb: LaplaceBeltrami, x: Float[Tensor, "N C"], time: Float[Tensor, " C"], tolerance: float
 ) -> Float[Tensor, "N C"]:
-    """The flow of each column for a time of its own, differentiable once in x and in the times.
+    """The flow of each column for its own time, differentiable once in x and in the times.
 
-    Zero at Dirichlet points. The error is `tolerance` in the norm of M, relative to x.
+    Zero at Dirichlet points. The error is at most `tolerance` in the norm of M, relative to x.
     """
     return _flow(x.double(), time.double(), lb, tolerance)
 
@@ -49,7 +49,7 @@ _flow: Any = uncompiled(_Flow.apply)
 def _summed(
     lb: LaplaceBeltrami, x: Tensor, time: Tensor, tolerance: float, transposed: bool
 ) -> tuple[Tensor, Tensor]:
-    """Σ c_k v_k and Σ c_k' v_k; at t = 0, of the transposed, x and −KM⁻¹x."""
+    """Σ c_k v_k and Σ c_k' v_k; at t = 0, for the transposed flow, x and −KM⁻¹x."""
     result, slope = torch.zeros_like(x), torch.zeros_like(x)
     times = time.detach().cpu().numpy()
     at_zero = torch.from_numpy(times == 0).to(x.device)
@@ -73,4 +73,4 @@ def _summed(
         for k, v in enumerate(chebyshev_vectors(doubled, x[:, columns], len(c))):
             result[:, columns] += torch.from_numpy(c[k]).to(x) * v
             slope[:, columns] += torch.from_numpy(derivative[k]).to(x) / pole * v
-    return solver.inside(result), solver.inside(slope)  # Zᵀ leads out to Dirichlet points
+    return solver.inside(result), solver.inside(slope)  # Zᵀ is nonzero at Dirichlet points

@@ -21,7 +21,7 @@ from torchlb.pde.conduction import WithConductivity, with_conductivity
 from torchlb.pde.systems import solve_columns
 
 TOLERANCE = 1e-10
-"""Relative error of solves by default: less than that of any mesh, and far above rounding."""
+"""Default relative error of solves: below the error of any mesh, and far above rounding."""
 
 
 @uncompiled
@@ -37,9 +37,9 @@ def implicit_step(
 ) -> Tensor:
     """(1 − tΔ)⁻¹f, one implicit Euler step of heat flow; differentiable in f, t and the boundary's data.
 
-    (M + tK)u = Mf + tB·flux, by conjugate gradients that the linear pair preconditions. Solved in float64; to a
-    tolerance of 1e-5 or more steps are in float32, and where f and the operator are, right-hand sides, too. The result
-    has the type of f, that of the operator where f are integers.
+    (M + tK)u = Mf + tB·flux, by conjugate gradients with the P1 pair as preconditioner. Solved in float64; for a
+    tolerance of 1e-5 or more iterations are in float32, and, where f and the operator are, right-hand sides, too. The
+    result has the type of f, that of the operator where f are integers.
 
     Parameters
     ----------
@@ -52,13 +52,13 @@ def implicit_step(
         default.
     flux
         κ∂_ν u along the rest of the boundary, κ∂_ν u + a u with `Robin`, units of f by 1/ℓ, in the same way; 0 by
-        default. Beside that rest it counts at the next few held points, too, as the curve between points does: continue
-        it smoothly to them.
+        default. At Dirichlet points next to that part it counts, too, since boundary integrals reach them: continue it
+        smoothly to them.
     conductivity
-        κ > 0 of u − t div(κ∇u) = f, of the vertices (N,), its logarithm prolonged as the surface is, or of the faces
-        (F,), if they are not as many; 1 by default. Of one shape; differentiable in it, too.
+        κ > 0 of u − t div(κ∇u) = f, at the vertices (N,), its logarithm prolonged as the surface is, or on the faces
+        (F,), if F ≠ N; 1 by default. Of one shape; the solution is differentiable in it, too.
     tolerance
-        Of the solver, relative.
+        Relative tolerance of the solver.
 
     Raises InputError for wrong shapes, times that are negative or not finite, data for a boundary that is not there, a
     tolerance that is not between 0 and 1; DiffusionError where the solver does not converge.
@@ -97,9 +97,8 @@ def poisson_solve(
 ) -> Tensor:
     """u with −Δu = f; differentiable in f and the boundary's data. Units of f by ℓ².
 
-    Ku = Mf + B·flux. On a component that neither a Dirichlet nor a Robin
-    condition holds u has mean zero, and f and flux are made compatible: their total is taken off f, evenly. Arguments
-    and errors as for `implicit_step`.
+    Ku = Mf + B·flux. On a component without a Dirichlet or Robin condition u has mean zero, and the data are made
+    compatible: the total of f and flux is subtracted from f, evenly. Arguments and errors as for `implicit_step`.
 
     Examples
     --------
@@ -134,17 +133,17 @@ def potential(
 ) -> Float[Tensor, "*B N C"]:
     """u with −Δu = s − ∇·v for a tangent field v, given in the frames, and a source s; differentiable.
 
-    Ku = Σ_c G_cᵀ(π v_c) + π s, G the rows of the gradient and π the mass. Of mean zero, where no condition holds u. For
-    a field alone u's gradient is closest to it; where v = ∇f it is f less its mean, up to the order.
+    Ku = Σ_c G_cᵀ(π v_c) + π s, where G are the rows of the gradient and π is the mass. u has mean zero where no
+    condition holds it. For a field alone, ∇u is closest to it; for v = ∇f, u is f less its mean, up to the order.
 
     Parameters
     ----------
     field
-        (N, d, C) or (B, N, d, C), as `lb.local_gradient` gives it, units of u by 1/ℓ; None for none.
+        (N, d, C) or (B, N, d, C), as `lb.local_gradient` gives it, units of u by 1/ℓ; None for no field.
     source
-        (N, C) or (B, N, C), units of u by 1/ℓ²; its mean is taken off.
+        (N, C) or (B, N, C), units of u by 1/ℓ²; its mean is subtracted.
     tolerance
-        Of the solve with the weak pair, relative; None for that of linear elements, which is second order.
+        Relative tolerance of the solve with the weak pair; None for the solution by P1 elements, of second order.
     """
     check_tolerance(tolerance)
     products = []
@@ -167,7 +166,7 @@ def potential(
 def _columns(
     x: Tensor, time: Tensor | None, dtype: torch.dtype = torch.float64
 ) -> tuple[Tensor, Tensor]:
-    """The surfaces of a stack (B, N, C) as further channels, with a time for each."""
+    """The functions of a stack (B, N, C) as further columns, with a time for each."""
     time = x.new_zeros(0) if time is None else time
     if x.ndim == 2:
         return x.to(dtype), time
@@ -205,7 +204,7 @@ def _data(lb: LaplaceBeltrami, data: Tensor | float | None, kind: int, f: Tensor
 
 
 def _reached_by_flux(lb: LaplaceBeltrami, free: Tensor) -> Tensor:
-    """(N,), points of the boundary whose flux comes to a free point."""
+    """Mask (N,) of the boundary points whose flux reaches a free point."""
     if len(lb.weak.values) < 3:
         return torch.zeros_like(free)
     size = lb.weak.values[2].abs()
@@ -213,7 +212,7 @@ def _reached_by_flux(lb: LaplaceBeltrami, free: Tensor) -> Tensor:
 
 
 def _missing(lb: LaplaceBeltrami, kind: int) -> str:
-    """Why there is no point for Dirichlet values (kind 0) or for fluxes (1)."""
+    """Reason why there is no point for Dirichlet values (kind 0) or for fluxes (1)."""
     if len(lb.weak.values) < 3:
         return "the shape is closed; it has no boundary for them"
     if kind == 0:
@@ -222,7 +221,7 @@ def _missing(lb: LaplaceBeltrami, kind: int) -> str:
 
 
 def _product(lb: LaplaceBeltrami | WithConductivity, number: int, x: Tensor) -> Tensor:
-    """K, with what a condition adds, or M times x."""
+    """K, with the term of a condition, or M times x."""
     crow, col, values = lb.weak.pair
     return symmetric_product(crow, col, values[number].to(x), x)
 
@@ -230,8 +229,8 @@ def _product(lb: LaplaceBeltrami | WithConductivity, number: int, x: Tensor) -> 
 class _Solve(torch.autograd.Function):
     """u of S(t)u = b: (M + tK)u = b, or Ku = b for a time of None; zero at Dirichlet points.
 
-    Its derivatives are solves with the same matrix: S⁻¹g in b, −⟨S⁻¹g, Ku⟩ in t, and −t⟨S⁻¹g, K'(κ)(u + g)⟩ in the
-    conductivity κ, g the `given` values at the boundary.
+    Its derivatives are solves with the same matrix: S⁻¹g in b, −⟨S⁻¹g, Ku⟩ in t, and −t⟨S⁻¹g, K'(κ)(u + u₀)⟩ in the
+    conductivity κ, for the cotangent g and the `given` boundary values u₀.
     """
 
     @staticmethod

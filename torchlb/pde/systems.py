@@ -1,11 +1,11 @@
 """The linear systems behind implicit steps and Poisson problems.
 
-A system is a K + b M, K with what a Robin condition adds to it, with the rows and columns of Dirichlet points taken
-out. It is solved by conjugate gradients; the factor of the linear pair, which is spectrally close and 20
-times sparser, preconditions them (`method.md`, section 10). Where rows of the fits have large weights, K is up to
-thirty times stiffer than K₁ at single points, in functions that live there: smoothing before and after the factor's
-solve then takes a third of the steps. Many times of one call share factors, those of powers of four. Factors are kept
-as long as the operator that they belong to; a batch takes those of its shapes.
+A system is a K + b M, where K includes the term of a Robin condition, without the rows and columns of Dirichlet points.
+It is solved by conjugate gradients, preconditioned with a factor of the P1 pair, which is spectrally close and 20 times
+sparser (`method.md`, section 10). Where rows of the fits have large weights, K is up to thirty times stiffer than K₁ at
+single points, in local functions: smoothing before and after the factor's solve then takes a third of the iterations.
+Several times in one call share factors, those of powers of four. Factors are kept as long as their operator; a batch
+uses those of its shapes.
 """
 
 from __future__ import annotations
@@ -33,19 +33,19 @@ from torchlb.operator.laplace_beltrami import LaplaceBeltrami
 from torchlb.pde.conduction import WithConductivity
 
 KEPT = 8
-"""Factors that are kept for each operator."""
+"""Number of factors kept for each operator."""
 SPACING = 4.0
-"""Ratio of the times that have factors: M + tK and the matrix of its factor then differ by its root at most."""
+"""Ratio of successive times with factors: M + tK and the matrix of its factor differ by its square root at most."""
 Operator = LaplaceBeltrami | WithConductivity
 
 
 def pair_system(lb: Operator) -> PairSystem:
-    """That of an operator with a weak pair, for all times."""
+    """The system of an operator with a weak pair, for all times."""
     return _kept(lb.cache.systems, None, lambda: PairSystem(lb))
 
 
 def _kept(kept: OrderedDict[Any, Any], key: Any, make: Callable[[], Any]) -> Any:
-    """What is kept under a key, made where it is not; what was not used for longest goes."""
+    """Least-recently-used cache of `KEPT` entries: the entry of a key, made where it is missing."""
     if key not in kept:
         kept[key] = make()
         if len(kept) > KEPT:
@@ -60,10 +60,7 @@ def solve_columns(
     time: Float[Tensor, " C"] | None,
     tolerance: float | None,
 ) -> Float[Tensor, "N C"]:
-    """(M + tK)⁻¹b of every column by its time, or K⁻¹b for a time of None.
-
-    A time of 0 has M to invert. A tolerance of None takes linear elements for the pair.
-    """
+    """(M + tK)⁻¹b of every column by its time, or K⁻¹b for a time of None; by P1 elements for a tolerance of None."""
     shapes = shapes_of(lb)
     if shapes:
         blocks = zip(shapes, b.split([shape.num_points for shape in shapes]), strict=True)
@@ -72,7 +69,7 @@ def solve_columns(
 
 
 class _Components:
-    """Means over the connected components of a shape, and which of them a condition holds: on these K is regular."""
+    """Means over the connected components of a shape; on components with a condition K is regular."""
 
     def __init__(self, lb: Operator) -> None:
         crow, col, _ = lb.weak.linear_pair
@@ -84,10 +81,10 @@ class _Components:
         held = held.index_add(0, self.of, lb.weak.losing(lb.fixed).float())
         if self.count > 1:
             held = held[self.of]
-        self.free = (held == 0)[:, None]  # of the points; one for all if there is one component
+        self.free = (held == 0)[:, None]  # by point; a single row for one component
 
     def sums(self, weights: Float[Tensor, "N 1"], x: Float[Tensor, "N C"]) -> Float[Tensor, "_ C"]:
-        """Of every point the weighted sum over its component; one row for all where there is one component."""
+        """Weighted sum over the component of each point; one row for all points if there is one component."""
         if self.count == 1:
             return weights.T @ x
         found = x.new_zeros(self.count, x.shape[1])
@@ -109,11 +106,11 @@ class PairSystem:
         self.ones_mass = self.mass_product(self.one)
         self.area = self.components.sums(self.one, self.ones_mass)
         self.stiff = float(self.stiffness.double().abs().sum() / self.mass.double().sum())
-        self.smooths = lb.weak.linear.num_rows > 0  # the cotangent's pair is the linear one
+        self.smooths = lb.weak.linear.num_rows > 0  # the cotangent's pair is its own P1 pair
         self.steps = 0
         crow, col, linear = lb.weak.linear_pair
         first, second = (to_scipy(crow, col, v.double(), lb.shape) for v in linear)
-        sums = first.sum(1)  # in float32 it would be indefinite with what is below zero
+        sums = first.sum(1)  # negative row sums (float32) would make it indefinite
         sums = np.where(lb.weak.losing(lb.fixed).cpu().numpy(), np.minimum(sums, 0.0), sums)
         first = first - sparse.diags_array(sums)
         self.linear, self.factors = (first, second), OrderedDict()
@@ -121,14 +118,14 @@ class PairSystem:
     def solve(
         self, b: Float[Tensor, "N C"], time: Float[Tensor, " C"] | None, tolerance: float | None
     ) -> Float[Tensor, "N C"]:
-        """The solution, zero at Dirichlet points, of mean zero on components where K1 = 0 of a Poisson problem.
+        """The solution, zero at Dirichlet points; for a Poisson problem, of mean zero on components where K1 = 0.
 
-        On these, constants are split off, for which M + tK is M: they and the mass stay to rounding. A tolerance of
-        None takes the factors' solution, that of linear elements.
+        On these components constants are split off, for which M + tK is M: constants and the mass are exact to
+        rounding. A tolerance of None takes the solution by the factors, of P1 elements.
         """
         if b.shape[1] == 0:
             return b.double()
-        if time is not None and bool((time.diff() < 0).any()):  # columns of a factor side by side
+        if time is not None and bool((time.diff() < 0).any()):  # group the columns of each factor
             order = time.argsort()
             return self.solve(b[:, order], time[order], tolerance)[:, order.argsort()]
         if time is not None and bool(time[0] == time[-1]):
@@ -152,9 +149,9 @@ class PairSystem:
     def _solved(
         self, right: Float[Tensor, "N C"], time: Tensor | None, tolerance: float, near: Linear
     ) -> Float[Tensor, "N C"]:
-        """By conjugate gradients, on right-hand sides and matrices that are scaled to about one.
+        """Solve by conjugate gradients, with right-hand sides and matrices scaled to about one.
 
-        Columns of several times go together: a product takes hardly longer for thirty than for one.
+        Columns of several times are solved together: a product takes hardly longer for thirty than for one.
         """
         unit, shares = self._shares(time)
         soft = time is not None and 1 + float(time[-1]) * self.stiff <= 1 / SINGLE
@@ -169,7 +166,7 @@ class PairSystem:
 
         def precondition(r: Tensor) -> Tensor:
             x = near(r.double()).mul_(unit)
-            # Where K is singular constants are large, from rounding alone.
+            # Where K is singular, rounding adds large constants.
             return (x - self._mean(self.ones_mass, x) if time is None else x).to(r)
 
         inverse = precondition
@@ -185,7 +182,7 @@ class PairSystem:
         return x.double() * (size / unit)
 
     def _shares(self, time: Tensor | None) -> tuple[Float[Tensor, " C"], list[Tensor]]:
-        """A unit for the matrix of each time, and its shares of K and M scaled to one; K alone without times."""
+        """A scale for the matrix of each time, and its shares of K and M scaled to one; K alone without times."""
         of_stiffness, of_mass = self.units
         if time is None:
             return of_stiffness[None], [torch.ones_like(of_stiffness[None])]
@@ -194,13 +191,13 @@ class PairSystem:
 
     @cached_property
     def _rough(self) -> list[tuple[Matrix, Float[Tensor, "N 1"]]]:
-        """What smoothing takes of K and of M, scaled to one, and the absolute row sums."""
+        """Smoothing matrices, K and M scaled to one without small entries, and their absolute row sums."""
         parts = zip(self.parts, self.units, strict=True)
         matrices = [without_small_entries(*self.pattern, v.double() / unit) for v, unit in parts]
         return [(m, absolute_row_sums(m[0], m[2])) for m in matrices]
 
     def _cycle(self, shares: list[Tensor], coarse: Linear) -> Linear:
-        """Smoothing around the factors' solve, in float32; of K alone where M is small even at the shortest time."""
+        """Two-grid cycle around the factors' solve, in float32; of K alone where M is small for the shortest time."""
         shares = [share.float() for share in shares]
         sums = [share * s for share, (_, s) in zip(shares, self._rough, strict=False)]
         terms = [(share, matrix) for share, (matrix, _) in zip(shares, self._rough, strict=False)]
@@ -209,15 +206,14 @@ class PairSystem:
         return two_grid(partial(self._product, terms), sum(sums[1:], sums[0]), coarse)
 
     def _product(self, terms: list[tuple[Tensor, Matrix]], x: Tensor) -> Tensor:
-        """Of every column with its shares of the matrices."""
+        """Product of every column with its shares of the matrices."""
         parts = [share * multiply(*matrix, x) for share, matrix in terms]
         return self.inside(sum(parts[1:], parts[0]))
 
     def _levels(self, time: Tensor | None, columns: int) -> list[tuple[float | None, int]]:
-        """Times of factors, and for how many columns each: where there are several, the nearest powers of four.
+        """Times of factors and the number of columns for each: for several times, the nearest powers of four.
 
-        Times so short that tK is small beside M count as one; where there are still too many powers, every second or
-        third is taken.
+        Times so short that tK is small beside M share one factor; of too many powers every second or third is taken.
         """
         if time is None or len(time) == 1:
             return [(None if time is None else float(time), columns)]
@@ -228,13 +224,13 @@ class PairSystem:
         return list(zip(level.tolist(), count.tolist(), strict=True))
 
     def _near(self, levels: list[tuple[float | None, int]], r: Tensor) -> Tensor:
-        """The solution by linear elements."""
+        """The solution by P1 elements."""
         blocks = r.split([count for _, count in levels], dim=1)
         solved = [self.factor(t).solve(block) for (t, _), block in zip(levels, blocks, strict=True)]
         return self.inside(solved[0] if len(solved) == 1 else torch.cat(solved, dim=1))
 
     def factor(self, t: float | None) -> Factor:
-        """That of M₁ + tK₁, or of K₁ with a little of M₁ that makes it definite."""
+        """The factor of M₁ + tK₁, or of K₁ with a small multiple of M₁ that makes it definite."""
         return _kept(self.factors, t, lambda: self._factored(t))
 
     def _factored(self, t: float | None) -> Factor:
@@ -252,9 +248,9 @@ class PairSystem:
         return Factor(sparse.csr_array((matrix + matrix.T) / 2))
 
     def _mean(self, weights: Tensor, x: Tensor) -> Tensor:
-        """Weighted sums over components where K1 = 0, by their areas; 0 on the others."""
+        """Weighted sums over components where K1 = 0, divided by their areas; 0 on the others."""
         return torch.where(self.components.free, self.components.sums(weights, x) / self.area, 0.0)
 
     def inside(self, x: Tensor) -> Tensor:
-        """x, zero at Dirichlet points."""
+        """x, set to zero at Dirichlet points."""
         return x if self.free is None else x * self.free.to(x)

@@ -1,7 +1,7 @@
 """Pictures with matplotlib (`pip install ".[plot]"` in a clone).
 
-`figures`: scalars, vectors, orders on a surface or cloud; convergence. `drawing`: the painter's algorithm behind them.
-`comparison`: an operator beside the cotangent one, as a table and a picture.
+`figures`: scalars, vectors, orders on a surface or cloud; convergence. `drawing`: projection and the painter's
+algorithm. `comparison`: an operator beside the cotangent one, as a table and a picture.
 """
 
 from torchlb.plot.figures import (

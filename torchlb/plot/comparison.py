@@ -22,7 +22,7 @@ def spectra(operators: Mapping[str, LaplaceBeltrami], k: int) -> dict[str, Float
 
 
 def spectrum_table(values: Mapping[str, Float[Tensor, " k"]]) -> str:
-    """Eigenvalues side by side; from the second column on with the difference from the first, in per cent of it.
+    """Table of eigenvalues; from the second operator on with the difference from the first, in per cent.
 
     >>> print(spectrum_table({"a": torch.tensor([0.0, 2.0]), "b": torch.tensor([0.0, 2.1])}))
        k           a           b
@@ -41,9 +41,9 @@ def spectrum_table(values: Mapping[str, Float[Tensor, " k"]]) -> str:
 
 
 def plot_spectrum(values: Mapping[str, Float[Tensor, " k"]], ax: Any) -> Any:
-    """Eigenvalues of the first operator against their number, on given matplotlib axes, which are returned.
+    """Plot the eigenvalues of the first operator against their index on matplotlib axes, and return the axes.
 
-    At the right how far those of the others are from them, in per cent, as in the table.
+    The right axis shows the differences of the other operators in per cent, as in the table.
     """
     from matplotlib.ticker import MaxNLocator
 
@@ -74,18 +74,18 @@ def draw_comparison(
     title: str,
     view: Sequence[tuple[float, float]] = SIDES,
 ) -> None:
-    """Write a picture (PNG, or what the ending says): the order that each point reached, and the spectra.
+    """Write a picture (PNG, or the format of the ending): the order that each point reached, and the spectra.
 
     Parameters
     ----------
     lb
-        Operator; of points in more than three dimensions the spectra alone are drawn.
+        Operator; for points in more than three dimensions only the spectra are drawn.
     faces
         (F, 3), or None for a cloud.
     values
-        Of `spectra`.
+        Eigenvalues, from `spectra`.
     path, title
-        Of the picture.
+        File and title of the picture.
     view
         Elevations and azimuths, degrees.
 

@@ -1,6 +1,6 @@
 """Drawing in three dimensions with matplotlib, for `plot`: projection, the painter's algorithm, colours, axes.
 
-What the functions take has been read by `cloud_of`, `mesh_of` and `values_of`: NumPy arrays of float64 that fit.
+The functions take checked input, as `cloud_of`, `mesh_of` and `values_of` return it: NumPy arrays of float64.
 """
 
 from __future__ import annotations
@@ -14,13 +14,13 @@ import torch
 from torchlb.errors import InputError
 
 Eye = tuple[float, float]
-"""Elevation above the plane of x and y, and azimuth from x, of the eye, in degrees."""
+"""Elevation of the eye above the plane of x and y, and azimuth from x, in degrees."""
 Views = Eye | Sequence[Eye]
 
 VIEW: Eye = (25.0, -55.0)
-"""From where a surface is seen: elevation and azimuth, °."""
+"""Default view of a surface: elevation and azimuth, °."""
 LIGHT = (-0.35, 0.45, 0.82)
-"""Direction of the light as the picture has it: right, up, towards the eye."""
+"""Direction of the light in the picture's coordinates: right, up, towards the eye."""
 MISSING = "0.6"
 """Colour of values that are NaN or infinite: grey."""
 INK = "0.1"
@@ -28,7 +28,7 @@ INK = "0.1"
 
 
 def axes_of(ax: Any) -> Any:
-    """The given axes, or new ones of pyplot, which nothing else here needs."""
+    """The given axes, or new ones of pyplot, which no other function here needs."""
     try:
         import matplotlib as mpl  # noqa: F401
     except ImportError as error:
@@ -45,7 +45,7 @@ def _numpy(values: Any) -> np.ndarray:
 
 
 def cloud_of(points: Any, name: str = "points") -> np.ndarray:
-    """As (N, 3), the plane as z = 0."""
+    """Points as (N, 3), with z = 0 for points of the plane."""
     places = _numpy(points)
     if places.ndim != 2 or places.shape[1] not in (2, 3):
         raise InputError(
@@ -85,7 +85,7 @@ def color_map(
     limits: tuple[float, float] | None = None,
     diverging: str = "RdBu_r",
 ) -> tuple[Any, str]:
-    """The map from values to colours, and at which ends values lie beyond it."""
+    """The map from values to colours, and the ends at which values exceed its range."""
     from matplotlib import cm, colormaps, colors
 
     finite = values[np.isfinite(values)]
@@ -101,7 +101,7 @@ def color_map(
         low, high = low - 1, high + 1
     if limits is not None:
         low, high = limits
-    slack = 0.02 * (high - low)  # an end is pointed only where the colours hide something
+    slack = 0.02 * (high - low)  # point an end only where values are cut off
     beyond = finite.min() < low - slack, finite.max() > high + slack
     extend = {(0, 0): "neither", (1, 0): "min", (0, 1): "max", (1, 1): "both"}[beyond]
     table = colormaps[cmap or (diverging if symmetric else "viridis")].with_extremes(bad=MISSING)
@@ -116,7 +116,7 @@ def plain(color: str, count: int) -> np.ndarray:
 
 
 def _project(points: np.ndarray, view: Eye) -> np.ndarray:
-    """Coordinates (N, 3) as the picture has them: right, up, towards the eye."""
+    """Coordinates (N, 3) in the picture: right, up, towards the eye."""
     elevation, azimuth = np.radians(view)
     right = np.array([-np.sin(azimuth), np.cos(azimuth), 0.0])
     ahead = np.array([np.cos(azimuth), np.sin(azimuth), 0.0])
@@ -125,7 +125,7 @@ def _project(points: np.ndarray, view: Eye) -> np.ndarray:
 
 
 def _stacked(points: np.ndarray, view: Views) -> list[tuple[np.ndarray, Eye]]:
-    """The projections for all eyes, each below the one before. A shape in the plane z = 0 is seen from above."""
+    """The projections for all eyes, one below the other. A shape in the plane z = 0 is seen from above."""
     if not points[:, 2].any():
         view = (90.0, -90.0)
     views = [view] if isinstance(view[0], int | float) else view
@@ -148,7 +148,7 @@ def paint(
     view: Views,
     isolines: tuple[np.ndarray, np.ndarray] | None = None,
 ) -> None:
-    """Shaded triangles, and segments on them as `isolines_of` gives them, back to front."""
+    """Draw shaded triangles, and segments on them as `isolines_of` returns them, back to front."""
     from matplotlib.collections import PolyCollection
 
     light = np.array(LIGHT) / np.linalg.norm(LIGHT)
@@ -156,7 +156,7 @@ def paint(
         corners = flat[faces]  # (F, 3, 3)
         normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
         normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-300)
-        normal *= np.where(normal[:, 2:] < 0, -1, 1)  # either side is lit
+        normal *= np.where(normal[:, 2:] < 0, -1, 1)  # light both sides
         shaded = colors.copy()
         shaded[:, :3] *= (0.45 + 0.55 * np.clip(normal @ light, 0, 1))[:, None]
         polygons, depth = list(corners[..., :2]), corners[..., 2].mean(axis=1)
@@ -166,7 +166,7 @@ def paint(
             ends = flat[edges[..., 0]] * (1 - share) + flat[edges[..., 1]] * share  # (S, 2, 3)
             above = np.linalg.norm(
                 corners[:, 1] - corners[:, 0], axis=1
-            ).mean()  # the triangles beside
+            ).mean()  # in front of the triangles beside
             polygons += list(ends[..., :2])
             depth = np.append(depth, ends[..., 2].mean(axis=1) + above)
             shaded = np.append(shaded, plain(INK, len(ends)), axis=0)
@@ -180,10 +180,9 @@ def paint(
 def isolines_of(
     values: np.ndarray, faces: np.ndarray, levels: Sequence[float] | np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Segments on which the linear interpolant has one of the levels.
+    """Segments on which the linear interpolant has one of the levels, none in triangles with a NaN or infinity.
 
-    Their ends as the edge (S, 2, 2) that each lies on, and how far along it, (S, 2, 1) in 0 … 1. Triangles with a
-    corner that is not finite have none.
+    Each end is given by its edge, (S, 2, 2), and its fraction of the edge, (S, 2, 1) in 0 … 1.
     """
     finite = faces[np.isfinite(values[faces]).all(axis=1)]
     edges = np.stack([finite, np.roll(finite, -1, axis=1)], axis=-1)  # (F, 3, 2)
@@ -198,7 +197,7 @@ def isolines_of(
 
 
 def _faded(colors: np.ndarray, flat: np.ndarray) -> np.ndarray:
-    """Colours paler with the distance from the eye; as they are where all are equally far, but for rounding."""
+    """Colours paler with the distance from the eye; unchanged where all distances are equal up to rounding."""
     height = flat[:, 2]
     depth = (height.max() - height) / max(np.ptp(height), 1e-9 * np.ptp(flat), 1e-300)
     pale = colors.copy()
@@ -209,7 +208,7 @@ def _faded(colors: np.ndarray, flat: np.ndarray) -> np.ndarray:
 def draw_dots(
     ax: Any, points: np.ndarray, colors: np.ndarray, view: Views, size: float | None
 ) -> None:
-    """A disk for each point, back to front, paler with distance."""
+    """Draw a disk for each point, back to front, paler with distance."""
     area = float(np.clip(60000 / len(points), 2, 60)) if size is None else size
     for flat, _ in _stacked(points, view):
         order = flat[:, 2].argsort()
@@ -219,7 +218,7 @@ def draw_dots(
 
 
 def _evenly_spread(points: np.ndarray, count: int) -> tuple[np.ndarray, float]:
-    """Indices of `count` of the points, each the farthest from those before, and the least distance between any two."""
+    """Indices of `count` points by farthest-point sampling, and the least distance between any two of them."""
     chosen = [int(np.linalg.norm(points - points.mean(axis=0), axis=1).argmax())]
     distance = np.linalg.norm(points - points[chosen[0]], axis=1)
     spacing = float(distance.max())
@@ -239,7 +238,7 @@ def draw_arrows(
     view: Views,
     count: int,
 ) -> None:
-    """Arrows at `count` points, back to front: those that no triangle hides, or paler with distance on a cloud."""
+    """Draw arrows at `count` points, back to front: on a mesh only visible ones, on a cloud paler with distance."""
     tails, spacing = _evenly_spread(points, count)
     lengths = np.linalg.norm(field[tails], axis=1)
     drawn = np.isfinite(lengths) & (lengths > 0)
@@ -258,11 +257,11 @@ def draw_arrows(
 
 
 def _visible(flat: np.ndarray, faces: np.ndarray, chosen: np.ndarray) -> np.ndarray:
-    """Which of the chosen points no triangle hides: none covers it in the picture and is nearer to the eye."""
+    """Mask of the chosen points that are visible: no triangle covers them in the picture and is nearer to the eye."""
     a, b, c = (flat[faces[:, i]] for i in range(3))
     normal = np.cross(b - a, c - a)
-    area = np.where(normal[:, 2] == 0, np.nan, normal[:, 2])  # seen from the side it hides nothing
-    slack = 1e-6 * np.ptp(flat[:, 2])  # its own triangles cover a point, too
+    area = np.where(normal[:, 2] == 0, np.nan, normal[:, 2])  # edge-on triangles hide nothing
+    slack = 1e-6 * np.ptp(flat[:, 2])  # tolerance for the triangles at the point itself
     visible = np.ones(len(chosen), dtype=bool)
     for i, point in enumerate(flat[chosen]):
         weights = [np.cross(q - p, point - p)[:, 2] / area for p, q in ((a, b), (b, c), (c, a))]
@@ -279,7 +278,7 @@ def finish(
     extend: str = "neither",
     label: str | None = None,
 ) -> Any:
-    """The axes with equal aspect, without frame, with a title and a colour bar."""
+    """Give the axes equal aspect, no frame, a title and a colour bar, and return them."""
     ax.autoscale_view()
     ax.set_aspect("equal")
     ax.set_axis_off()

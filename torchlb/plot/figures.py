@@ -1,7 +1,7 @@
 """Scalars, vectors and orders on a surface or cloud, and convergence, as pictures of matplotlib.
 
-Surfaces are drawn by the painter's algorithm: triangles projected, shaded and filled from back to front. That takes a
-second for 20,000 of them, and no graphics card. Each function draws on the axes given, or on new ones of
+Surfaces are drawn by the painter's algorithm: triangles are projected, shaded and filled from back to front. That takes
+a second for 20,000 of them, without a graphics card. Each function draws on the axes passed, or on new ones of
 `matplotlib.pyplot`, and returns them; without matplotlib it raises ImportError. Nothing global is set.
 """
 
@@ -38,11 +38,11 @@ Cloud = Float[Tensor, "N n"] | Float[np.ndarray, "N n"]
 Scalar = Num[Tensor, " N"] | Num[np.ndarray, " N"]
 Vectors = Float[Tensor, "N n"] | Float[np.ndarray, "N n"]
 ORDER_COLORS = ("#ece7dc", "#cfd6cf", "#abc1c4", "#7fa5b5", "#5485a0", "#33648a", "#1b446d")
-"""By order reached, low-order rows first, the last for all beyond: darker means higher, and grey tells them, too."""
+"""Colours by order reached, low-order rows first, the last for all beyond: darker is higher, also in grey."""
 LINE_COLORS = ("#d55e00", "#56b4e9", "#0072b2", "#000000", "#e69f00", "#009e73", "#cc79a7")
 MARKERS = "osD^vP*"
 PALE = "0.88"
-"""Colour of a shape on which only arrows have one."""
+"""Colour of a shape on which only the arrows are coloured."""
 
 
 def plot_surface(
@@ -72,21 +72,21 @@ def plot_surface(
     ax
         Matplotlib axes; new ones by default.
     title
-        Above the axes.
+        Title above the axes.
     cmap
         matplotlib's name; by default "RdBu_r" around zero, "viridis" otherwise, which the colour-blind can read.
     symmetric
         Whether zero is in the middle of the colours; by default if the values have both signs. The colours span the
-        values but for the outer 1 % at either end, which a pointed end of the bar stands for.
+        values except the outer 1 % at either end, for which the bar has a pointed end.
     limits
-        Least and greatest value that the colours tell apart, instead of those.
+        Least and greatest value of the colours instead.
     levels
         Values at which isolines are drawn.
     view
-        Elevation and azimuth of the eye, degrees; several are drawn below one another. A shape in the plane z = 0 is
-        seen from above.
+        Elevation and azimuth of the eye, degrees; several views are drawn below one another. A shape in the plane z = 0
+        is seen from above.
     label
-        Of the colour bar, such as the unit.
+        Label of the colour bar, such as the unit.
 
     Returns the axes. Raises ValueError for values or faces that do not fit the vertices.
     """
@@ -112,7 +112,7 @@ def plot_points(
     label: str | None = None,
     size: float | None = None,
 ) -> Any:
-    """A scalar on a cloud in the plane or in space: a disk for each point, the near ones on top, the far ones paler.
+    """A scalar on a cloud in the plane or in space: a disk for each point, near ones on top, far ones paler.
 
     Parameters
     ----------
@@ -130,7 +130,7 @@ def plot_points(
     ax = axes_of(ax)
     places = cloud_of(points)
     numbers = values_of(values, places)
-    # The middle of "coolwarm" is no white.
+    # The middle of "coolwarm" is not white.
     shades, extend = color_map(numbers, cmap, symmetric, limits, "coolwarm")
     draw_dots(ax, places, shades.to_rgba(numbers), view, size)
     return finish(ax, title, shades, extend, label)
@@ -151,9 +151,9 @@ def plot_vectors(
     label: str | None = None,
     count: int = 400,
 ) -> Any:
-    """A field of vectors as arrows at evenly spread points of a surface or cloud, such as ``lb.gradient(f)``.
+    """A vector field as arrows at evenly spread points of a surface or cloud, such as ``lb.gradient(f)``.
 
-    Those that the surface hides are left out. The longest is twice as long as the distance between two of them.
+    Arrows behind the surface are left out. The longest one is twice as long as the distance between two arrows.
 
     Parameters
     ----------
@@ -162,9 +162,9 @@ def plot_vectors(
     faces
         (F, 3), or None for a cloud.
     vectors
-        (N, 3), or (N, 2) in the plane. None is drawn where one is zero or not finite.
+        (N, 3), or (N, 2) in the plane. Vectors that are zero or not finite are not drawn.
     values
-        (N,), a scalar beneath black arrows. Without it the arrows are coloured, by their lengths.
+        (N,), a scalar beneath black arrows. Without it the arrows are coloured by length.
     count
         Number of arrows, on all sides of the shape.
     ax, title, cmap, symmetric, limits, view, label
@@ -235,7 +235,7 @@ def plot_orders(
 def _fill(
     ax: Any, points: np.ndarray, faces: np.ndarray | None, colors: np.ndarray, view: Views
 ) -> None:
-    """A surface by the colours of its triangles, or a cloud by those of its points."""
+    """Draw a surface in the colours of its triangles, or a cloud in those of its points."""
     if faces is None:
         draw_dots(ax, points, colors, view, None)
     else:
@@ -253,22 +253,22 @@ def plot_convergence(
 ) -> Any:
     """Error against the number of points, doubly logarithmic, with the measured order of each line in the legend.
 
-    Grey lines fall like whole powers of the spacing h ~ N^(−1/d), to compare with.
+    Grey reference lines fall like whole powers of the spacing h ~ N^(−1/d).
 
     Parameters
     ----------
     sizes
         Numbers of points N, ascending.
     errors
-        For each method its errors at these sizes; zeros and NaN are left out.
+        Errors at these sizes, by method; zeros and NaN are left out.
     dim
         d of the manifold. The measured order is the slope against h over the three finest sizes.
     ax, title
         As for `plot_surface`.
     ylabel
-        Of the vertical axis.
+        Label of the vertical axis.
 
-    Returns the axes. Raises ValueError for no errors that are positive, or another number of them than of sizes.
+    Returns the axes. Raises ValueError if no error is positive, or if their number is not that of the sizes.
     """
     ax = axes_of(ax)
     orders = []
@@ -297,14 +297,14 @@ def plot_convergence(
 
 
 def _references(ax: Any, sizes: Sequence[int], orders: list[float], dim: int) -> None:
-    """A grey fan of the whole powers of h near the measured ones, from the largest error on, each with its name."""
+    """Grey lines for the whole powers of h near the measured ones, from the largest error on, labelled."""
     drawn = [y for line in ax.lines for y in line.get_ydata()]
     if not drawn:
         raise InputError("errors: expected some that are positive, got none")
     low, high = min(drawn) / 2, max(drawn) * 1.5
     first, last = min(sizes), max(sizes)
     for power in sorted({max(round(order), 1) for order in orders}):
-        end = min(last, first * (high / low) ** (dim / power))  # where it leaves the axes
+        end = min(last, first * (high / low) ** (dim / power))  # end of the line within the axes
         fall = (end / first) ** (-power / dim)
         ax.loglog([first, end], [high, high * fall], color="0.75", lw=1, ls="--", zorder=0)
         name = "$h$" if power == 1 else f"$h^{{{power}}}$"

@@ -8,7 +8,7 @@ from scipy import linalg
 
 
 def members(component: np.ndarray) -> list[np.ndarray]:
-    """The points of every component, ascending, of the component of each point.
+    """Points of every component, ascending, from the component of each point.
 
     >>> members(np.array([0, 1, 0]))
     [array([0, 2]), array([1])]
@@ -20,7 +20,7 @@ def members(component: np.ndarray) -> list[np.ndarray]:
 def constants(
     component: np.ndarray, areas: Float[np.ndarray, " P"], k: int
 ) -> Float[np.ndarray, "N k"]:
-    """The first k of orthonormal functions that are constant on every component; the first is so everywhere.
+    """The first k of orthonormal functions that are constant on every component; the first is constant everywhere.
 
     They vanish on components whose area is given as 0; k is at most the number of the others.
 
@@ -40,6 +40,6 @@ def constants(
 
 
 def global_first(root: Float[np.ndarray, " P"], k: int) -> Float[np.ndarray, "P k"]:
-    """Orthonormal columns, the first along √area, with which the constants of components are recombined."""
+    """Orthonormal columns, the first along √area, that recombine the constants of components."""
     t = np.linalg.qr(np.column_stack([root, np.eye(len(root), k - 1)]))[0]
     return t * np.sign(t[0, 0])

@@ -1,4 +1,4 @@
-"""An eigenbasis of −Δ: real functions, orthonormal in the mass, and the way there and back (`method.md`, section 7)."""
+"""An eigenbasis of −Δ: real functions, orthonormal in the mass; analysis and synthesis (`method.md`, section 7)."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from torchlb.linalg.checks import check_finite, check_tensor
 
 
 def check_num_pairs(k: object) -> int:
-    """k as an int; InputError if it is no number of eigenpairs.
+    """Return k as an int; InputError unless it is a number of eigenpairs.
 
     >>> check_num_pairs(0)
     Traceback (most recent call last):
@@ -27,7 +27,7 @@ def check_num_pairs(k: object) -> int:
 
 @runtime_checkable
 class Spectral(Protocol):
-    """What has an eigenbasis: an operator of one shape or of a batch."""
+    """An object with an eigenbasis: an operator of one shape or of a batch."""
 
     sizes: tuple[int, ...] | None
 
@@ -47,19 +47,19 @@ class Eigenbasis:
     Attributes
     ----------
     eigenvalues
-        (k,), 1/ℓ², ≥ 0 and ascending, exactly 0 once for every connected component (but one where a condition takes
-        something away); (S, k) for a batch of S shapes, each with its own.
+        (k,), 1/ℓ², ≥ 0 and ascending, exactly 0 once for every connected component (except those with a Dirichlet or
+        Robin condition); (S, k) for a batch of S shapes, each with its own.
     eigenvectors
-        Φ, (N, k), ΦᵀMΦ = I; the first is constant where its eigenvalue is 0. For a batch, those of each shape on its
-        own rows; a shape of fewer than k points has zero columns at the end.
+        Φ, (N, k), ΦᵀMΦ = I; the first is constant where its eigenvalue is 0. In a batch each shape has its eigenvectors
+        on its own rows; a shape with fewer than k pairs has zero columns at the end.
     mass
         (N,), ℓ^d: the weights of the operator.
     left
-        MΦ, (N, k): what functions are multiplied by for their coefficients.
+        MΦ, (N, k): its transpose maps functions to coefficients.
     sizes
         Numbers of points of the shapes of a batch; None for a single shape.
     relative_errors
-        (k,) or (S, k), estimates for the eigenvalues; None if they were not made.
+        (k,) or (S, k), estimates for the eigenvalues; None without estimates.
     """
 
     def __init__(
@@ -82,7 +82,7 @@ class Eigenbasis:
         return f"Eigenbasis({k} pairs of {n} points{shapes}, eigenvalues 0 to {last:.4g})"
 
     def truncate(self, k: int) -> Eigenbasis:
-        """The first k of the pairs; itself if there are no more."""
+        """The first k of the pairs; the basis itself if it has no more."""
         if k >= self.eigenvectors.shape[1]:
             return self
         cut = (self.eigenvalues[..., :k], self.eigenvectors[:, :k], self.mass, self.left[:, :k])
@@ -94,8 +94,8 @@ class Eigenbasis:
     ) -> Float[Tensor, "*S k C"] | Float[Tensor, "*S k"]:
         """Coefficients ΦᵀMf, (…, k, C), or (…, S, k, C) for a batch of shapes.
 
-        (k,), or (S, k), for f (N,). In the type of f, that of the basis where f are integers; computed in that of f,
-        at least float32. InputError for another number of points, and for NaN or infinity in f.
+        (k,), or (S, k), for f (N,). In the type of f, that of the basis where f are integers; computed in that of f, at
+        least float32. InputError for another number of points, and for NaN or infinity in f.
         """
         coefficients = self.analyse(self.left, f)
         check_finite(f)
@@ -104,7 +104,7 @@ class Eigenbasis:
     def from_basis(
         self, coefficients: Shaped[Tensor, "*S k C"] | Shaped[Tensor, "*S k"]
     ) -> Float[Tensor, "*B N C"] | Float[Tensor, " N"]:
-        """The function Φc with the given coefficients, (…, N, C), or (N,) for (k,) or (S, k).
+        """The function Φc with the coefficients c, (…, N, C), or (N,) for (k,) or (S, k).
 
         In the type of the coefficients, as for `to_basis`; InputError for another number of them.
         """
@@ -122,7 +122,7 @@ class Eigenbasis:
     def synthesise(
         self, functions: Float[Tensor, "N k"], coefficients: Shaped[Tensor, "*S k C"]
     ) -> Float[Tensor, "*B N C"]:
-        """Σ_k functions[:, k] c_k, with the coefficients of its own shape at every point."""
+        """Σ_k functions[:, k] c_k; in a batch, with the coefficients of each point's shape."""
         if torch.is_autocast_enabled(coefficients.device.type):
             with torch.autocast(coefficients.device.type, enabled=False):
                 return self.synthesise(functions, coefficients)
@@ -135,7 +135,7 @@ class Eigenbasis:
     def analyse(
         self, functionals: Float[Tensor, "N k"], f: Shaped[Tensor, "*B N C"] | Shaped[Tensor, " N"]
     ) -> Tensor:
-        """Σ_i functionals[i] f_i, over the points of each shape. NaN in f pass on, and no GPU is waited for."""
+        """Σ_i functionals[i] f_i, over the points of each shape. NaN in f propagate, without waiting for a GPU."""
         check_tensor(f)
         if f.ndim == 1:
             return self.analyse(functionals, f[:, None])[..., 0]
@@ -154,9 +154,9 @@ class Eigenbasis:
 
     @staticmethod
     def _typed(functions: Tensor, f: Tensor) -> tuple[Tensor, Tensor, torch.dtype]:
-        """Both in the type to multiply in, that of f and at least float32, and the type of the result.
+        """The factors in the type to multiply in, that of f and at least float32, and the type of the result.
 
-        Integers and masks are of the type of the basis. In half precision masses and functions of small shapes are 0.
+        Integers and masks take the type of the basis. In half precision, masses and functions of small shapes are 0.
         """
         dtype = f.dtype if f.is_floating_point() or f.is_complex() else functions.dtype
         wide = torch.promote_types(dtype, torch.float32)
@@ -164,7 +164,7 @@ class Eigenbasis:
 
 
 def unstack_eigenbases(basis: Eigenbasis) -> list[Eigenbasis]:
-    """The basis of each shape of a batch, without the padding: the inverse of `stack_eigenbases`."""
+    """The basis of each shape of a batch, without the padding: inverse of `stack_eigenbases`."""
     if basis.sizes is None:
         return [basis]
     parts = []
@@ -178,7 +178,7 @@ def unstack_eigenbases(basis: Eigenbasis) -> list[Eigenbasis]:
 
 
 def stack_eigenbases(bases: list[Eigenbasis]) -> Eigenbasis:
-    """One basis of a batch from those of its shapes, padded to the longest by zero columns."""
+    """The basis of a batch from those of its shapes, padded to the longest by zero columns."""
     k = max(basis.eigenvectors.shape[1] for basis in bases)
 
     def padded(t: Tensor) -> Tensor:

@@ -1,11 +1,11 @@
 r"""Eigenpairs of a symmetric weak pair K u = λ M u (`method.md`, section 10).
 
-Block Lanczos for the linear pair (K₁, M₁), whose factor is 20 times sparser than that of K; Rayleigh–Ritz in (K, M);
-then sweeps. In a sweep each eigenvector u is corrected by some steps of conjugate gradients for (K − λM)w = Ku − λMu on
-the complement of what is known, as in the Jacobi–Davidson method, and Rayleigh–Ritz follows: among all u − w first,
-which mostly is enough, then among the u and those w that are needed, and at once where an error is large. The steps are
-taken in float32, which costs no digits: what they give is a direction. Their preconditioner is a cycle of two levels,
-Chebyshev smoothing in K around a solve with that factor.
+Block Lanczos for the P1 pair (K₁, M₁), whose factor is 20 times sparser than that of K; Rayleigh–Ritz in (K, M); then
+Jacobi–Davidson sweeps. A sweep corrects each eigenvector u by some conjugate-gradient steps for (K − λM)w = Ku − λMu on
+the complement of the known vectors. Rayleigh–Ritz follows: first among all u − w, mostly enough, or among all u and w
+where an error is large; in later sweeps among the u and the w that are needed. The steps, taken in float32, give only
+directions, so that no digits are lost. Their preconditioner is a two-grid cycle, Chebyshev smoothing in K around a
+solve with that factor.
 """
 
 from __future__ import annotations
@@ -40,17 +40,17 @@ from torchlb.spectral.components import constants, members
 from torchlb.spectral.eigenbasis import Eigenbasis
 
 SHARE = 6
-"""Where more than a sixth of the spectrum is wanted a dense solve is as fast."""
+"""If more than a sixth of the spectrum is wanted, a dense solve is as fast."""
 SHIFT = 10.0
 """Shift of the factor times the size of a component: about half of its first eigenvalue, were it a disk."""
 START = 0.003
-"""Relative residual of the eigenpairs of the linear pair, whose distance from (K, M) is of that order."""
+"""Relative residual of the eigenpairs of the P1 pair, whose distance from (K, M) is of that order."""
 LONGEST = 24
-"""Steps of conjugate gradients in a sweep at most."""
+"""Maximal number of conjugate-gradient steps in a sweep."""
 ASTRAY = 0.5
-"""Estimated error above which vectors are no start for more than one step, and are kept beside what it gives."""
+"""Estimated error above which a sweep takes one step only, and the first one keeps the old vectors beside the new."""
 SAFETY = 4.0
-"""Factor on the estimated errors, which are too small where K is softer than the preconditioner takes it for."""
+"""Factor on the estimated errors, which are too small where K is softer than its preconditioner."""
 
 
 Sparse = sparse.csr_array
@@ -59,7 +59,7 @@ Blocks = tuple[np.ndarray, ...]  # U, KU, MU
 
 
 class _Part(NamedTuple):
-    """One component, its free points only."""
+    """One component, without its fixed points."""
 
     points: np.ndarray
     stiffness: Sparse
@@ -80,7 +80,7 @@ def pencil_eigenbasis(
     losing: Bool[np.ndarray, " N"] | None = None,
     tolerance: float | None = None,
 ) -> Eigenbasis:
-    """The min(k, N) smallest eigenpairs of K u = λ M u, and more where a group of equal ones (but 0) would be split.
+    """The min(k, N) smallest eigenpairs of K u = λ M u, and more where a group of equal nonzero ones would be split.
 
     Parameters
     ----------
@@ -89,14 +89,13 @@ def pencil_eigenbasis(
     dim
         d, from which the unit of a length follows: K is in ℓ^{d−2}, M in ℓ^d.
     linear
-        K₁ and M₁ of the same points, spectrally close, with fewer entries. None if (K, M) are that themselves.
+        K₁ and M₁ of the same points, spectrally close, with fewer entries. None if they are (K, M).
     fixed
         Points where functions vanish (Dirichlet).
     losing
-        These, and points where K1 > 0 (Robin); on components without K1 = 0. By default the same.
+        The fixed points, and points where K1 > 0 (Robin); on components without any K1 = 0. By default `fixed`.
     tolerance
-        Bound on the estimated relative error of every eigenvalue, 1.5e-8 k² by default; those closer than that are not
-        separated.
+        Bound on the estimated relative error of every eigenvalue, 1.5e-8 k² by default; closer ones are not separated.
 
     Raises EigenbasisError where that is not reached, K has a negative eigenvalue, or M a diagonal that is not positive.
 
@@ -111,7 +110,7 @@ def pencil_eigenbasis(
             "eigenbasis: the mass matrix is not positive; a shape so small that areas are zero in float32 has to be "
             "scaled, or kept in float64"
         )
-    # A unit of length with which float32 holds the entries, and nothing is rounded.
+    # A power of two as the unit of length: float32 holds the entries, and scaling rounds nothing.
     length = 2.0 ** round(float(np.log2(mass_matrix.sum())) / dim)
     units = length ** (dim - 2), length**dim
     whole = _narrow(stiffness, units[0]), _narrow(mass_matrix, units[1])
@@ -131,10 +130,10 @@ def pencil_eigenbasis(
 
 
 def _components(whole: Pair, near: Pair | None) -> tuple[np.ndarray, Sparse]:
-    """The component of every point, as both matrices connect them, and the pattern of the linear pair."""
+    """The connected component of every point under both matrices, and the pattern of the P1 pair."""
     pattern = _joined(*(near or whole))
     count, component = csgraph.connected_components(pattern, directed=False)
-    if near and count > 1:  # fits may reach from one to the other
+    if near and count > 1:  # fits may connect components
         component = csgraph.connected_components(_joined(*whole), directed=False)[1]
     return component, pattern
 
@@ -147,10 +146,7 @@ def _parts(
     pattern: Sparse,
     areas: np.ndarray,
 ) -> list[_Part]:
-    """The components without their fixed points.
-
-    They are numbered along the surface (Cuthill–McKee), which halves the time of the products.
-    """
+    """The components without fixed points, numbered by reverse Cuthill–McKee, which halves the time of products."""
     order = csgraph.reverse_cuthill_mckee(pattern, symmetric_mode=True)
     parts = []
     for own in members(component[order]):
@@ -170,20 +166,20 @@ def _renumbered(pair: Pair, order: np.ndarray) -> Pair:
         return one, other
     number = np.arange(pair[0].nnz, dtype=np.int32)
     places = sparse.csr_array((number, pair[0].indices, pair[0].indptr), pair[0].shape)
-    places = sparse.csr_array(places[order].T)[order]  # and so its columns ascend
+    places = sparse.csr_array(places[order].T)[order]  # with ascending columns
     pattern = places.indices, places.indptr
     one, other = (sparse.csr_array((m.data[places.data], *pattern), places.shape) for m in pair)
     return one, other
 
 
 def _narrow(matrix: Sparse, unit: float) -> Sparse:
-    """With indices of 32 bits, in float64, over a unit."""
+    """A matrix with 32-bit indices, in float64, divided by a unit."""
     ends = (part.astype(np.int32, copy=False) for part in (matrix.indices, matrix.indptr))
     return sparse.csr_array((np.divide(matrix.data, unit, dtype=float), *ends), shape=matrix.shape)
 
 
 def _joined(one: Sparse, other: Sparse) -> Sparse:
-    """|A| + |B|, without zeros; in a tenth of the time where they are on one pattern."""
+    """|A| + |B|, without zeros; in a tenth of the time for a common pattern."""
     if on_one_pattern(one, other):
         data = abs(one.data) + abs(other.data)
         if data.all():
@@ -192,7 +188,7 @@ def _joined(one: Sparse, other: Sparse) -> Sparse:
 
 
 def _pairs(part: _Part, k: int, tolerance: float) -> tuple[np.ndarray, ...]:
-    """The k smallest eigenvalues of a component, or all, with groups whole, their relative errors, U, and MU; not 0."""
+    """Eigenvalues of a component without 0, relative errors, U and MU: the k smallest, with groups whole, or all."""
     size, zero = len(part.points), int(part.conserving)
     count = min(k + BLOCK, size)
     if size <= max(DENSE, SHARE * count):
@@ -240,7 +236,7 @@ def _closed(values: np.ndarray, k: int, tolerance: float) -> int:
 def _swept(
     part: _Part, u: np.ndarray, k: int, solve: Inverse, tolerance: float
 ) -> tuple[np.ndarray, ...] | None:
-    """Sweeps from the linear pair's eigenvectors until the first k eigenvalues are accurate; None if some never are."""
+    """Sweep from the P1 eigenvectors until the first k eigenvalues are accurate; None if that takes too many sweeps."""
     assert part.linear is not None
     whole = part.stiffness, part.mass_matrix
     *single, on_linear_mass = (_product(m) for m in (*whole, part.linear[1]))
@@ -266,7 +262,7 @@ def _swept(
             return values[:keep], errors, u[:, :keep], mu[:, :keep]
         rough = errors[:k].max() > ASTRAY
         active = np.flatnonzero(errors > tolerance) if sweep else np.arange(keep)
-        # the last step takes off FACTOR times the energy that is left: from step to step it falls to a quarter or less
+        # each step leaves a quarter of the energy or less, so the last one takes off FACTOR times what is left
         enough = FACTOR * np.maximum(SMALL * errors, tolerance) / np.maximum(scale, TINY)
         small = (u.astype(np.float32), mu.astype(np.float32))
         right = (r, z, shifts.astype(np.float32), enough)
@@ -299,14 +295,14 @@ def _correction(
 ) -> np.ndarray:
     """Conjugate gradients for every column of (K − λM)w = r, M-orthogonal to U; of [U, MU] and [r, cycle(r), λ, ε].
 
-    A column ends with a step that takes less than ε off its energy, or the last.
+    A column ends with the step that reduces its energy by less than ε, or with the last step.
     """
     (u, mu), (r, z, shifts, enough) = known, right
     w, p, square = np.zeros_like(r), np.zeros_like(r), np.ones(r.shape[1], r.dtype)
     at, found = np.arange(r.shape[1]), []
     for step in range(steps):
         z = z - u @ (mu.T @ z)
-        before, square = square, np.maximum(_dots(r, z), 0)  # below zero by rounding alone
+        before, square = square, np.maximum(_dots(r, z), 0)  # negative only by rounding
         p = z + p * np.divide(square, before, out=np.zeros_like(square), where=before > 0)
         product = shifted(p, shifts)
         curvature = _dots(p, product)
@@ -325,7 +321,7 @@ def _correction(
 
 
 def _two_levels(stiffness: Sparse, coarse: Inverse) -> Inverse:
-    """An approximate inverse of K around a coarse solve, in float32."""
+    """An approximate inverse of K, the two-grid cycle around a coarse solve, in float32."""
     rough = without_small_entries(*_tensors(stiffness))
     cycle = two_grid(
         partial(multiply, *rough),
@@ -343,7 +339,7 @@ def _product(matrix: Sparse) -> Inverse:
 
 
 def _tensors(matrix: Sparse) -> Matrix:
-    """Its parts, in the same memory."""
+    """The arrays of a matrix as tensors, in the same memory."""
     crow, col, values = map(torch.from_numpy, (matrix.indptr, matrix.indices, matrix.data))
     return crow, col, values
 
@@ -353,12 +349,12 @@ def _dots(x: np.ndarray, y: np.ndarray) -> np.ndarray:
 
 
 def _ritz(space: Blocks, count: int) -> tuple[np.ndarray, Blocks]:
-    """Rayleigh–Ritz on the span of U, of (U, KU, MU): the smallest values, ascending, and the same of their vectors."""
+    """Rayleigh–Ritz on the span of U, from (U, KU, MU): the smallest values, ascending, and these for their vectors."""
     a, b = ((space[0].T @ x).astype(np.float64) for x in space[1:])
-    scale = np.where(b.diagonal() > 0, b.diagonal(), np.inf) ** -0.5  # what has no mass has no part
+    scale = np.where(b.diagonal() > 0, b.diagonal(), np.inf) ** -0.5  # drop vectors without mass
     squares, q = linalg.eigh(b * scale * scale[:, None])
     q = (scale[:, None] * q / np.sqrt(np.maximum(squares, TINY)))[:, squares > ROUNDING]
-    values, y = linalg.eigh(q.T @ a @ q)  # all of them, in less time than a part
+    values, y = linalg.eigh(q.T @ a @ q)  # all of them: faster than a subset
     y = (q @ y[:, :count]).astype(space[0].dtype)
     u, ku, mu = (x @ y for x in space)
     return values[:count], (u, ku, mu)
@@ -373,7 +369,7 @@ def _merged(
     tolerance: float,
     units: tuple[float, float],
 ) -> Eigenbasis:
-    """After Φ and MΦ of constants what else the components have, ascending, in units of `mass`."""
+    """Constants Φ and MΦ followed by the other pairs of the components, ascending, in units of `mass`."""
     zeros = null[0].shape[1]
     values, errors = (np.concatenate([np.zeros(zeros), *(f[i] for f in found)]) for i in (0, 1))
     order = np.arange(len(values))

@@ -1,7 +1,7 @@
-r"""What is computed from the eigenbasis: signatures, wavelets, diffusion maps.
+r"""Signatures, wavelets and diffusion maps from the eigenbasis.
 
 Every function takes the operator, whose basis is solved once and kept, and `k`, the number of pairs to use. A batch of
-shapes gives what its shapes give one by one.
+shapes gives the results of its shapes, concatenated.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from torchlb.spectral.eigenbasis import Eigenbasis, Spectral
 
 
 def _present(basis: Eigenbasis) -> Tensor:
-    """Which pairs are those of a shape, and not padding: (k,) or (S, k)."""
+    """Mask of the pairs of each shape, without padding: (k,) or (S, k)."""
     k = torch.arange(basis.eigenvectors.shape[1], device=basis.mass.device)
     if basis.sizes is None:
         return k >= 0
@@ -28,7 +28,7 @@ def _present(basis: Eigenbasis) -> Tensor:
 
 
 def _first_positive(basis: Eigenbasis) -> Tensor:
-    """λ_1, the smallest eigenvalue that is not zero, (1,) or (S, 1); EigenbasisError if a shape has none."""
+    """λ_1, the smallest positive eigenvalue, (1,) or (S, 1); EigenbasisError if a shape has none."""
     values = basis.eigenvalues
     first = torch.where(values > 0, values, torch.inf).amin(-1, keepdim=True)
     if first.isinf().any():
@@ -40,7 +40,7 @@ def _first_positive(basis: Eigenbasis) -> Tensor:
 
 
 def _evenly(start: Tensor, end: Tensor, count: int) -> Tensor:
-    """`count` numbers from start to end, equally spaced, along the last axis."""
+    """`count` equally spaced numbers from start to end, along the last axis."""
     fraction = torch.linspace(0, 1, count, dtype=start.dtype, device=start.device)
     return start * (1 - fraction) + end * fraction
 
@@ -62,7 +62,7 @@ def heat_kernel_signature(
     count: int = 16,
     k: int = 128,
 ) -> Float[Tensor, "N T"]:
-    """The heat that remains where it was put: Σ_k e^{−λ_k t} φ_k(x)², 1/ℓ^d (Sun, Ovsjanikov, Guibas 2009).
+    """The heat that remains at its source: Σ_k e^{−λ_k t} φ_k(x)², 1/ℓ^d (Sun, Ovsjanikov, Guibas 2009).
 
     Parameters
     ----------
@@ -101,7 +101,7 @@ def wave_kernel_signature(
     k: int = 128,
     width: float = 7.0,
 ) -> Float[Tensor, "N T"]:
-    """How likely a quantum particle of energy e is met at x: a band-pass signature (Aubry, Schlickewei, Cremers 2011).
+    """Probability that a quantum particle of energy e is at x, a band-pass (Aubry, Schlickewei, Cremers 2011).
 
     Σ_k φ_k(x)² exp(−(e − ln λ_k)²/2σ²), divided by Σ_k exp(…), over λ_k > 0; 1/ℓ^d.
 
@@ -111,7 +111,7 @@ def wave_kernel_signature(
         e, logarithms of eigenvalues in 1/ℓ². By default `count`, equally spaced from ln λ_1 + 2σ to ln λ_k − 2σ of each
         shape, where σ is `width` times their spacing in the original: (ln λ_k − ln λ_1)/100.
     width
-        Of the Gaussians, in such hundredths.
+        Width σ of the Gaussians, in units of that spacing.
     """
     check_operator(lb)
     basis = lb.eigenbasis(k)
@@ -145,7 +145,7 @@ def spectral_wavelets(
     Parameters
     ----------
     scales
-        s, ℓ²; a band sits at the eigenvalue 1/s.
+        s, ℓ²; a band has its peak at the eigenvalue 1/s.
     """
     if isinstance(f, Tensor) and f.ndim == 1:
         return spectral_wavelets(lb, f[:, None], scales, k=k)[..., 0]
@@ -164,7 +164,7 @@ def _wavelet_gains(values: Tensor, scales: Tensor) -> Tensor:
     low = torch.exp(-values[..., None] * scales.max())
     bands = torch.cat([low, z * torch.exp(1 - z)], dim=-1)
     norm = bands.square().sum(-1, keepdim=True).sqrt()
-    # Far above all bands every gain underflows; what is there belongs to the finest band.
+    # Far above all bands every gain underflows; the finest band takes these eigenvalues.
     finest = torch.nn.functional.one_hot(scales.argmin() + 1, len(scales) + 1).to(values)
     return torch.where(norm > 1e-30, bands / norm.clamp_min(1e-30), finest)
 
@@ -174,8 +174,8 @@ def diffusion_map(
 ) -> Float[Tensor, "N dim"]:
     """Coordinates e^{−λ_k t} φ_k(x) in which distances are diffusion distances (Coifman, Lafon 2006); ℓ^{−d/2}.
 
-    The constants, of λ_0 = 0, are left out; a shape with a Dirichlet or Robin condition has none. `k` at least dim + 1
-    may be given to share a basis. The time is in ℓ². On a cloud of any ambient dimension this is its diffusion map.
+    The constants, of λ_0 = 0, are left out; a shape with a Dirichlet or Robin condition has none. `k`, at least dim +
+    1, may be passed to share a basis. The time is in ℓ². On a cloud of any ambient dimension this is its diffusion map.
     """
     check_operator(lb)
     basis = lb.eigenbasis(max(dim + 1, k or 0))
@@ -192,8 +192,8 @@ def diffusion_distance(
 ) -> Float[Tensor, "N S"]:
     """Diffusion distance of every point to each source: (Σ_k e^{−2λ_k t}(φ_k(x) − φ_k(y))²)^{1/2}, ℓ^{−d/2}.
 
-    The distance in L² between the heat that spreads from x and from y in the time t, ℓ². Raises ValueError for a
-    batch, whose shapes have no distance from each other, and for numbers that no point has.
+    It is the L² distance between heat that spreads from x and from y for the time t, ℓ². Raises ValueError for a batch,
+    whose shapes have no distance from each other, and for indices out of range.
     """
     check_operator(lb)
     if lb.sizes is not None:
@@ -207,6 +207,6 @@ def diffusion_distance(
     basis = lb.eigenbasis(k)
     values = basis.eigenvalues
     coordinates = basis.eigenvectors * torch.exp(-values * _numbers("time", time, values))
-    # By the matrix product a point would have a distance from itself.
+    # By a matrix product the distance of a point from itself would not be zero.
     mode = "donot_use_mm_for_euclid_dist"
     return torch.cdist(coordinates, coordinates[index.long()], compute_mode=mode)

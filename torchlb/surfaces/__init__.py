@@ -1,7 +1,7 @@
-"""Manifolds to compare on: analytic ones with exact points, derivatives and spectra, and smooth ones of real shapes.
+"""Manifolds for comparison: analytic ones with exact points, derivatives and spectra, and smooth ones of real shapes.
 
-`base`: a manifold from a retraction and a chart. `shapes`: spheres, tori, curves and others, with what is known of them
-in closed form. `limit`: smooth surfaces of real shapes, by subdivision.
+`base`: a manifold from a retraction and a chart. `shapes`: spheres, tori, curves and others, with their closed forms.
+`limit`: smooth surfaces of real shapes, by subdivision.
 """
 
 from torchlb.surfaces.base import Surface

@@ -44,13 +44,13 @@ class Surface:
     ambient_dim: ClassVar[int] = 3
     perimeter: ClassVar[float] = 0.0  # length ℓ of the boundary
 
-    # A subclass says what follows; the rest derives from it.
+    # A subclass defines the methods that follow; the rest derives from them.
 
     def _retract(self, x: Places) -> Places:
         raise NotImplementedError
 
     def _chart(self, cube: Float[Tensor, "N d"]) -> Points:
-        """Points of coordinates in [0, 1)^d; a boundary is at u_0 = 1."""
+        """Points with coordinates in [0, 1)^d; a boundary is at u_0 = 1."""
         raise NotImplementedError
 
     def _outward(self, points: Places) -> Places:
@@ -58,7 +58,7 @@ class Surface:
         return points
 
     def _inside(self, points: Points, margin: float) -> Points:
-        """Points moved to no less than the margin from the boundary."""
+        """Points moved to at least the margin from the boundary."""
         return points
 
     def _faces(self, points: np.ndarray) -> np.ndarray:
@@ -68,7 +68,7 @@ class Surface:
         raise InputError(f"{type(self).__name__}: no exact eigenvalues are known")
 
     def _spectra(self) -> Mapping[str, Callable[[int], np.ndarray]]:
-        """By boundary condition, what gives the k least eigenvalues, or more of them in any order."""
+        """Functions that return the k least eigenvalues, or more of them in any order, by boundary condition."""
         return {"neumann": self._spectrum}
 
     def retract(self, x: Places) -> Places:
@@ -93,7 +93,7 @@ class Surface:
         return torch.linalg.det(jacobian.mT @ jacobian).sqrt()
 
     def _sample(self, n: int, draw: Callable[[int], Tensor]) -> Points:
-        """n points uniform in area: what rejection leaves of `draw(count)`, (count, d + 1) in [0, 1)."""
+        """n points uniform in area, by rejection from `draw(count)`, (count, d + 1) in [0, 1)."""
         area, peak = _area_and_peak(self)
         bound = 1.001 * peak
         count = int(1.1 * n * bound / area) + 64
@@ -113,8 +113,8 @@ class Surface:
     def points(self, n: int, seed: int = 0) -> Points:
         """n ≥ 8 quasi-uniform points: a low-discrepancy sequence, then short-range repulsion.
 
-        Those on a boundary come first, equally spaced and exactly on it. On a curve all are 0.75 to 1.25 spacings
-        apart.
+        Boundary points come first, equally spaced and exactly on the boundary. Spacings of a curve are 0.75 to 1.25 of
+        the mean.
         """
         require(n >= 8, "n", "at least 8", n)
         source = torch.Generator().manual_seed(seed)
@@ -130,7 +130,7 @@ class Surface:
         ring = pad(circle(turns), (0, self.ambient_dim - 2))
         shift = _uniform(1, self.dim + 1, source)
         scale = torch.ones_like(shift)
-        scale[0, 0] -= half * spacing / self.area  # what the ring's half cells cover
+        scale[0, 0] -= half * spacing / self.area  # area of the half cells at the boundary
         free = self._sample(n - len(ring), lambda count: scale * _kronecker(count, shift))
         return torch.cat([ring, self._repel(free, ring, spacing)])
 
@@ -160,7 +160,7 @@ class Surface:
         return free
 
     def boundary_mask(self, points: Points) -> Bool[Tensor, " N"]:
-        """Which of the points lie on the boundary."""
+        """Mask of the points that lie on the boundary."""
         on_circle = (self._checked(points)[:, :2].norm(dim=1) - 1).abs() < ROOT_EPS
         return on_circle & (self.perimeter > 0)
 
@@ -170,7 +170,7 @@ class Surface:
         given = f"{points.dtype} {tuple(points.shape)}"
         require(fits and points.dtype == torch.float64, name, expected, given)
         distance = (self.retract(points) - points).norm(dim=1)
-        off = torch.nonzero(~(distance <= ROOT_EPS))[:, 0].tolist()  # not-a-number is off, too
+        off = torch.nonzero(~(distance <= ROOT_EPS))[:, 0].tolist()  # NaN is off the surface, too
         require(not off, name, "points on the surface (use retract)", f"others: {off[:8]}")
         return points.detach()
 
@@ -195,7 +195,7 @@ class Surface:
     def laplacian(self, f: Function, points: Points) -> Values:
         """Exact Δf, 1/ℓ², (N,) or (N, C); the analyst's sign, Δ Y_l = −l (l + 1) Y_l on the unit sphere.
 
-        What torch cannot differentiate in forward mode, such as `torch.special.bessel_j0`, it takes for constant.
+        Functions that torch cannot differentiate in forward mode, such as `torch.special.bessel_j0`, count as constant.
         """
         frames, points = self.frames(points), points.detach()
         bending = _second_derivatives(self.retract, points, frames)
@@ -253,7 +253,7 @@ def _quadrature(dim: int) -> tuple[Float[Tensor, "Q d"], Float[Tensor, " Q"]]:
 
 @lru_cache
 def _area_and_peak(surface: Surface) -> tuple[float, float]:
-    """Integral and maximum of the area element; once for all surfaces that are equal."""
+    """Integral and maximum of the area element; cached for equal surfaces."""
     nodes, weights = _quadrature(surface.dim)
     density = surface._density(nodes)
     return float(density @ weights), float(density.max())
@@ -271,7 +271,7 @@ def _uniform(rows: int, columns: int, generator: torch.Generator) -> Float[Tenso
 def _kronecker(count: int, shift: Float[Tensor, "1 D"]) -> Float[Tensor, "count D"]:
     """The sequence shift + i (φ⁻¹, …, φ⁻ᵈ, √2) mod 1, where φ^{d+1} = φ + 1 (M. Roberts, 2018).
 
-    The first d coordinates are as even as they get in d dimensions; the last only decides on rejection.
+    The first d coordinates have low discrepancy in d dimensions; the last is only for rejection.
     """
     dim, golden = shift.shape[1] - 1, 2.0
     for _ in range(60):
@@ -282,6 +282,6 @@ def _kronecker(count: int, shift: Float[Tensor, "1 D"]) -> Float[Tensor, "count 
 
 
 def require(condition: bool, name: str, expected: str, value: object) -> None:
-    """Raise a ValueError that says what was expected and what came."""
+    """Raise a ValueError that says what was expected and what came, unless the condition holds."""
     if not condition:
         raise InputError(f"{name}: expected {expected}, got {value}")

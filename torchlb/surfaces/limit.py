@@ -15,23 +15,23 @@ def limit_surface(
 ) -> tuple[Float[Tensor, "P 3"], list[Int[Tensor, "_ 3"]]]:
     """Points on the limit surface of a closed mesh under Loop's subdivision, and the meshes of its levels on them.
 
-    The surface is that of a real shape, and smooth: twice continuously differentiable but at the vertices that have
-    not six neighbours, where it is once. All meshes are inscribed in the same surface, so that what is computed on a
-    coarse one can be compared with what is computed on a fine one.
+    The surface is that of a real shape, and smooth: twice continuously differentiable except at extraordinary vertices
+    (valence not six), where it is C¹. All meshes are inscribed in the same surface, so that results on a coarse one can
+    be compared with those on a fine one.
 
     Parameters
     ----------
     vertices, faces
         The control mesh; closed, two triangles at every edge.
     levels
-        How often it is subdivided.
+        Number of subdivisions.
 
     Returns
     -------
     points
         (P, 3), those of the finest level; those of every coarser level come first.
     faces
-        Of the levels 0 to `levels`; `points[: faces[i].max() + 1]` are the vertices of level i.
+        Triangles of the levels 0 to `levels`; `points[: faces[i].max() + 1]` are the vertices of level i.
 
     Raises
     ------
@@ -69,7 +69,7 @@ def limit_surface(
 
 
 def _limit(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    """Where subdivision takes the vertices: (1 − nχ)v + χ Σ neighbours, n of them, χ = 1/(3/(8β) + n)."""
+    """Limit positions of the vertices: (1 − nχ)v + χ Σ neighbours, n of them, χ = 1/(3/(8β) + n)."""
     ends = faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2).T
     half = sparse.csr_array((np.full(ends.shape[1], 0.5), ends), shape=(len(vertices),) * 2)
     graph = half + half.T

@@ -1,4 +1,4 @@
-"""Spheres, tori, curves, disks: each a retraction and a chart for `base`, with what is known of it in closed form."""
+"""Spheres, tori, curves, disks: each a retraction and a chart for `base`, with its closed forms."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from torchlb.surfaces.base import Function, Places, Points, Surface, circle, req
 
 
 class _Radial(Surface):
-    """One point a direction: what the retraction makes of a unit vector."""
+    """A surface with one point in each direction: the retraction of the unit vector."""
 
     def _chart(self, cube: Float[Tensor, "N d"]) -> Points:
         return self.retract(_directions(cube))
@@ -44,13 +44,13 @@ class _Round(_Radial):
         return self.radius * _unit(x)
 
     def _spectrum(self, k: int) -> np.ndarray:
-        d, degree = self.dim, np.arange(k)  # one for each harmonic polynomial of the degree
+        d, degree = self.dim, np.arange(k)  # as often as there are harmonic polynomials
         times = [math.comb(j + d, d) - math.comb(max(j + d - 2, 0), d) for j in degree]
         return np.repeat(degree * (degree + d - 1) / self.radius**2, times)
 
 
 class Sphere(_Round):
-    """The sphere of a radius ℓ in R³: eigenvalues l (l + 1) / radius², 2l + 1 times.
+    """The sphere of radius `radius`, ℓ, in R³: eigenvalues l (l + 1) / radius², 2l + 1 times.
 
     Examples
     --------
@@ -60,14 +60,14 @@ class Sphere(_Round):
 
 
 class Circle(_Round):
-    """The circle of a radius ℓ in R²: eigenvalues l² / radius², twice for l > 0."""
+    """The circle of radius `radius`, ℓ, in R²: eigenvalues l² / radius², twice for l > 0."""
 
     dim: ClassVar[int] = 1
     ambient_dim: ClassVar[int] = 2
 
 
 class ThreeSphere(_Round):
-    """The sphere S³ of a radius ℓ in R⁴: eigenvalues l (l + 2) / radius², (l + 1)² times."""
+    """The sphere S³ of radius `radius`, ℓ, in R⁴: eigenvalues l (l + 2) / radius², (l + 1)² times."""
 
     dim: ClassVar[int] = 3
     ambient_dim: ClassVar[int] = 4
@@ -81,7 +81,7 @@ class Ellipsoid(_Radial):
 
     def __post_init__(self) -> None:
         require(min(self.semi_axes) > 0, "semi_axes", "positive lengths", self.semi_axes)
-        object.__setattr__(self, "semi_axes", tuple(self.semi_axes))  # to be hashed
+        object.__setattr__(self, "semi_axes", tuple(self.semi_axes))  # hashable
 
     def _retract(self, x: Places) -> Places:
         return _unit(x / x.new_tensor(self.semi_axes)) * x.new_tensor(self.semi_axes)
@@ -192,7 +192,7 @@ class SpaceCurve(Surface):
         return self._at(2 * math.pi * cube)
 
     def _retract(self, x: Places) -> Places:
-        """The point t = 3t − 2t: the angle around the tube of a torus less that around its axis."""
+        """The point t = 3t − 2t: the angle around the tube of a torus minus the angle around its axis."""
         a, b, c = x.split(1, dim=-1)
         return self._at(torch.atan2(c, torch.hypot(a, b) - 1) - torch.atan2(b, a))
 
@@ -223,7 +223,7 @@ class UnitDisk(Surface):
 
     def _spectra(self) -> Mapping[str, Callable[[int], np.ndarray]]:
         def squares_of(zeros: Callable[[int, int], np.ndarray]) -> Callable[[int], np.ndarray]:
-            # They are about π apart, and the k-th eigenvalue is about 4k.
+            # Zeros are about π apart, and the k-th eigenvalue is about 4k.
             return lambda k: _by_angle(k, lambda m: zeros(m, math.isqrt(k) + 8) ** 2)
 
         def of_derivative(m: int, count: int) -> np.ndarray:
@@ -284,8 +284,8 @@ def deserno_points(n: int) -> Float[Tensor, "N 3"]:
 def spherical_harmonic(l: int, m: int) -> Function:  # noqa: E741
     """The real Y_l^m, of norm 1 in L² of the unit sphere, as a function (N, 3) → (N,).
 
-    It is the homogeneous harmonic polynomial r^l Y_l^m: the normalised Legendre recurrence in z and r², times the
-    real (m ≥ 0) or imaginary (m < 0) part of (x + iy)^|m|. So it is smooth at the poles as everywhere.
+    It is the homogeneous harmonic polynomial r^l Y_l^m: the normalised Legendre recurrence in z and r², times the real
+    (m ≥ 0) or imaginary (m < 0) part of (x + iy)^|m|. So it is smooth at the poles, too.
     """
     order = abs(m)
     require(order <= l, "m", f"-{l} to {l}", m)
@@ -331,7 +331,7 @@ def _directions(cube: Float[Tensor, "N d"]) -> Float[Tensor, "N n"]:
 
 
 def _periodic_delaunay(base: np.ndarray, scale: np.ndarray) -> np.ndarray:
-    """Triangles of points (N, 2) of the plane that repeat with the periods 2π scale (2,)."""
+    """Delaunay triangles of points (N, 2) of the plane, repeated with the periods 2π scale (2,)."""
     count, period = len(base), 2 * math.pi * scale
     shifts = sorted(itertools.product((-1, 0, 1), repeat=2), key=any)  # (0, 0) first
     copies = (base + period * np.array(shifts)[:, None]).reshape(-1, 2)
@@ -347,7 +347,7 @@ def _periodic_delaunay(base: np.ndarray, scale: np.ndarray) -> np.ndarray:
 
 
 def _by_angle(k: int, spectrum: Callable[[int], np.ndarray]) -> np.ndarray:
-    """The k least of the ascending spectra of m = 0, 1, 2, …, which begin ever higher; m > 0 counts twice."""
+    """The k least of the ascending spectra for m = 0, 1, 2, …, whose first values increase; m > 0 counts twice."""
     values = spectrum(0)
     for m in itertools.count(1):
         more = spectrum(m)
