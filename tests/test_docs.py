@@ -83,7 +83,15 @@ TRIGGERS = {
     ),
     "… points share": lambda: LaplaceBeltrami.from_points(torch.cat([VERTICES, VERTICES[:2]])),
     "… are NaN": lambda: LaplaceBeltrami.from_points(NAN),
-    "…: they require": lambda: LaplaceBeltrami.from_points(VERTICES.clone().requires_grad_()),
+    "…: they require": lambda: LaplaceBeltrami.from_cotangent(
+        VERTICES.clone().requires_grad_(), FACES
+    ),
+    "points: they require": lambda: LaplaceBeltrami.from_points(
+        VERTICES.clone().requires_grad_(), weak_form=False
+    ),
+    "…: no derivative in": lambda: (
+        LaplaceBeltrami.from_points(VERTICES.clone().requires_grad_()).frames.sum().backward()
+    ),
     "normals: the signs": lambda: LaplaceBeltrami.from_points(
         VERTICES, normals=VERTICES * torch.tensor([1.0, -1.0]).repeat(30)[:, None], order=1
     ),

@@ -25,9 +25,13 @@ def test_the_operator_of_a_mesh_a_cloud_and_a_scene():
     mesh = LaplaceBeltrami.from_mesh(VERTICES, FACES, order=2)
     assert torch.equal(from_trimesh(MESH, order=2).stencil.values, mesh.stencil.values)
     cloud = from_trimesh(trimesh.PointCloud(VERTICES.numpy()), order=2)
-    assert torch.equal(cloud.stencil.values, LaplaceBeltrami.from_points(VERTICES, order=2).stencil.values)
+    assert torch.equal(
+        cloud.stencil.values, LaplaceBeltrami.from_points(VERTICES, order=2).stencil.values
+    )
     cotangent = LaplaceBeltrami.from_cotangent(VERTICES, FACES)
-    assert torch.equal(from_trimesh(MESH, operator="cotangent").stencil.values, cotangent.stencil.values)
+    assert torch.equal(
+        from_trimesh(MESH, operator="cotangent").stencil.values, cotangent.stencil.values
+    )
     scene = trimesh.Scene([MESH, MESH.copy().apply_translation([5, 0, 0])])
     both = from_trimesh(scene, order=2)
     assert both.num_points == 400
