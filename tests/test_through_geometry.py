@@ -154,6 +154,8 @@ def test_what_has_no_derivative_raises_and_nothing_is_zero_in_silence(unchecked)
         moved.hessian(f),
         moved.mean_curvature_normal(),
         moved.frames,
+        moved.matrix @ f,
+        moved.stiffness @ f,
         moved.normals,
         moved.eigenbasis(5).eigenvectors,
         heat_kernel_signature(moved, k=6),

@@ -11,7 +11,7 @@ from torch import Tensor
 from torchlb.errors import InputError
 from torchlb.galerkin.pair import BilinearForm
 from torchlb.linalg.csr import Csr
-from torchlb.linalg.sparse import to_scipy
+from torchlb.linalg.sparse import csr_tensor, to_scipy
 from torchlb.linalg.threads import threads_for
 from torchlb.operator.batching import shapes_of
 from torchlb.operator.checks import check_tolerance
@@ -71,7 +71,10 @@ class PairMethods(OperatorStorage):
 
     def _tensor(self, name: MatrixName) -> Tensor:
         matrices, channel = self._channel(name)
-        return matrices.tensor(channel)
+        if not self.points.requires_grad:
+            return matrices.tensor(channel)
+        values = refused(self.points, matrices.values[channel], f"{name} as a tensor")
+        return csr_tensor(matrices.crow, matrices.col, values, self.num_points)
 
     def _channel(self, name: str) -> tuple[Csr, int]:
         """The matrices that hold "laplacian", "stiffness", "mass" or "boundary_mass", and its channel in them."""
@@ -131,7 +134,6 @@ class PairMethods(OperatorStorage):
     def _carried(self, basis: Eigenbasis) -> Eigenbasis:
         """The basis with dλ = φᵀ(dK − λ dM)φ; in a cluster, symmetric functions of its eigenvalues have derivatives."""
         points, vectors = self.points, basis.eigenvectors.cpu().double()
-
         squares = basis.eigenvalues.cpu().double()
 
         def forms(g: Tensor) -> list[BilinearForm]:
@@ -140,8 +142,7 @@ class PairMethods(OperatorStorage):
             return [BilinearForm("stiffness", *functions, g), of_mass]
 
         values = known(points, basis.eigenvalues, self.plan, forms)
-        sides = (refused(points, t, "eigenvectors") for t in (basis.eigenvectors, basis.left))
-        modes, left = sides
+        modes, left = (refused(points, t, "eigenvectors") for t in (basis.eigenvectors, basis.left))
         return Eigenbasis(values, modes, self.mass, left, relative_errors=basis.relative_errors)
 
     def invariant_basis(
