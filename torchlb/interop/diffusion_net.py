@@ -47,6 +47,7 @@ from torchlb.geometry.neighbors import nearest_neighbors
 from torchlb.geometry.thresholds import NEAREST
 from torchlb.io.cache import load_or_build
 from torchlb.operator.dispatch import Operator, build_operator
+from torchlb.operator.inputs import warn_of_gradients
 from torchlb.operator.laplace_beltrami import LaplaceBeltrami
 
 __all__ = ["compute_operators", "get_all_operators", "get_operators"]
@@ -107,7 +108,8 @@ def get_operators(
         arguments.setdefault("certify", True)
     if cloud and normals is not None:
         arguments["normals"] = normals
-    double = verts.double()
+    warn_of_gradients(verts, "verts")
+    double = verts.detach().double()
     if op_cache_dir is None:
         lb = build_operator(double, None if cloud else faces, **arguments)
     else:

@@ -35,6 +35,7 @@ from torchlb.io.cache import load_or_build
 from torchlb.linalg.csr import Csr
 from torchlb.operator.batching import join_states
 from torchlb.operator.dispatch import Operator, build_operator
+from torchlb.operator.inputs import warn_of_gradients
 from torchlb.operator.laplace_beltrami import LaplaceBeltrami
 from torchlb.operator.parts import BASIS, PairMatrices
 from torchlb.spectral.eigenbasis import Eigenbasis, stack_eigenbases
@@ -142,9 +143,11 @@ class LaplaceBeltramiTransform(BaseTransform):
                 f"{data} has edges but no face, so that the operator is that of a cloud; a mesh keeps its faces with "
                 "FaceToEdge(remove_faces=False), or with this transform first"
             )
+        warn_of_gradients(data["pos"], "pos")
+        points = data["pos"].detach()
         if self.cache is None:
-            return build_operator(data["pos"], faces, **options)
-        return load_or_build(data["pos"], faces, cache=self.cache, k=self.k, **options)
+            return build_operator(points, faces, **options)
+        return load_or_build(points, faces, cache=self.cache, k=self.k, **options)
 
     def __repr__(self) -> str:
         shown = {"operator": self.operator, "k": self.k, "cache": self.cache, **self.options}
