@@ -90,10 +90,8 @@ def get_operators(
         Whether to compute anew.
     truncate_cache
         Argument of the original; without effect, since a file with more pairs serves already.
-    operator
-        "stencil" or "cotangent".
-    symmetric
-        Whether L is symmetric; see above.
+    operator, symmetric
+        "stencil" or "cotangent"; whether L is symmetric, see above.
     **options
         Options of `LaplaceBeltrami.from_mesh` or `from_points`, such as ``order=3``.
 
@@ -109,12 +107,12 @@ def get_operators(
     if cloud and normals is not None:
         arguments["normals"] = normals
     warn_of_gradients(verts, "verts")
-    double = verts.detach().double()
+    shape = verts.detach().double(), None if cloud else faces
     if op_cache_dir is None:
-        lb = build_operator(double, None if cloud else faces, **arguments)
+        lb = build_operator(*shape, **arguments)
     else:
         arguments |= {"cache": op_cache_dir, "k": k_eig, "overwrite": overwrite_cache}
-        lb = load_or_build(double, None if cloud else faces, **arguments)
+        lb = load_or_build(*shape, **arguments)
     if cloud:
         normals = None  # the operator's own are oriented by them
     return _tuple(lb, k_eig, normals, symmetric, verts)
