@@ -300,3 +300,12 @@ def test_errors():
         to_operator(data)
     with pytest.raises(TypeError, match="no option degree"):
         LaplaceBeltramiTransform(degree=2)(DATA[0])
+
+
+def test_positions_that_require_gradients_are_told():
+    data = LaplaceBeltramiTransform(order=1, k=4)(DATA[0])
+    data.pos = data.pos.clone().requires_grad_()
+    with pytest.warns(UserWarning, match="pos: they require gradients"):
+        lb = to_operator(data)
+    assert not lb.points.requires_grad
+    assert not lb.eigenbasis(4).eigenvalues.requires_grad

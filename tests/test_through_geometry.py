@@ -194,3 +194,18 @@ def test_builders_carry_gradients(parameter):
     torch.testing.assert_close(*gradients, rtol=1e-6, atol=1e-8)
     with torch.no_grad():
         assert not LaplaceBeltrami.from_points(x).points.requires_grad
+
+
+def test_a_batch_has_the_gradients_of_its_masses_alone():
+    """∂ area is that of the shapes; eigenvalues and products of a batch raise, and have their values."""
+    x = built("closed").points.clone().requires_grad_()
+    single, f = built("closed").at(x), noise(400, 1)
+    batch = LaplaceBeltrami.batch([single, built("closed")])
+    (together,) = torch.autograd.grad(batch.mass.sum(), x, retain_graph=True)
+    (alone,) = torch.autograd.grad(single.mass.sum(), x)
+    torch.testing.assert_close(together, alone)
+    basis = batch.eigenbasis(4)
+    torch.testing.assert_close(basis.eigenvalues[0], single.eigenbasis(4).eigenvalues)
+    for value in (basis.eigenvalues, batch.product("mass", f), basis.to_basis(f)):
+        with pytest.raises(DerivativeError, match="no derivative in the points"):
+            value.sum().backward()

@@ -92,14 +92,7 @@ def element_matrices(
 
     Both are real and share a pattern; packed into one complex matrix they are assembled and multiplied together.
     """
-    slopes = shape.gradients.unbind(-1)  # (Q, n) each
-    products = []
-    for a, x in enumerate(slopes):
-        for y in slopes[a:]:
-            cross = x[:, :, None] * y[:, None, :]
-            products.append(cross if x is y else cross + cross.mT)
-    gradients = torch.stack(products, 1).flatten(0, 1).flatten(1)
-    masses = squares(shape)
+    gradients, masses = gradient_products(shape).flatten(0, 1), squares(shape)
     blocks = torch.empty(len(g), masses.shape[1], dtype=torch.complex128)
     for first in range(0, len(g), AT_ONCE):
         part = slice(first, first + AT_ONCE)
@@ -117,6 +110,15 @@ def assemble_mass(
 ) -> sparse.csr_array:
     """Mass matrix ∫ φ_i φ_j of elements with volume element `size` at the Gauss points."""
     return summed((shape.weights * size) @ squares(shape), nodes, num_nodes)
+
+
+def gradient_products(shape: Element) -> Float[Tensor, "Q S n_times_n"]:
+    """∂_a φ_i ∂_b φ_j at the Gauss points for a = b, and its sum with a and b exchanged for a < b."""
+    products = []
+    for x, y in combinations_with_replacement(shape.gradients.unbind(-1), 2):
+        cross = x[:, :, None] * y[:, None, :]
+        products.append(cross if x is y else cross + cross.mT)
+    return torch.stack(products, 1).flatten(2)
 
 
 def squares(shape: Element) -> Float[Tensor, "Q n_times_n"]:

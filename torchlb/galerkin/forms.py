@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from itertools import combinations_with_replacement
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -18,6 +17,7 @@ from torchlb.galerkin.assembly import (
     cofactors,
     element_matrices,
     flat_metric,
+    gradient_products,
     linear_elements,
     squares,
     summed,
@@ -185,15 +185,22 @@ class Forms:
         blocks = element_matrices(self.metric, self.element, conductivity)
         return blocks if self.shares is None else self.shares[:, None] * blocks
 
-    def near(self, conductivities: list[Tensor] | None = None) -> sparse.csr_array:
-        """Upper triangle of K₁ + iM₁ of P1 elements on flat simplices, with the mean of κ on each."""
+    def near(
+        self, conductivities: list[Tensor] | None = None, flat: Any = None
+    ) -> sparse.csr_array:
+        """Upper triangle of K₁ + iM₁ of P1 elements on flat simplices, with the mean of κ on each.
+
+        `flat` has the part of the flat cells, if it is known.
+        """
         means = None
         if conductivities is not None:
             means = conductivities[0] @ self.element.weights / self.element.weights.sum()
         count = self.prolongation.shape[1]
         own = linear_elements(self.lengths, self.cells, count, means, shares=self.shares)
         upper: Any = sparse.triu(own, format="csr")
-        return upper + self.flat(conductivities) if self.flats else upper
+        if not self.flats:
+            return upper
+        return upper + (self.flat(conductivities) if flat is None else flat)
 
     def flat(self, conductivities: list[Tensor] | None = None) -> sparse.csr_array:
         """Upper triangle of K + iM of the flat cells."""
@@ -284,12 +291,8 @@ def _slopes(
     metric: Float[Tensor, "T Q S"], element: Element, blocks: Float[Tensor, "T n_times_n"]
 ) -> Float[Tensor, "T Q"]:
     """Quadrature weights times Σ_k c_k ∇w_k·∇u_k at the Gauss points."""
-    total, slopes = metric.new_zeros(metric.shape[:2]), element.gradients.unbind(-1)
-    pairs = combinations_with_replacement(slopes, 2)
-    for (x, y), entry in zip(pairs, cofactors(metric).unbind(-1), strict=True):
-        cross = x[:, :, None] * y[:, None, :]
-        cross = cross if x is y else cross + cross.mT
-        total = total + entry * (blocks @ cross.flatten(1).T)
+    entries = zip(cofactors(metric).unbind(-1), gradient_products(element).unbind(1), strict=True)
+    total = torch.stack([entry * (blocks @ cross.T) for entry, cross in entries]).sum(0)
     return element.weights * total / area_element(metric)
 
 

@@ -165,10 +165,13 @@ class PairPlan:
         """Patterns of the matrices evaluated so far, by their names in `WeakPair`."""
         return {}
 
-    def forms(self, fits: LocalFits, mesh: CurvedMesh | None = None) -> Forms:
+    def forms(
+        self, fits: LocalFits, mesh: CurvedMesh | None = None, *, prolong: bool = True
+    ) -> Forms:
         """Elements from the fits at given points; `mesh` has the curved cells there, if they are known already."""
         mesh = self.curving.at(fits.points, self.fits, fits) if mesh is None else mesh
-        return Forms.curved(self.fits, fits, self.curving, mesh, self.stars, self.shares)
+        rest = mesh, self.stars, self.shares
+        return Forms.curved(self.fits, fits, self.curving, *rest, prolong=prolong)
 
     def at(self, fits: LocalFits, numbering: Numbering) -> WeakPair:
         """Weak pair from the fits at given points, in the user's numbers."""
@@ -181,8 +184,7 @@ class PairPlan:
         "lumped" is "mass" with the rows of P that the mass of the vertices is found by: with w = 1 it is Σ_i m_i u_i.
         """
         mesh = self.curving.at(fits.points, self.fits, fits)
-        rest = self.stars, self.shares
-        elements = Forms.curved(self.fits, fits, self.curving, mesh, *rest, prolong=False)
+        elements = self.forms(fits, mesh, prolong=False)
         flat = self.curving.bent.index_fill(0, self.lowered, False)
         total = []
         for lumped, curving in ((False, self.curving), (True, replace(self.curving, bent=flat))):
@@ -248,7 +250,8 @@ def assembled_pair(
     Missing `patterns` are computed and added.
     """
     forms = plan.forms(fits, mesh)
-    near, flat, p = forms.near(), forms.flat(), forms.prolongation
+    flat, p = forms.flat(), forms.prolongation
+    near = forms.near(flat=flat)
     boundary = boundary_mass(fits.points, plan.curving, mesh, p)
     blocks, nodes = [forms.blocks()], forms.nodes
     del forms, mesh  # some of these are as large as the pair

@@ -159,9 +159,8 @@ def _tuple(
     gradient = torch.einsum("exd,de->xe", turn[row], lb.stencil.values[1:])
     weak = -lb.mass[row] * lb.stencil.values[0]
     if symmetric and lb.has_weak_form:
-        crow, col, values = lb.weak.pair
-        rows = torch.arange(lb.num_points).repeat_interleave(crow.diff())
-        matrix = _coo(torch.stack([rows, col]), values[0], like)
+        _, col, values = lb.weak.pair
+        matrix = _coo(torch.stack([lb.weak.row, col]), values[0], like)
     elif symmetric:
         matrix = _coo(torch.cat([index, index.flip(0)], 1), torch.cat([weak, weak]) / 2, like)
     else:

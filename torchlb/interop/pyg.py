@@ -202,6 +202,7 @@ def to_operator(data: Any) -> LaplaceBeltrami:
     batched = isinstance(data, Batch)
     infos = [json.loads(text) for text in (data["lb_info"] if batched else [data["lb_info"]])]
     sizes = data["ptr"].diff() if batched else data.lb_mass.new_tensor([len(data.lb_mass)]).long()
+    warn_of_gradients(data.pos, "pos")
     _check_unchanged(data, sizes)
     basis = None
     if "lb_basis" in data:
@@ -213,7 +214,7 @@ def to_operator(data: Any) -> LaplaceBeltrami:
 
 def _parts(data: Any, sizes: Int[Tensor, " S"]) -> dict[str, Any]:
     """The block-diagonal matrices, and the other tensors of the operator."""
-    points = data.pos.to(data.lb_mass)
+    points = data.pos.detach().to(data.lb_mass)
     boundary = data.lb_boundary
     parts = {
         "mass": data.lb_mass,
@@ -245,7 +246,7 @@ def _parts(data: Any, sizes: Int[Tensor, " S"]) -> dict[str, Any]:
 
 def _check_unchanged(data: Any, sizes: Int[Tensor, " S"]) -> None:
     """Raise ValueError unless `pos` is that of the operator, in its order, up to a translation of each shape."""
-    built, pos = data.lb_pos, data.pos
+    built, pos = data.lb_pos, data.pos.detach()
     count = max(
         len(built), int(data.lb_stencil_index.max()) + 1
     )  # some transforms sample every key

@@ -30,6 +30,24 @@ def starts(counts: Sequence[int]) -> list[int]:
     return [0, *accumulate(counts)][: len(counts)]
 
 
+def side_by_side(f: Tensor) -> Tensor:
+    """The functions of f, (N,), (N, C) or (B, N, C), as columns: (N, 1), (N, C) or (N, B C).
+
+    >>> side_by_side(torch.tensor([[[1.0], [2.0]], [[3.0], [4.0]]])).tolist()
+    [[1.0, 3.0], [2.0, 4.0]]
+    """
+    if f.ndim == 1:
+        return f[:, None]
+    return f if f.ndim == 2 else f.transpose(0, 1).flatten(1)
+
+
+def shaped_like(columns: Tensor, f: Tensor) -> Tensor:
+    """Columns in the layout of f: the inverse of `side_by_side`."""
+    if f.ndim == 1:
+        return columns[:, 0]
+    return columns if f.ndim == 2 else columns.unflatten(1, f.shape[::2]).transpose(0, 1)
+
+
 class Tensors(nn.Module):
     """Plain buffers by name, which load a state of any size: they are data, not parameters."""
 
@@ -145,7 +163,7 @@ class Csr(Tensors):
     def row(self) -> Int[Tensor, " nnz"]:
         """The row of every entry."""
         count = torch.arange(self.num_rows, device=self.crow.device)
-        return count.repeat_interleave(self.crow.diff())
+        return count.repeat_interleave(self.crow.diff(), output_size=self.col.shape[0])
 
     @property
     def pattern(self) -> list[Tensor]:
@@ -188,19 +206,12 @@ class Csr(Tensors):
         Raises InputError for another shape.
         """
         check_tensor(f)
-        if f.ndim == 1:
-            options: Any = {"transposed": transposed, "dtype": dtype}
-            return self.product(channel, f[:, None], **options)[:, 0]
-        if not (f.ndim in (2, 3) and f.shape[-2] == self.num_rows):
+        if f.ndim not in (1, 2, 3) or f.shape[max(f.ndim - 2, 0)] != self.num_rows:
             raise InputError(
                 f"expected f of shape (N,), (N, C) or (B, N, C) with N = {self.num_rows}, got {tuple(f.shape)}"
             )
-        columns = f if f.ndim == 2 else f.transpose(0, 1).flatten(1)
         values = self.values[channel] if dtype is None else self.values[channel].to(dtype)
-        result = csr_product(self.pattern, values, columns, transposed)
-        if f.ndim == 2:
-            return result
-        return result.view(f.shape[1], f.shape[0], f.shape[2]).transpose(0, 1)
+        return shaped_like(csr_product(self.pattern, values, side_by_side(f), transposed), f)
 
     @staticmethod
     def join(records: Sequence[Csr]) -> Csr:

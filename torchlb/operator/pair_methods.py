@@ -141,9 +141,9 @@ class PairMethods(OperatorStorage):
             of_mass = BilinearForm("mass", *functions, -g * squares)
             return [BilinearForm("stiffness", *functions, g), of_mass]
 
-        values = known(points, basis.eigenvalues, self.plan, forms)
+        values = known(self, basis.eigenvalues, "eigenvalues", forms)
         modes, left = (refused(points, t, "eigenvectors") for t in (basis.eigenvectors, basis.left))
-        return Eigenbasis(values, modes, self.mass, left, relative_errors=basis.relative_errors)
+        return Eigenbasis(values, modes, self.mass, left, self.sizes, basis.relative_errors)
 
     def invariant_basis(
         self, k: int, *, tolerance: float | None = None, store: bool = False

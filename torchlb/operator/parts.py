@@ -61,10 +61,9 @@ class PairMatrices(Csr):
 
     def losing(self, fixed: Bool[Tensor, " N"] | None) -> Bool[Tensor, " N"]:
         """Mask of the points where a condition keeps constants out of the null space of K, `fixed` ones included."""
-        diagonal = self.near.row == self.near.col
         found = torch.zeros(self.num_rows, dtype=torch.bool, device=self.col.device)
         if len(self.near.values) > 3:
-            found = self.near.values[3, diagonal] > 0
+            found = self.near.values[3, self.near.row == self.near.col] > 0
         return found if fixed is None else found | fixed
 
     @property

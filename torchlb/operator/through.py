@@ -16,6 +16,7 @@ from torch import Tensor
 
 from torchlb.errors import DerivativeError
 from torchlb.galerkin.pair import BilinearForm
+from torchlb.linalg.csr import side_by_side
 from torchlb.linalg.once import once_differentiable
 from torchlb.operator.plan import Plan
 
@@ -41,11 +42,6 @@ class _Known(torch.autograd.Function):
         return found.to(points), None, None, None
 
 
-def known(points: Tensor, result: Tensor, plan: Plan, forms: Forms) -> Tensor:
-    """A result with its derivative in the points, by the forms that a gradient makes."""
-    return _Known.apply(points, result.detach(), plan, forms)  # pyright: ignore[reportReturnType]
-
-
 class _Refused(torch.autograd.Function):
     """A value that depends on the points in a way that is not differentiated."""
 
@@ -65,6 +61,13 @@ class _Refused(torch.autograd.Function):
 def refused(points: Tensor, value: Tensor, what: str) -> Tensor:
     """The value, which raises DerivativeError where its derivative in the points is asked for."""
     return _Refused.apply(points, value.detach(), what)  # pyright: ignore[reportReturnType]
+
+
+def known(lb: Any, result: Tensor, what: str, forms: Forms) -> Tensor:
+    """A result with its derivative in the operator's points, by the forms that a gradient makes; of a batch refused."""
+    if lb.sizes is not None:
+        return refused(lb.points, result, f"{what} of a batch")
+    return _Known.apply(lb.points, result.detach(), lb.plan, forms)  # pyright: ignore[reportReturnType]
 
 
 def carrying(lb: Any, points: Any) -> Any:
@@ -88,7 +91,7 @@ def carrying(lb: Any, points: Any) -> Any:
         return [BilinearForm("lumped", one, g[:, None], one[0])]
 
     lb.points = points.to(lb.points).view_as(lb.points)  # a buffer is no Parameter
-    lb.mass = known(points, lb.mass, lb.plan, forms)
+    lb.mass = known(lb, lb.mass, "mass", forms)
     lb.stencil.values = refused(points, lb.stencil.values, "rows of Δ and ∇")
     lb.frames = refused(points, lb.frames, "frames")
     lb.normals = refused(points, lb.normals, "normals")
@@ -100,13 +103,9 @@ def through_product(lb: Any, name: Any, f: Tensor, result: Tensor) -> Tensor:
     if name == "boundary_mass":
         return result + refused(lb.points, torch.zeros_like(result), name)
 
-    def columns(x: Tensor) -> Tensor:
-        x = x.detach().cpu().double()
-        return x[:, None] if x.ndim == 1 else x.transpose(0, -2).flatten(1)
-
-    other = columns(f)
+    other = side_by_side(f.detach().cpu().double())
 
     def forms(g: Tensor) -> list[BilinearForm]:
-        return [BilinearForm(name, columns(g), other, torch.ones(other.shape[1]).double())]
+        return [BilinearForm(name, side_by_side(g), other, torch.ones_like(other[0]))]
 
-    return result + known(lb.points, torch.zeros_like(result), lb.plan, forms)
+    return result + known(lb, torch.zeros_like(result), name, forms)

@@ -15,6 +15,7 @@ import torch
 from jaxtyping import Shaped
 from torch import Tensor
 
+from torchlb.linalg.csr import shaped_like, side_by_side
 from torchlb.linalg.exponential import heat
 from torchlb.linalg.precision import ROOT_EPS
 from torchlb.linalg.sparse import compute_dtype
@@ -87,9 +88,8 @@ def flow(
     """e^{tΔ}x, (N, C) or (B, N, C), in the type of x, which is float32 or float64; autocast has to be off."""
     check_tolerance(tolerance)
     if x.ndim == 3:
-        columns, times = x.transpose(0, 1).flatten(1), time.repeat(len(x))
-        y = flow(lb, columns, times, method, k, tolerance)
-        return y.view(x.shape[1], x.shape[0], x.shape[2]).transpose(0, 1)
+        y = flow(lb, side_by_side(x), time.repeat(len(x)), method, k, tolerance)
+        return shaped_like(y, x)
     check_pair(lb)
     x = off_geometry(x, lb)
     if method == "spectral":
@@ -131,9 +131,7 @@ def _deflated(
 def _linear_flow(lb: LaplaceBeltrami) -> tuple[list[Tensor], Tensor, Tensor]:
     """Pattern and values of −D^{−½}K₁D^{−½}, zero for Dirichlet points, and D^½, where D are the row sums of M₁."""
     crow, col, (stiffness, mass, *_) = lb.weak.linear_pair
-    row = torch.arange(lb.num_points, device=col.device).repeat_interleave(
-        crow.diff(), output_size=len(col)
-    )
+    row = lb.weak.near.row
     root = torch.zeros_like(lb.mass).index_add(0, row, mass.to(lb.mass)).sqrt()
     values = -stiffness / (root[row] * root[col])
     if lb.fixed is not None:

@@ -10,6 +10,7 @@ from torch import Tensor
 
 from torchlb.errors import InputError
 from torchlb.linalg.checks import check_finite
+from torchlb.linalg.csr import shaped_like, side_by_side
 from torchlb.linalg.once import once_differentiable
 from torchlb.linalg.precision import SINGLE
 from torchlb.linalg.sparse import compute_dtype, symmetric_product
@@ -82,7 +83,7 @@ def implicit_step(
     if given is not None:
         right = right - _product(lb, 1, given) - time * _product(medium, 0, given)
     u = _solve(off_geometry(right, lb), time, conductivity, given, medium, tolerance)
-    return _shaped(u if given is None else u + given, f, x.dtype)
+    return shaped_like(u if given is None else u + given, f).to(x.dtype)
 
 
 @uncompiled
@@ -120,7 +121,7 @@ def poisson_solve(
     if given is not None:
         right = right - _product(medium, 0, given)
     u = _solve(off_geometry(right, lb), None, conductivity, given, medium, tolerance)
-    return _shaped(u if given is None else u + given, f, x.dtype)
+    return shaped_like(u if given is None else u + given, f).to(x.dtype)
 
 
 @uncompiled
@@ -160,7 +161,7 @@ def potential(
         source = field[..., 0, :]
     assert source is not None, "neither field nor source"
     u = _solve(off_geometry(columns, lb), None, None, None, lb, tolerance)
-    return _shaped(u, source, source.dtype)
+    return shaped_like(u, source).to(source.dtype)
 
 
 def _columns(
@@ -168,16 +169,7 @@ def _columns(
 ) -> tuple[Tensor, Tensor]:
     """The functions of a stack (B, N, C) as further columns, with a time for each."""
     time = x.new_zeros(0) if time is None else time
-    if x.ndim == 2:
-        return x.to(dtype), time
-    return x.to(dtype).transpose(0, 1).flatten(1), time.repeat(len(x))
-
-
-def _shaped(u: Tensor, f: Tensor, dtype: torch.dtype) -> Tensor:
-    """Columns in the shape of f."""
-    if f.ndim == 3:
-        u = u.view(f.shape[1], f.shape[0], f.shape[2]).transpose(0, 1)
-    return (u[:, 0] if f.ndim == 1 else u).to(dtype)
+    return side_by_side(x.to(dtype)), time if x.ndim == 2 else time.repeat(len(x))
 
 
 def _data(lb: LaplaceBeltrami, data: Tensor | float | None, kind: int, f: Tensor) -> Tensor | None:
