@@ -76,6 +76,16 @@ def circle_network():
     DiffusionNet(2, 1, width=4, num_blocks=1, k=4)(torch.zeros(30, 2), lb)
 
 
+def derivative_of_a_lone_corner():
+    corner = int(FACES[FACES[:, 0] == 0][0, 1])
+    faces = torch.cat([FACES, torch.tensor([[0, len(VERTICES), corner]])])
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        x = torch.cat([VERTICES, VERTICES[:1]]).requires_grad_()
+        lb = LaplaceBeltrami.from_mesh(x, faces)
+    lb.eigenbasis(4).eigenvalues.sum().backward()
+
+
 # By the beginning of the heading: what gives the message.
 TRIGGERS = {
     "… vertices (…) belong": lambda: LaplaceBeltrami.from_mesh(
@@ -89,6 +99,7 @@ TRIGGERS = {
     "points: they require": lambda: LaplaceBeltrami.from_points(
         VERTICES.clone().requires_grad_(), weak_form=False
     ),
+    "points: the derivative": lambda: derivative_of_a_lone_corner(),
     "…: no derivative in": lambda: (
         LaplaceBeltrami.from_points(VERTICES.clone().requires_grad_()).frames.sum().backward()
     ),

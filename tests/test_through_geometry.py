@@ -209,3 +209,22 @@ def test_a_batch_has_the_gradients_of_its_masses_alone():
     for value in (basis.eigenvalues, batch.product("mass", f), basis.to_basis(f)):
         with pytest.raises(DerivativeError, match="no derivative in the points"):
             value.sum().backward()
+
+
+def test_cells_without_area_do_no_harm():
+    """A T-junction closed by a triangle of three points on a line; a point with no other cell is an error."""
+    vertices, faces = Ellipsoid((1.0, 0.8, 0.6)).mesh(200)
+    a, b, c = faces[0].tolist()
+    middle = (vertices[a] + vertices[b]) / 2
+    more = torch.tensor([[a, 200, c], [200, b, c], [a, b, 200]])
+    x = torch.cat([vertices, middle[None]]).requires_grad_()
+    lb = LaplaceBeltrami.from_mesh(x, torch.cat([faces[1:], more]))
+    values = lb.eigenbasis(8, tolerance=1e-11).eigenvalues[1:]
+    (g,) = torch.autograd.grad(values.log().sum(), x)
+    assert abs((g * x).sum() + 14) < 1e-6
+    x = torch.cat([vertices, vertices[:1]]).requires_grad_()
+    corner = faces[(faces == 0).any(1)][0].max()
+    lone = torch.stack([torch.tensor(0), torch.tensor(200), corner])
+    lb = LaplaceBeltrami.from_mesh(x, torch.cat([faces, lone[None]]))
+    with pytest.raises(DerivativeError, match=r"points: the derivative in .* is not finite"):
+        lb.eigenbasis(4).eigenvalues.sum().backward()

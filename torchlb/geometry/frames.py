@@ -28,6 +28,9 @@ def mesh_frames(
     """
     dim = faces.shape[1] - 1
     edges = _edges(vertices, faces)
+    if vertices.requires_grad:  # simplices without volume have no weight, and no derivative
+        sound = torch.linalg.det(edges.detach() @ edges.detach().mT) > 0
+        faces, edges = faces[sound], edges[sound]
     basis, triangle = torch.linalg.qr(edges.mT)
     area = torch.diagonal(triangle, dim1=-2, dim2=-1).prod(-1).abs()
     projector = (area[:, None, None] * (basis @ basis.mT)).repeat_interleave(dim + 1, dim=0)

@@ -15,7 +15,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from torchlb.errors import InputError, renumbered
+from torchlb.errors import DerivativeError, InputError, first_few, renumbered
 from torchlb.galerkin.forms import Forms
 from torchlb.galerkin.pair import BilinearForm, PairPlan
 from torchlb.geometry.numbering import Numbering
@@ -77,13 +77,23 @@ class Plan:
     def gradient(
         self, points: Float[Tensor, "N n"], forms: Sequence[BilinearForm]
     ) -> Float[Tensor, "N n"]:
-        """The derivative in the user's points of the sum of bilinear forms of functions at the user's points."""
+        """The derivative in the user's points of the sum of bilinear forms of functions at the user's points.
+
+        Raises DerivativeError where it is not finite, naming the points.
+        """
         sort = cache(self.numbering.sorted)  # a function that stands in two forms is one
         forms = [form._replace(w=sort(form.w), u=sort(form.u)) for form in forms]
         with torch.enable_grad():
             x = points.requires_grad_()
             _, fits = self.shape.at(self._sorted(x))
-            return torch.autograd.grad(self.pair.bilinear(fits, forms), x)[0]
+            found = torch.autograd.grad(self.pair.bilinear(fits, forms), x)[0]
+        bad = (~found.isfinite()).any(1).nonzero()[:, 0]
+        if len(bad):
+            raise DerivativeError(
+                f"points: the derivative in {len(bad)} of them ({first_few(bad)}) is not finite, as where all cells of "
+                "a point are degenerate; remove these, or merge their corners"
+            )
+        return found
 
     def _sorted(self, points: Float[Tensor, "N n"]) -> Float[Tensor, "N n"]:
         if len(self.moved):
