@@ -29,7 +29,7 @@ from torchlb import (
     wave_kernel_signature,
 )
 from torchlb.nn.diffusion import LearnedTimes, raw_of_time
-from torchlb.pde import systems
+from torchlb.operator import systems
 from torchlb.pde.solves import implicit_step, potential
 from torchlb.surfaces import Circle, Ellipsoid, Sphere, Torus, UnitDisk
 

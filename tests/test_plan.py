@@ -252,4 +252,4 @@ def test_a_copy_has_the_numbers_of_the_faces():
     ours, theirs = (implicit_step(one, f, 0.1, conductivity=kappa) for one in (lb, other))
     assert other.plan.faces.equal(lb.faces)
     assert not torch.equal(other.plan.order, lb.plan.order)
-    torch.testing.assert_close(theirs, ours, rtol=0, atol=1e-5)
+    torch.testing.assert_close(theirs, ours, rtol=0, atol=2e-5)

@@ -23,7 +23,7 @@ from torchlb import (
 )
 from torchlb.linalg.conjugate_gradients import conjugate_gradients
 from torchlb.linalg.exponential import _coefficients
-from torchlb.pde import systems
+from torchlb.operator import systems
 from torchlb.surfaces import CliffordTorus, Ellipsoid, Sphere, StarShaped, Torus, UnitDisk
 
 

@@ -5,6 +5,7 @@ elements on the reference simplex. `nodes`: the numbering of Lagrange nodes on a
 `curving`: positions of the nodes on the surface, and which cells stay flat. `coarse`: triangles too coarse for the
 fits; `delaunay`: the intrinsic Delaunay tufted cover that replaces them. `prolongation`: P, from the vertices to the
 nodes. `boundary_curves`: polynomial curves along the boundary of a surface. `boundary`: nodes along a boundary.
-`flips`: edge flips that remove folded triangles and slivers. `forms`: PᵀK_FE P and PᵀM_FE P, for any conductivity.
-`pair`: an operator's matrices and positive lumped mass. `absorption`: the term that Robin conditions add to K.
+`flips`: edge flips that remove folded triangles and slivers. `medium`: conductivity, density and
+potential. `forms`: PᵀK_FE P and PᵀM_FE P, in any medium. `pair`: an operator's matrices and positive lumped mass.
+`absorption`: the term that Robin conditions add to K.
 """

@@ -6,7 +6,9 @@ A symmetric (d, d) matrix is stored as its upper triangle, row by row.
 from __future__ import annotations
 
 from itertools import combinations_with_replacement
+from typing import Any
 
+import numpy as np
 import torch
 from jaxtyping import Complex, Float, Int, Shaped
 from scipy import sparse
@@ -85,10 +87,51 @@ def area_element(g: Float[Tensor, "*batch S"]) -> Float[Tensor, "*batch"]:
     return (g[..., :3] * cofactors(g)[..., :3]).sum(-1).clamp_min(0).sqrt()
 
 
+def conductance(
+    g: Float[Tensor, "*batch S"], conductivity: Tensor | None = None
+) -> Float[Tensor, "*batch S"]:
+    """Upper triangle of √det(G) A, for ∫A∇u·∇w in reference coordinates.
+
+    The conductivity is a number κ (…), A = κG⁻¹, or a tensor in these coordinates, (…, S), as `in_cells` has it.
+
+    >>> conductance(torch.tensor([4.0]), torch.tensor(8.0)).tolist(), conductance(torch.tensor([4.0])).tolist()
+    ([4.0], [0.5])
+    """
+    root = area_element(g)
+    if conductivity is not None and conductivity.ndim == g.ndim:
+        return root[..., None] * conductivity
+    scale = 1 / root if conductivity is None else conductivity / root
+    return cofactors(g) * scale[..., None]
+
+
+def in_cells(
+    a: Float[Tensor, "*batch n n"], edges: Float[Tensor, "*batch n d"], g: Float[Tensor, "*batch S"]
+) -> Float[Tensor, "*batch S"]:
+    """Upper triangle of a space tensor in reference coordinates, R⁻¹(QᵀAQ)R⁻ᵀ with G = RᵀR.
+
+    Q are orthonormal vectors along the edges of a cell, or its partial derivatives, whose lengths G may not have.
+    """
+    q, r = torch.linalg.qr(edges)
+    q = torch.where(r.diagonal(dim1=-2, dim2=-1)[..., None, :] < 0, -q, q)
+    places = {1: [[0]], 3: [[0, 1], [1, 2]], 6: [[0, 1, 2], [1, 3, 4], [2, 4, 5]]}
+    r = torch.linalg.cholesky_ex(g[..., places[g.shape[-1]]], upper=True).L.clone()
+    others = r.diagonal(dim1=-2, dim2=-1)[..., :-1].prod(-1)
+    r[..., -1, -1] = (
+        area_element(g) / others
+    )  # rounded as for numbers: needles have hardly any area
+    one = torch.eye(r.shape[-1], dtype=r.dtype).expand_as(r)
+    inverse = torch.linalg.solve_triangular(r, one, upper=True)
+    row, col = torch.triu_indices(*r.shape[-2:])
+    return (inverse @ (q.mT @ a @ q) @ inverse.mT)[..., row, col]
+
+
 def element_matrices(
-    g: Float[Tensor, "T Q S"], shape: Element, conductivity: Float[Tensor, "T Q"] | None = None
+    g: Float[Tensor, "T Q S"],
+    shape: Element,
+    conductivity: Tensor | None = None,
+    density: Float[Tensor, "T Q"] | None = None,
 ) -> Complex[Tensor, "T n_times_n"]:
-    """Element matrices K + iM: K = ∫ κ∇φ_i·∇φ_j, ℓ^{d−2}, and M = ∫ φ_i φ_j, ℓ^d; κ = 1 by default.
+    """Element matrices K + iM: K = ∫ A∇φ_i·∇φ_j, ℓ^{d−2}, and M = ∫ ρφ_i φ_j, ℓ^d; A, as in `conductance`, and ρ are 1.
 
     Both are real and share a pattern; packed into one complex matrix they are assembled and multiplied together.
     """
@@ -96,12 +139,11 @@ def element_matrices(
     blocks = torch.empty(len(g), masses.shape[1], dtype=torch.complex128)
     for first in range(0, len(g), AT_ONCE):
         part = slice(first, first + AT_ONCE)
-        root = area_element(g[part])
-        inverse = cofactors(g[part]) * (shape.weights / root)[..., None]
-        if conductivity is not None:
-            inverse = conductivity[part, :, None] * inverse
-        stiffness = inverse.flatten(1) @ gradients
-        blocks[part] = torch.complex(stiffness, (shape.weights * root) @ masses)
+        kappa, rho = (None if x is None else x[part] for x in (conductivity, density))
+        entries = shape.weights[:, None] * conductance(g[part], kappa)
+        size = shape.weights * area_element(g[part])
+        mass = (size if rho is None else rho * size) @ masses
+        blocks[part] = torch.complex(entries.flatten(1) @ gradients, mass)
     return blocks
 
 
@@ -130,21 +172,30 @@ def linear_elements(
     lengths: Float[Tensor, "T e"],
     cells: Int[Tensor, "T corners"],
     num_points: int,
-    conductivity: Float[Tensor, " T"] | None = None,
+    conductivity: Tensor | None = None,
+    density: Float[Tensor, " T"] | None = None,
     *,
     shares: Float[Tensor, " T"] | None = None,
-    lumped: bool = False,
+    lumped: Float[Tensor, " N"] | None = None,
 ) -> sparse.csr_array:
-    """K + iM of P1 elements on flat simplices with these edge lengths, weighted by `shares`; M lumped on request."""
+    """K + iM of P1 elements on flat simplices with these edge lengths, weighted by `shares`.
+
+    The conductivity, a number (T,) or a tensor as `in_cells` has it, (T, S), and the density are constant in each. With
+    factors `lumped` for the points, M is lumped in equal shares to the corners, times these.
+    """
     shape, g = simplex(cells.shape[1] - 1, 1), flat_metric(lengths)
-    points = len(shape.weights)
-    kappa = None if conductivity is None else conductivity[:, None].expand(-1, points)
-    blocks = element_matrices(g[:, None].expand(-1, points, -1), shape, kappa)
-    if lumped:
-        corners = cells.shape[1]
+    medium = [None if x is None else spread(x, shape) for x in (conductivity, density)]
+    blocks = element_matrices(spread(g, shape), shape, *medium)
+    if lumped is not None:
+        corners, total = cells.shape[1], blocks.imag.sum(1, keepdim=True)
         blocks.imag.zero_()
-        blocks.imag[:, :: corners + 1] = (area_element(g) * shape.weights.sum() / corners)[:, None]
+        blocks.imag[:, :: corners + 1] = lumped[cells] * total / corners
     return summed(blocks if shares is None else shares[:, None] * blocks, cells, num_points)
+
+
+def spread(x: Tensor, shape: Element) -> Tensor:
+    """A value for each cell, (T, …), at its Gauss points, (T, Q, …)."""
+    return x[:, None].expand(-1, len(shape.weights), *x.shape[1:])
 
 
 def summed(
@@ -159,3 +210,20 @@ def summed(
     del entries
     result.data, result.indices = result.data.copy(), result.indices.copy()  # without duplicates
     return result
+
+
+def upper_congruence(p: Any, matrix: sparse.csr_array) -> sparse.csr_array:
+    """Upper triangle of the symmetric PᵀAP, computed in blocks of rows."""
+    left, parts, count = sparse.csr_array(p.T), [], p.shape[1]
+    for first in range(0, count, AT_ONCE):
+        part: Any = left[first : first + AT_ONCE] @ matrix @ p
+        row = np.arange(first, first + part.shape[0], dtype=np.int32).repeat(np.diff(part.indptr))
+        upper = np.flatnonzero(part.indices >= row)
+        length = np.bincount(row[upper] - first, minlength=part.shape[0])
+        parts.append((length, part.indices.take(upper), part.data.take(upper)))
+    indptr = np.concatenate([[0], *(length for length, *_ in parts)]).cumsum()
+    indices, data = np.empty(indptr[-1], np.int32), np.empty(indptr[-1], parts[0][2].dtype)
+    for first in range(0, count, AT_ONCE):
+        place = slice(indptr[first], indptr[min(first + AT_ONCE, count)])
+        _, indices[place], data[place] = parts.pop(0)  # which frees it
+    return sparse.csr_array((data, indices, indptr), shape=(count, count))

@@ -1,10 +1,11 @@
-"""Stiffness and mass of a complex from its elements, for any conductivity, and derivatives in it (`method.md`, 10)."""
+"""Stiffness and mass of a complex from its elements, in any medium, and bilinear forms of both (`method.md`, 17)."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, NamedTuple
+from functools import cache, partial
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 import torch
@@ -14,25 +15,42 @@ from torch import Tensor
 
 from torchlb.galerkin.assembly import (
     area_element,
-    cofactors,
+    conductance,
     element_matrices,
     flat_metric,
     gradient_products,
+    in_cells,
     linear_elements,
+    spread,
     squares,
     summed,
+    upper_congruence,
 )
 from torchlb.galerkin.curving import CurvedMesh, CurvingPlan
 from torchlb.galerkin.delaunay import sound_lengths
 from torchlb.galerkin.elements import Element, simplex, subsets
+from torchlb.galerkin.medium import Field, Medium
 from torchlb.galerkin.prolongation import prolongation
 from torchlb.geometry.local_fits import FitPlan, LocalFits
 from torchlb.geometry.numbering import Numbering
 from torchlb.geometry.vectors import at
 from torchlb.linalg.once import once_differentiable
-from torchlb.linalg.precision import AT_ONCE, rows_at_once
+from torchlb.linalg.precision import rows_at_once
 
-Density = Callable[[Tensor, Element, Tensor], Tensor]
+Linear = Callable[[Tensor], Tensor]
+FIELDS = {"stiffness": "conductivity", "mass": "density", "potential": "potential"}
+
+
+class BilinearForm(NamedTuple):
+    """Σ_k c_k w_kᵀA u_k of constant functions w, u (N, C) and numbers c (C,).
+
+    A is K, "stiffness"; M, "mass"; ∫cwu of the potential c, "potential"; or the mass of the vertices, "lumped".
+    """
+
+    name: Literal["stiffness", "mass", "potential", "lumped"]
+    w: Float[Tensor, "N C"]
+    u: Float[Tensor, "N C"]
+    c: Float[Tensor, " C"]
 
 
 class FlatCells(NamedTuple):
@@ -47,7 +65,7 @@ class FlatCells(NamedTuple):
     share
         Fraction of each simplex that is integrated.
     lumped
-        Whether the mass is lumped in equal shares to the corners.
+        (N,), factors of the mass, which is lumped in equal shares to the corners; None where it is not.
     mix
         (T, F), share of each face of the mesh in a cell; None where the cells replace no faces.
     """
@@ -55,16 +73,21 @@ class FlatCells(NamedTuple):
     cells: Int[Tensor, "T corners"]
     lengths: Float[Tensor, "T e"]
     share: float
-    lumped: bool
+    lumped: Float[Tensor, " N"] | None
     mix: Any
 
 
 @dataclass(frozen=True)
 class Forms:
-    """Elements of a weak pair, which assemble its stiffness for any conductivity.
+    """Elements of a weak pair, which assemble it for any medium.
+
+    The values of a field of the medium are a list: at the Gauss points of the curved elements, (T, Q, …), and the mean
+    on each flat cell, (F, …), for each lot of these; a field that is left out is 1.
 
     Attributes
     ----------
+    points, places
+        (N, n), (NX, n), vertices and nodes, ℓ.
     cells, lengths
         (T, d + 1), (T, e), ℓ: simplices, and their edge lengths in the order of `subsets`.
     faces
@@ -85,12 +108,14 @@ class Forms:
         Flat simplices beside these.
     """
 
+    points: Float[Tensor, "N n"]
+    places: Float[Tensor, "NX n"]
     cells: Int[Tensor, "T corners"]
     lengths: Float[Tensor, "T e"]
     faces: Int[Tensor, " T"]
     num_faces: int
     prolongation: Any
-    nodes: Int[Tensor, "T n"]
+    nodes: Int[Tensor, "T lattice"]
     metric: Float[Tensor, "T Q S"]
     element: Element
     shares: Float[Tensor, " T"] | None
@@ -116,10 +141,11 @@ class Forms:
         if mesh.cover is not None:
             same: Any = sparse.eye_array(len(own), format="csr")
             mix = mesh.cover.mixed() @ same[plan.coarse.numpy()]
-            flats.append(FlatCells(mesh.cover.faces, mesh.cover.lengths, 0.5, True, mix))
+            one = torch.ones(len(fits.points), dtype=torch.float64)
+            flats.append(FlatCells(mesh.cover.faces, mesh.cover.lengths, 0.5, one, mix))
         if len(stars):
             lengths = sound_lengths(edge_lengths(fits.points, stars), stars)
-            flats.append(FlatCells(stars, lengths, 1 / stars.shape[1], False, None))
+            flats.append(FlatCells(stars, lengths, 1 / stars.shape[1], None, None))
         p = prolongation(fit_plan, fits, plan, mesh) if prolong else None
         every = torch.arange(len(own))
         parts = nodes.cells, mesh.lengths, every, nodes.elements, mesh.metric
@@ -127,16 +153,28 @@ class Forms:
             parts, shares = [x[own] for x in parts], None if shares is None else shares[own]
         cells, lengths, faces, elements, metric = parts
         curved = p, elements, metric, simplex(nodes.dim, nodes.degree)
-        return cls(cells, lengths, faces, len(own), *curved, shares, flats)
+        flat = fits.points, mesh.places, cells, lengths, faces, len(own)
+        return cls(*flat, *curved, shares, flats)
 
     @classmethod
-    def linear(cls, points: Float[Tensor, "N n"], faces: Int[Tensor, "F corners"]) -> Forms:
-        """Build P1 elements, whose stiffness for κ = 1 is the cotangent matrix."""
+    def linear(
+        cls,
+        points: Float[Tensor, "N n"],
+        faces: Int[Tensor, "F corners"],
+        mass: Float[Tensor, " N"],
+    ) -> Forms:
+        """Build flat P1 elements, whose stiffness for κ = 1 is the cotangent matrix, with a lumped mass."""
         lengths, element = edge_lengths(points, faces), simplex(faces.shape[1] - 1, 1)
-        metric = flat_metric(lengths)[:, None].expand(-1, len(element.weights), -1)
-        same: Any = sparse.eye_array(len(points), format="csr")
-        every = torch.arange(len(faces))
-        return cls(faces, lengths, every, len(faces), same, faces, metric, element, None, [])
+        corners, same = faces.shape[1], sparse.eye_array(len(points), format="csr")
+        area = area_element(flat_metric(lengths)) * element.weights.sum() / corners
+        shares = torch.zeros_like(mass).index_add(
+            0, faces.flatten(), area.repeat_interleave(corners)
+        )
+        whole: Any = sparse.eye_array(len(faces), format="csr")
+        flats = [FlatCells(faces, lengths, 1.0, mass / shares, whole)]
+        metric = flat_metric(lengths[:0])[:, None].expand(-1, len(element.weights), -1)
+        curved = faces[:0], lengths[:0], faces[:0, 0], len(faces), same, faces[:0], metric, element
+        return cls(points, points, *curved, None, flats)
 
     def restored(self, numbering: Numbering, order: Int[Tensor, " G"], num_faces: int) -> Forms:
         """Renumber to the user's points and `num_faces` faces; `order` has the user's numbers of the faces here."""
@@ -144,12 +182,14 @@ class Forms:
         flats = [
             flat._replace(
                 cells=given[flat.cells],
+                lumped=None if flat.lumped is None else numbering.restored(flat.lumped),
                 mix=None if flat.mix is None else _renumbered(flat.mix, order, num_faces),
             )
             for flat in self.flats
         ]
         return replace(
             self,
+            points=numbering.restored(self.points),
             cells=given[self.cells],
             faces=order[self.faces],
             num_faces=num_faces,
@@ -157,95 +197,129 @@ class Forms:
             flats=flats,
         )
 
-    def conductivities(self, conductivity: Tensor) -> list[Tensor]:
-        """Return κ at the Gauss points, (T, Q), and its means on flat cells; differentiable.
+    def values(self, field: Field, prolong: Linear | None = None) -> list[Tensor]:
+        """Values of a field, differentiable in it.
 
-        The conductivity is given per vertex, (N,), or per face, (F,) with F ≠ N. From vertices its logarithm is
-        prolonged, which keeps κ positive, and of high order where the fits are.
+        From vertices the logarithm of a positive field is prolonged, which keeps it positive, and of high order where
+        the fits are; a field that may be zero is prolonged as it is, and cut off at zero. `prolong` takes functions to
+        the nodes where the matrix P does not.
         """
-        if len(conductivity) != self.prolongation.shape[1]:
-            points = conductivity[self.faces, None].expand(-1, len(self.element.weights))
-            return [points, *(_prolonged(conductivity, flat.mix) for flat in self.flats)]
-        log = conductivity.log()
-        found = [(_prolonged(log, self.prolongation)[self.nodes] @ self.element.values.T).exp()]
+        x, corners = field.values, simplex(self.element.dim, 1)
+        if field.on_faces:
+            own = spread(x[self.faces], self.element)
+            return [own, *(_along(partial(_times, flat.mix), x) for flat in self.flats)]
+        before, after = field.transforms
+        y = before(x)
+        nodes = at(_along(prolong or partial(_times, self.prolongation), y), self.nodes)
+        found = [after(torch.einsum("qn,tn...->tq...", self.element.values, nodes))]
         for flat in self.flats:
-            shape = simplex(self.element.dim, 1)
-            means = (log[flat.cells] @ shape.values.T).exp() @ shape.weights
-            found.append(means / shape.weights.sum())
+            inside = after(torch.einsum("qc,tc...->tq...", corners.values, at(y, flat.cells)))
+            found.append(_mean(inside, corners))
         return found
 
-    def matrix(self, conductivities: list[Tensor] | None = None) -> sparse.csr_array:
-        """Upper triangle of K + iM, (N, N), positive semidefinite for every κ > 0; the rows of K sum to zero."""
-        kappa = None if conductivities is None else conductivities[0]
-        elements = summed(self.blocks(kappa), self.nodes, self.prolongation.shape[0])
-        return upper_congruence(self.prolongation, elements) + self.flat(conductivities)
+    def matrix(
+        self, conductivity: list[Tensor] | None = None, density: list[Tensor] | None = None
+    ) -> sparse.csr_array:
+        """Upper triangle of K + iM, (N, N), positive semidefinite in every medium; the rows of K sum to zero."""
+        elements = summed(
+            self.blocks(conductivity, density), self.nodes, self.prolongation.shape[0]
+        )
+        return upper_congruence(self.prolongation, elements) + self.flat(conductivity, density)
 
-    def blocks(self, conductivity: Float[Tensor, "T Q"] | None = None) -> Tensor:
+    def blocks(
+        self, conductivity: list[Tensor] | None = None, density: list[Tensor] | None = None
+    ) -> Tensor:
         """Element matrices K_FE + iM_FE of the curved elements, (T, n²)."""
-        blocks = element_matrices(self.metric, self.element, conductivity)
+        kappa = None if conductivity is None else self._on_curved(conductivity[0])
+        rho = None if density is None else density[0]
+        blocks = element_matrices(self.metric, self.element, kappa, rho)
         return blocks if self.shares is None else self.shares[:, None] * blocks
 
     def near(
-        self, conductivities: list[Tensor] | None = None, flat: Any = None
+        self,
+        conductivity: list[Tensor] | None = None,
+        density: list[Tensor] | None = None,
+        flat: Any = None,
     ) -> sparse.csr_array:
-        """Upper triangle of K₁ + iM₁ of P1 elements on flat simplices, with the mean of κ on each.
+        """Upper triangle of K₁ + iM₁ of P1 elements on flat simplices, with the mean of the medium on each.
 
         `flat` has the part of the flat cells, if it is known.
         """
-        means = None
-        if conductivities is not None:
-            means = conductivities[0] @ self.element.weights / self.element.weights.sum()
-        count = self.prolongation.shape[1]
-        own = linear_elements(self.lengths, self.cells, count, means, shares=self.shares)
-        upper: Any = sparse.triu(own, format="csr")
+        kappa, rho = (
+            None if x is None else _mean(x[0], self.element) for x in (conductivity, density)
+        )
+        kappa = self._on_flat(kappa, self.cells, self.lengths)
+        own = linear_elements(
+            self.lengths, self.cells, len(self.points), kappa, rho, shares=self.shares
+        )
+        triangle: Any = sparse.triu(own, format="csr")
         if not self.flats:
-            return upper
-        return upper + (self.flat(conductivities) if flat is None else flat)
+            return triangle
+        return triangle + (self.flat(conductivity, density) if flat is None else flat)
 
-    def flat(self, conductivities: list[Tensor] | None = None) -> sparse.csr_array:
+    def flat(
+        self, conductivity: list[Tensor] | None = None, density: list[Tensor] | None = None
+    ) -> sparse.csr_array:
         """Upper triangle of K + iM of the flat cells."""
-        count = self.prolongation.shape[1]
+        count = len(self.points)
         total: Any = sparse.csr_array((count, count), dtype=complex)
         for number, flat in enumerate(self.flats, 1):
-            kappa = None if conductivities is None else conductivities[number]
-            part = linear_elements(flat.lengths, flat.cells, count, kappa, lumped=flat.lumped)
+            kappa, rho = (None if x is None else x[number] for x in (conductivity, density))
+            kappa = self._on_flat(kappa, flat.cells, flat.lengths)
+            part = linear_elements(flat.lengths, flat.cells, count, kappa, rho, lumped=flat.lumped)
             total = total + flat.share * sparse.triu(part, format="csr")
         return total
 
-    def sensitivity(self, w: Float[Tensor, "N C"], u: Float[Tensor, "N C"]) -> list[Tensor]:
-        """∂/∂κ of Σ_c w_cᵀK(κ)u_c, in the shapes of `conductivities`: quadrature weights times ∇w·∇u."""
-        at_nodes = [torch.from_numpy(self.prolongation @ x.numpy()) for x in (w, u)]
-        own, *flat = self.densities(_slopes, at_nodes, [w, u], torch.ones(w.shape[1]).to(w))
-        return [own, *(each.sum(1) for each in flat)]
+    def bilinear(self, forms: Sequence[BilinearForm], medium: Medium) -> Float[Tensor, ""]:
+        """Σ of bilinear forms, differentiable in the medium; those of "lumped", which depend on no medium, are 0."""
+        values, total = {name: self.values(field) for name, field in medium.items()}, []
+        prolong = cache(
+            partial(_times, self.prolongation)
+        )  # a function that stands in two forms is one
+        for form in forms:
+            if form.name != "lumped":
+                total.append(self.form(form, [prolong(form.w), prolong(form.u)], values))
+        return torch.stack(total).sum()
 
     def form(
-        self, name: str, nodes: list[Tensor], corners: list[Tensor], c: Float[Tensor, " C"]
+        self, form: BilinearForm, nodes: list[Tensor], medium: Mapping[str, list[Tensor]]
     ) -> Float[Tensor, ""]:
-        """Σ_k c_k w_kᵀK u_k, of "stiffness", or Σ_k c_k w_kᵀM u_k, from w and u at the nodes and at the vertices."""
-        density = _slopes if name == "stiffness" else _products
-        parts = self.densities(density, nodes, corners, c)
-        return torch.stack([part.sum() for part in parts]).sum()
-
-    def densities(
-        self, density: Density, nodes: list[Tensor], corners: list[Tensor], c: Float[Tensor, " C"]
-    ) -> list[Tensor]:
-        """A density of two functions times the quadrature weights, differentiable in metric and functions.
-
-        Of the curved elements, (T, Q), and of each lot of flat cells, (F, Q).
-        """
-        own = density(self.metric, self.element, _outer(self.nodes, nodes, c))
-        found = [own if self.shares is None else self.shares[:, None] * own]
-        for flat in self.flats:
+        """The value of a form, from its functions at the nodes and the values of the medium; differentiable in all."""
+        stiffness, corners, c = form.name == "stiffness", [form.w, form.u], form.c
+        values, density = medium.get(FIELDS.get(form.name, "")), _slopes if stiffness else _products
+        coefficient = None if values is None else values[0]
+        coefficient = self._on_curved(coefficient) if stiffness else coefficient
+        own = density(self.metric, self.element, _outer(self.nodes, nodes, c), coefficient)
+        total = [own.sum() if self.shares is None else (self.shares[:, None] * own).sum()]
+        for number, flat in enumerate(self.flats, 1):
             shape = simplex(self.element.dim, 1)
-            metric = flat_metric(flat.lengths)[:, None].expand(-1, len(shape.weights), -1)
+            metric = spread(flat_metric(flat.lengths), shape)
             blocks = _outer(flat.cells, corners, c)
-            if flat.lumped and density is _products:
-                share = area_element(metric[:, 0]) * shape.weights.sum() / flat.cells.shape[1]
-                part = share[:, None] * blocks[:, :: flat.cells.shape[1] + 1]
-            else:
-                part = density(metric, shape, blocks)
-            found.append(flat.share * part)
-        return found
+            mean = None if values is None else values[number]
+            mean = self._on_flat(mean, flat.cells, flat.lengths) if stiffness else mean
+            if flat.lumped is not None and not stiffness:
+                own = flat.lumped[flat.cells] * blocks[:, :: flat.cells.shape[1] + 1]
+                blocks = own.mean(1, keepdim=True).expand_as(blocks)
+            mean = None if mean is None else spread(mean, shape)
+            total.append(flat.share * density(metric, shape, blocks, mean).sum())
+        return torch.stack(total).sum()
+
+    def _on_curved(self, a: Tensor | None) -> Tensor | None:
+        """A conductivity as `conductance` takes it, at the Gauss points of the curved elements."""
+        if a is None or a.ndim == 2:
+            return a
+        places = at(self.places, self.nodes)
+        slopes = torch.einsum("tnk,qnd->tqkd", places, self.element.gradients)
+        return in_cells(a, slopes, self.metric)
+
+    def _on_flat(
+        self, a: Tensor | None, cells: Int[Tensor, "T corners"], lengths: Float[Tensor, "T e"]
+    ) -> Tensor | None:
+        """As `_on_curved`, on flat cells; their plane is that of their corners, whatever the edge lengths are."""
+        if a is None or a.ndim == 1:
+            return a
+        corners = at(self.points, cells)
+        return in_cells(a, (corners[:, 1:] - corners[:, :1]).mT, flat_metric(lengths))
 
 
 def edge_lengths(
@@ -254,23 +328,6 @@ def edge_lengths(
     """Lengths of the edges of each cell, in the order of `subsets`, ℓ."""
     ends = points[cells[:, [list(pair) for pair in subsets(cells.shape[1] - 1, 2)]]]
     return (ends[:, :, 1] - ends[:, :, 0]).norm(dim=2)
-
-
-def upper_congruence(p: Any, matrix: sparse.csr_array) -> sparse.csr_array:
-    """Upper triangle of the symmetric PᵀAP, computed in blocks of rows."""
-    left, parts, count = sparse.csr_array(p.T), [], p.shape[1]
-    for first in range(0, count, AT_ONCE):
-        part: Any = left[first : first + AT_ONCE] @ matrix @ p
-        row = np.arange(first, first + part.shape[0], dtype=np.int32).repeat(np.diff(part.indptr))
-        upper = np.flatnonzero(part.indices >= row)
-        length = np.bincount(row[upper] - first, minlength=part.shape[0])
-        parts.append((length, part.indices.take(upper), part.data.take(upper)))
-    indptr = np.concatenate([[0], *(length for length, *_ in parts)]).cumsum()
-    indices, data = np.empty(indptr[-1], np.int32), np.empty(indptr[-1], parts[0][2].dtype)
-    for first in range(0, count, AT_ONCE):
-        place = slice(indptr[first], indptr[min(first + AT_ONCE, count)])
-        _, indices[place], data[place] = parts.pop(0)  # which frees it
-    return sparse.csr_array((data, indices, indptr), shape=(count, count))
 
 
 def _renumbered(matrix: Any, columns: Int[Tensor, " C"], count: int) -> sparse.csr_array:
@@ -288,33 +345,51 @@ def _outer(
 
 
 def _slopes(
-    metric: Float[Tensor, "T Q S"], element: Element, blocks: Float[Tensor, "T n_times_n"]
+    metric: Float[Tensor, "T Q S"],
+    element: Element,
+    blocks: Float[Tensor, "T n_times_n"],
+    conductivity: Tensor | None,
 ) -> Float[Tensor, "T Q"]:
-    """Quadrature weights times Σ_k c_k ∇w_k·∇u_k at the Gauss points."""
-    entries = zip(cofactors(metric).unbind(-1), gradient_products(element).unbind(1), strict=True)
-    total = torch.stack([entry * (blocks @ cross.T) for entry, cross in entries]).sum(0)
-    return element.weights * total / area_element(metric)
+    """Quadrature weights times Σ_k c_k A∇w_k·∇u_k at the Gauss points."""
+    entries = conductance(metric, conductivity).unbind(-1)
+    crosses = gradient_products(element).unbind(1)
+    total = [entry * (blocks @ cross.T) for entry, cross in zip(entries, crosses, strict=True)]
+    return element.weights * torch.stack(total).sum(0)
 
 
 def _products(
-    metric: Float[Tensor, "T Q S"], element: Element, blocks: Float[Tensor, "T n_times_n"]
+    metric: Float[Tensor, "T Q S"],
+    element: Element,
+    blocks: Float[Tensor, "T n_times_n"],
+    density: Tensor | None,
 ) -> Float[Tensor, "T Q"]:
-    """Quadrature weights times Σ_k c_k w_k u_k at the Gauss points."""
-    return element.weights * area_element(metric) * (blocks @ squares(element).T)
+    """Quadrature weights times Σ_k c_k ρ w_k u_k at the Gauss points."""
+    found = element.weights * area_element(metric) * (blocks @ squares(element).T)
+    return found if density is None else density * found
 
 
-class _Prolonged(torch.autograd.Function):
-    """P x for a vector x."""
+def _mean(values: Float[Tensor, "T Q ..."], element: Element) -> Float[Tensor, "T ..."]:
+    """Mean over each cell of values at its Gauss points."""
+    return torch.einsum("q,tq...->t...", element.weights / element.weights.sum(), values)
+
+
+def _along(linear: Linear, x: Tensor) -> Tensor:
+    """A linear map of functions (N, C) applied to x, (N, …)."""
+    return linear(x.reshape(len(x), -1)).view(-1, *x.shape[1:])
+
+
+class _Times(torch.autograd.Function):
+    """A sparse matrix times functions (N, C)."""
 
     @staticmethod
-    def forward(ctx: Any, x: Tensor, matrix: Any) -> Tensor:  # pyright: ignore[reportIncompatibleMethodOverride]
+    def forward(ctx: Any, matrix: Any, x: Tensor) -> Tensor:  # pyright: ignore[reportIncompatibleMethodOverride]
         ctx.matrix = matrix
         return torch.from_numpy(np.asarray(matrix @ x.detach().numpy()))
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, g: Tensor) -> tuple[Any, ...]:  # pyright: ignore[reportIncompatibleMethodOverride]
-        return torch.from_numpy(np.asarray(ctx.matrix.T @ g.numpy())), None
+        return None, torch.from_numpy(np.asarray(ctx.matrix.T @ g.numpy()))
 
 
-_prolonged: Any = _Prolonged.apply
+_times: Any = _Times.apply

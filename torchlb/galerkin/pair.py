@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
-from typing import Any, Literal, NamedTuple
+from functools import cached_property, partial
+from typing import Any
 
 import numpy as np
 import torch
@@ -13,12 +13,19 @@ from jaxtyping import Bool, Float, Int
 from scipy import sparse
 from torch import Tensor
 
-from torchlb.galerkin.assembly import area_element, assemble_mass, metric, summed
+from torchlb.galerkin.assembly import (
+    area_element,
+    assemble_mass,
+    metric,
+    summed,
+    upper_congruence,
+)
 from torchlb.galerkin.boundary import boundary_nodes
 from torchlb.galerkin.coarse import boundary_shares
 from torchlb.galerkin.curving import CurvedMesh, CurvingPlan, curve
 from torchlb.galerkin.elements import simplex
-from torchlb.galerkin.forms import Forms, upper_congruence
+from torchlb.galerkin.forms import BilinearForm, Forms
+from torchlb.galerkin.medium import Medium
 from torchlb.galerkin.nodes import lagrange_nodes
 from torchlb.galerkin.prolongation import prolonged
 from torchlb.geometry.local_fits import FitPlan, LocalFits
@@ -129,15 +136,6 @@ ELEMENTS = {1: (2, (2,)), 2: (2, (2,)), 3: (2, (3, 2)), 4: (3, (4, 2)), 5: (4, (
 """Degree r of the elements and degrees m of the fits of functions, best first, for each order p; p > 5 as p = 5."""
 
 
-class BilinearForm(NamedTuple):
-    """Σ_k c_k w_kᵀA u_k of constant functions w, u (N, C) and numbers c (C,), A by its name."""
-
-    name: Literal["stiffness", "mass", "lumped"]
-    w: Float[Tensor, "N C"]
-    u: Float[Tensor, "N C"]
-    c: Float[Tensor, " C"]
-
-
 @dataclass(frozen=True)
 class PairPlan:
     """Plan of the weak pair of a complex of d-simplices.
@@ -178,13 +176,17 @@ class PairPlan:
         mesh = self.curving.at(fits.points, self.fits, fits)
         return assembled_pair(self, fits, mesh, numbering, self.patterns)[0]
 
-    def bilinear(self, fits: LocalFits, forms: Sequence[BilinearForm]) -> Float[Tensor, ""]:
-        """Σ of bilinear forms, differentiable in the points of the fits: no matrix is made.
+    def bilinear(
+        self, fits: LocalFits, forms: Sequence[BilinearForm], medium: Medium
+    ) -> Float[Tensor, ""]:
+        """Σ of bilinear forms, differentiable in the points of the fits and in the medium: no matrix is made.
 
         "lumped" is "mass" with the rows of P that the mass of the vertices is found by: with w = 1 it is Σ_i m_i u_i.
         """
         mesh = self.curving.at(fits.points, self.fits, fits)
         elements = self.forms(fits, mesh, prolong=False)
+        prolong = partial(prolonged, self.fits, fits, self.curving, mesh)
+        values = {name: elements.values(field, prolong) for name, field in medium.items()}
         flat = self.curving.bent.index_fill(0, self.lowered, False)
         total = []
         for lumped, curving in ((False, self.curving), (True, replace(self.curving, bent=flat))):
@@ -197,7 +199,7 @@ class PairPlan:
                 nodes = dict(zip(functions, at_nodes, strict=True))
                 for form in chosen:
                     both = [nodes[id(form.w)], nodes[id(form.u)]]
-                    total.append(elements.form(form.name, both, [form.w, form.u], form.c))
+                    total.append(elements.form(form, both, values))
         return torch.stack(total).sum()
 
     @property

@@ -7,8 +7,9 @@ any size loads into them, and they are joined to batches and split again.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from copy import copy
 from itertools import accumulate
-from typing import Any
+from typing import Any, TypeVar
 
 import torch
 from jaxtyping import Float, Int, Shaped
@@ -19,6 +20,8 @@ from torch.nn.functional import pad
 from torchlb.errors import InputError
 from torchlb.linalg.checks import check_tensor
 from torchlb.linalg.sparse import csr_product, csr_tensor, to_scipy, transpose_pattern
+
+Held = TypeVar("Held", bound="Tensors")
 
 
 def starts(counts: Sequence[int]) -> list[int]:
@@ -63,6 +66,16 @@ class Tensors(nn.Module):
             if name in held:
                 return held[name]
         return super().__getattr__(name)
+
+    def alias(self: Held) -> Held:
+        """A module of the same tensors, which is moved and cast by itself."""
+        other = copy(self)
+        other._buffers = dict(self._buffers)
+        other._modules = {
+            name: module.alias() if isinstance(module, Tensors) else module
+            for name, module in self._modules.items()
+        }
+        return other
 
     @property
     def tensors(self) -> dict[str, Tensor]:

@@ -92,6 +92,7 @@ def join_states(states: Sequence[dict[str, Any]], sizes: Sequence[int]) -> dict[
         "sizes": list(sizes),
         "radius": None if any(each is None for each in known) else max(known),
         "parts": parts,
+        "medium": any(part.get("medium") for part in parts),
     }
 
 

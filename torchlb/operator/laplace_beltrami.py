@@ -21,21 +21,20 @@ from torchlb.operator.batching import (
     join_states,
     joined_parts,
     remember_shapes,
+    shapes_of,
     split_parts,
 )
 from torchlb.operator.build_cloud import Reconstruction, build_cloud, built_again
 from torchlb.operator.inputs import ArrayLike, check_points, float_type, warn_of_gradients
+from torchlb.operator.medium import checked_fields, pair_in, split_fields
 from torchlb.operator.options import Options
-from torchlb.operator.pair_methods import MatrixName, PairMethods
-from torchlb.operator.parts import Modes, PairMatrices
+from torchlb.operator.pair_methods import PairMethods
+from torchlb.operator.parts import MediumFields, Modes, PairMatrices
 from torchlb.operator.plan import Plan, evaluate
 from torchlb.operator.stencil_methods import StencilMethods
 from torchlb.operator.storage import FIT_FIELDS, ROW_FIELDS
-from torchlb.operator.through import carrying, through_product
-from torchlb.spectral.eigenbasis import (
-    stack_eigenbases,
-    unstack_eigenbases,
-)
+from torchlb.operator.through import carrying, origins
+from torchlb.spectral.eigenbasis import stack_eigenbases, unstack_eigenbases
 from torchlb.stencils.conditions import Condition, ConditionName
 
 
@@ -238,6 +237,7 @@ class LaplaceBeltrami(StencilMethods, PairMethods):
             basis = stack_eigenbases(bases) if len(bases) == len(shapes) else None
             joined = cls.of_parts(joined_parts(shapes), state, basis)
         remember_shapes(joined, shapes)
+        joined._carries = any(origins(shape) is not None for shape in shapes)
         return joined
 
     @property
@@ -289,27 +289,56 @@ class LaplaceBeltrami(StencilMethods, PairMethods):
         with torch.inference_mode(False):
             built = replace(evaluate(self.plan, there), surface=self.surface, plan=self.plan)
             lb = self._from_assembled(built, points).to(self.device)
-        return carrying(lb, points)
+        lb = carrying(lb, points)
+        if not self._in_medium:
+            return lb
+        if not self._medium.tensors:
+            raise InputError(
+                "at: the medium of this operator is not known, as it comes from a batch"
+            )
+        return lb.with_medium(**self._medium.tensors)
 
-    def product(self, name: MatrixName, f: Tensor) -> Tensor:
-        """A matrix of the operator times f, of the shape of f, differentiable in f any number of times.
+    def with_medium(
+        self,
+        conductivity: Tensor | float | None = None,
+        density: Tensor | float | None = None,
+        potential: Tensor | float | None = None,
+    ) -> LaplaceBeltrami:
+        """The operator of −div(A∇u) + cu = λρu, for eigenpairs, flows, solves, layers: another weak pair on the shape.
 
-        Computed in the wider of the types of f and the operator, at least float32, also under autocast; only a
-        half-precision f gets its own type back. ``lb.stiffness @ f`` is torch's product, which needs equal types and,
-        on the CPU, no half precision.
+        Results are differentiable in A, ρ and c. Rows of Δ and ∇, `mass` and the frames are those of the shape; the
+        medium of this operator, if any, is replaced.
 
         Parameters
         ----------
-        name
-            "stiffness", "mass", "boundary_mass", as `to_scipy` has them; "laplacian" is ``lb(f)``.
-        f
-            (N,), (N, C) or (B, N, C), of any type.
+        conductivity
+            A: positive numbers at the vertices (N,), or on the faces (F,), if F ≠ N; or symmetric positive space
+            tensors, (N, n, n) or (F, n, n), of which the part along the surface counts; 1 by default. With a boundary,
+            fluxes and the condition are those of A∂_ν u.
+        density
+            ρ > 0, at either; 1 by default.
+        potential
+            c ≥ 0, 1/ℓ² if A has no unit, at either; 0 by default.
 
-        Raises InputError for another name or shape, and where there is no such matrix.
+        Each may be a number. From vertices the logarithms of A and ρ are prolonged as functions are, and c itself.
+        Raises InputError for other shapes and values, and without a weak pair.
+
+        >>> from torchlb.surfaces import Sphere
+        >>> lb = LaplaceBeltrami.from_mesh(*Sphere().mesh(300))
+        >>> lb.with_medium(density=4.0, potential=2.0).eigenbasis(2).eigenvalues.round(decimals=3).tolist()
+        [0.5, 1.0]
         """
-        matrices, channel = self._channel(name)
-        result = matrices.product(channel, f)
-        return through_product(self, name, f, result) if self.points.requires_grad else result
+        given = {"conductivity": conductivity, "density": density, "potential": potential}
+        if self.sizes is not None:
+            shapes = shapes_of(self) or self.unbatch()
+            parts = zip(shapes, split_fields(self, shapes, given), strict=True)
+            return self.batch([shape.with_medium(**own) for shape, own in parts])
+        with torch.inference_mode(False):
+            medium, lb = checked_fields(self, given), self.alias()
+            lb.weak = pair_in(self, medium.fields(self.num_points))
+            lb.modes, lb._medium, lb._in_medium = Modes(None, self.mass), medium, True
+        lb._plan, lb.cache.elements = self._plan, self.cache.elements
+        return lb
 
     def unbatch(self) -> list[LaplaceBeltrami]:
         """The operators of the shapes of a `batch`, with their certificates, spectral radii and eigenbases.
@@ -365,5 +394,5 @@ class LaplaceBeltrami(StencilMethods, PairMethods):
 
 # A whole module can be read back with torch.load(weights_only=True) where torchlb is imported.
 torch.serialization.add_safe_globals(
-    [LaplaceBeltrami, Csr, PairMatrices, Modes, Record, Certificate, SurfaceSummary]
+    [LaplaceBeltrami, Csr, PairMatrices, MediumFields, Modes, Record, Certificate, SurfaceSummary]
 )

@@ -9,14 +9,14 @@ from scipy import sparse
 from torch import Tensor
 
 from torchlb.errors import InputError
-from torchlb.galerkin.pair import BilinearForm
 from torchlb.linalg.csr import Csr
 from torchlb.linalg.sparse import csr_tensor, to_scipy
 from torchlb.linalg.threads import threads_for
 from torchlb.operator.batching import shapes_of
 from torchlb.operator.checks import check_tolerance
+from torchlb.operator.eigenpairs import BEYOND, through_eigenpairs
 from torchlb.operator.storage import OperatorStorage
-from torchlb.operator.through import known, refused
+from torchlb.operator.through import origins, through_product, without
 from torchlb.spectral.eigenbasis import (
     Eigenbasis,
     check_num_pairs,
@@ -71,9 +71,7 @@ class PairMethods(OperatorStorage):
 
     def _tensor(self, name: MatrixName) -> Tensor:
         matrices, channel = self._channel(name)
-        if not self.points.requires_grad:
-            return matrices.tensor(channel)
-        values = refused(self.points, matrices.values[channel], f"{name} as a tensor")
+        values = without(self, matrices.values[channel], f"{name} as a tensor")
         return csr_tensor(matrices.crow, matrices.col, values, self.num_points)
 
     def _channel(self, name: str) -> tuple[Csr, int]:
@@ -84,9 +82,29 @@ class PairMethods(OperatorStorage):
             return self.stencil, 0
         if not self.has_weak_form:
             raise InputError(NO_PAIR.format(name))
-        if name == "boundary_mass" and len(self.weak.values) < 3:
+        if name == "boundary_mass" and not self.weak.has_boundary:
             raise InputError("boundary_mass: the shape is closed")
         return self.weak, get_args(MatrixName).index(name) - 1
+
+    def product(self, name: MatrixName, f: Tensor) -> Tensor:
+        """A matrix of the operator times f, of the shape of f, differentiable in f any number of times.
+
+        Computed in the wider of the types of f and the operator, at least float32, also under autocast; only a
+        half-precision f gets its own type back. ``lb.stiffness @ f`` is torch's product, which needs equal types and,
+        on the CPU, no half precision.
+
+        Parameters
+        ----------
+        name
+            "stiffness", "mass", "boundary_mass", as `to_scipy` has them; "laplacian" is ``lb(f)``.
+        f
+            (N,), (N, C) or (B, N, C), of any type.
+
+        Raises InputError for another name or shape, and where there is no such matrix.
+        """
+        matrices, channel = self._channel(name)
+        result = matrices.product(channel, f)
+        return through_product(self, name, f, result)
 
     def to_scipy(self, name: MatrixName = "laplacian") -> sparse.csr_array:
         """Δ, or another matrix of the operator, as a scipy CSR matrix (N, N) on the CPU.
@@ -128,22 +146,9 @@ class PairMethods(OperatorStorage):
         InputError
             Without a weak pair.
         """
-        basis = self.invariant_basis(k, tolerance=tolerance, store=store).truncate(k)
-        return self._carried(basis) if self.points.requires_grad else basis
-
-    def _carried(self, basis: Eigenbasis) -> Eigenbasis:
-        """The basis with dλ = φᵀ(dK − λ dM)φ; in a cluster, symmetric functions of its eigenvalues have derivatives."""
-        points, vectors = self.points, basis.eigenvectors.cpu().double()
-        squares = basis.eigenvalues.cpu().double()
-
-        def forms(g: Tensor) -> list[BilinearForm]:
-            functions = vectors, vectors
-            of_mass = BilinearForm("mass", *functions, -g * squares)
-            return [BilinearForm("stiffness", *functions, g), of_mass]
-
-        values = known(self, basis.eigenvalues, "eigenvalues", forms)
-        modes, left = (refused(points, t, "eigenvectors") for t in (basis.eigenvectors, basis.left))
-        return Eigenbasis(values, modes, self.mass, left, self.sizes, basis.relative_errors)
+        count = check_num_pairs(k) + (0 if origins(self) is None else BEYOND)
+        basis = self.invariant_basis(count, tolerance=tolerance, store=store)
+        return through_eigenpairs(self, basis, k)
 
     def invariant_basis(
         self, k: int, *, tolerance: float | None = None, store: bool = False

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from collections import OrderedDict
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, get_args
 from weakref import finalize
 
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from torchlb.galerkin.medium import Field, FieldName
 from torchlb.linalg.csr import Csr, Tensors
 from torchlb.linalg.exponential import spectral_radius
 from torchlb.linalg.sparse import to_scipy
@@ -22,8 +23,8 @@ BASIS = ("eigenvalues", "eigenvectors", "left", "relative_errors")
 class PairMatrices(Csr):
     """The weak pair, and that of P1 elements beside it.
 
-    Channels are the stiffness K and the mass matrix M; with a boundary its mass matrix B; the term a condition adds to
-    K.
+    Channels are the stiffness K and the mass matrix M; with a boundary its mass matrix B; what a condition adds to K;
+    what a potential adds to K.
 
     Attributes
     ----------
@@ -45,13 +46,18 @@ class PairMatrices(Csr):
         self._radius: Tensor | None = None
 
     @property
+    def has_boundary(self) -> bool:
+        """Whether the shape has a boundary."""
+        return len(self.values) > 2 and bool(self.values[2].any())
+
+    @property
     def near(self) -> Csr:
         """The matrices of P1 elements, close to the pair and 20 times sparser."""
         return self.linear if self.linear.num_rows else self
 
     @property
     def pair(self) -> tuple[Tensor, Tensor, Tensor]:
-        """(crow, col, values (2, nnz)) of K, with the term of a condition, and of M: the pair in every computation."""
+        """(crow, col, values (2, nnz)) of K, with what is added to it, and of M: the pair in every computation."""
         return self.crow, self.col, _with_added(self.values)
 
     @property
@@ -60,10 +66,10 @@ class PairMatrices(Csr):
         return self.near.crow, self.near.col, _with_added(self.near.values)
 
     def losing(self, fixed: Bool[Tensor, " N"] | None) -> Bool[Tensor, " N"]:
-        """Mask of the points where a condition keeps constants out of the null space of K, `fixed` ones included."""
+        """Mask of the points where a condition or a potential keeps constants from the kernel of K; `fixed` too."""
         found = torch.zeros(self.num_rows, dtype=torch.bool, device=self.col.device)
         if len(self.near.values) > 3:
-            found = self.near.values[3, self.near.row == self.near.col] > 0
+            found = self.near.values[3:, self.near.row == self.near.col].sum(0) > 0
         return found if fixed is None else found | fixed
 
     @property
@@ -121,13 +127,36 @@ class PairMatrices(Csr):
         return PairMatrices(whole.crow, whole.col, values, near)
 
 
+class MediumFields(Tensors):
+    """The fields of a medium by `FieldName`; those that were not given are not there."""
+
+    def fields(self, num_points: int) -> dict[str, Field]:
+        """The fields, which are on the faces where there are not as many as points."""
+        return {
+            name: Field(values, len(values) != num_points, name != "potential")
+            for name, values in self.tensors.items()
+        }
+
+    def _load_from_state_dict(self, state_dict: Any, prefix: str, *given: Any) -> None:  # pyright: ignore[reportIncompatibleMethodOverride]
+        self._buffers.clear()
+        for name in get_args(FieldName):
+            if prefix + name in state_dict:
+                self.register_buffer(name, torch.zeros(0))
+        super()._load_from_state_dict(state_dict, prefix, *given)
+
+
 def _with_added(values: Float[Tensor, "terms nnz"]) -> Float[Tensor, "2 nnz"]:
-    """K + R and M, from K, M, B, R; the term R of a condition is stored only where there is one."""
-    return values[:2] if len(values) < 4 else torch.stack([values[0] + values[3], values[1]])
+    """K + R + C and M, from K, M, B, R, C; R of a condition and C of a potential are there only if needed."""
+    return (
+        values[:2] if len(values) < 4 else torch.stack([values[0] + values[3:].sum(0), values[1]])
+    )
 
 
 def _without_zeros(values: Float[Tensor, "terms nnz"]) -> Float[Tensor, "_ nnz"]:
-    return values[: 4 if values[3:].any() else 3 if values[2:].any() else 2]
+    count = len(values)
+    while count > 2 and not values[count - 1].any():
+        count -= 1
+    return values[:count]
 
 
 class Modes(Tensors):
@@ -196,7 +225,7 @@ class OperatorCache:
     systems
         Linear systems with their factors.
     elements
-        Elements of the weak pair, made for the first conductivity.
+        Elements of the weak pair, made for the first medium.
     shapes
         Shapes of a batch, whose caches serve it, each with the values that it had.
     """

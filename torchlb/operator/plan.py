@@ -11,13 +11,13 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache
 
-import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from torchlb.errors import DerivativeError, InputError, first_few, renumbered
-from torchlb.galerkin.forms import Forms
-from torchlb.galerkin.pair import BilinearForm, PairPlan
+from torchlb.errors import DerivativeError, InputError, renumbered
+from torchlb.galerkin.forms import BilinearForm, Forms
+from torchlb.galerkin.medium import Medium
+from torchlb.galerkin.pair import PairPlan
 from torchlb.geometry.numbering import Numbering
 from torchlb.linalg.threads import threads_for
 from torchlb.operator.assembled import AssembledOperator
@@ -74,26 +74,26 @@ class Plan:
         _, fits = self.shape.at(here)
         return self.pair.forms(fits).restored(self.numbering, self.order, len(self.faces))
 
-    def gradient(
-        self, points: Float[Tensor, "N n"], forms: Sequence[BilinearForm]
-    ) -> Float[Tensor, "N n"]:
-        """The derivative in the user's points of the sum of bilinear forms of functions at the user's points.
+    def bilinear(
+        self, points: Float[Tensor, "N n"], forms: Sequence[BilinearForm], medium: Medium
+    ) -> Float[Tensor, ""]:
+        """The sum of bilinear forms of functions at the user's points, differentiable in points and medium.
 
-        Raises DerivativeError where it is not finite, naming the points.
+        Raises DerivativeError for a medium on the faces of coarse triangles, which flips mix.
         """
         sort = cache(self.numbering.sorted)  # a function that stands in two forms is one
         forms = [form._replace(w=sort(form.w), u=sort(form.u)) for form in forms]
-        with torch.enable_grad():
-            x = points.requires_grad_()
-            _, fits = self.shape.at(self._sorted(x))
-            found = torch.autograd.grad(self.pair.bilinear(fits, forms), x)[0]
-        bad = (~found.isfinite()).any(1).nonzero()[:, 0]
-        if len(bad):
+        if any(f.on_faces for f in medium.values()) and bool(self.pair.curving.coarse.any()):
             raise DerivativeError(
-                f"points: the derivative in {len(bad)} of them ({first_few(bad)}) is not finite, as where all cells of "
-                "a point are degenerate; remove these, or merge their corners"
+                "points: some triangles are too coarse to be curved, and the medium on the faces is mixed there in a "
+                "way that is not differentiated in the points; give it at the vertices"
             )
-        return found
+        medium = {
+            name: f._replace(values=f.values[self.order] if f.on_faces else sort(f.values))
+            for name, f in medium.items()
+        }
+        _, fits = self.shape.at(self._sorted(points))
+        return self.pair.bilinear(fits, forms, medium)
 
     def _sorted(self, points: Float[Tensor, "N n"]) -> Float[Tensor, "N n"]:
         if len(self.moved):

@@ -15,7 +15,7 @@ from torchlb.cloud.surface import SurfaceSummary
 from torchlb.errors import InputError, warn
 from torchlb.linalg.csr import Csr, Record, Tensors
 from torchlb.operator.checks import check_same_points
-from torchlb.operator.parts import Modes, OperatorCache, PairMatrices
+from torchlb.operator.parts import MediumFields, Modes, OperatorCache, PairMatrices
 from torchlb.spectral.eigenbasis import Eigenbasis
 from torchlb.stencils.conditions import Condition, condition_of, kind_of
 
@@ -47,6 +47,7 @@ class OperatorStorage(Tensors):
     weak: PairMatrices
     modes: Modes
     _record: Record
+    _medium: MediumFields
 
     def __init__(self) -> None:
         none, whole = torch.zeros(0), torch.zeros(0, dtype=torch.int64)
@@ -60,8 +61,10 @@ class OperatorStorage(Tensors):
         self._states: list[dict[str, Any]] | None = (
             None  # the extra states of the shapes of a batch
         )
+        self._in_medium = self._carries = False  # whether shapes of a batch require gradients
         self._plan: Any = None
         self._cache: OperatorCache | None = None
+        self._medium = MediumFields({})
         self.stencil, self.weak, self.modes = Csr(order_t=whole), PairMatrices(), Modes(None, none)
         fields = {n: none if n in REAL_FIELDS else whole for n in (*ROW_FIELDS, *FIT_FIELDS)}
         self._record = Record(fields)
@@ -204,6 +207,7 @@ class OperatorStorage(Tensors):
             "sizes": None if self.sizes is None else list(self.sizes),
             "radius": self.weak.known_radius,
             "parts": self._states,
+            "medium": self._in_medium,
             "surface": None if self.surface is None else asdict(self.surface),
         }
 
@@ -216,6 +220,7 @@ class OperatorStorage(Tensors):
         self.certificate = None if found is None else Certificate(**found)
         self.sizes, self._states = None if sizes is None else tuple(sizes), state.get("parts")
         self.weak.known_radius = radius
+        self._in_medium = bool(state.get("medium"))
 
     def _load_from_state_dict(self, state_dict: Any, prefix: str, *given: Any) -> None:
         """Load a state; warn where it replaces an operator on other points."""

@@ -1,73 +1,172 @@
-"""Through the geometry: results of an operator that are differentiable in the points it is evaluated at.
+"""Through geometry and medium: results of an operator that are differentiable in its points and in its medium.
 
-Eigenvalues, the mass and products with K and M follow from the weak pair alone, whose derivative in the points is that
-of a bilinear form (`PairPlan.bilinear`). What has no such derivative raises an error where one is asked for: no
-gradient is zero, or lacks a part, in silence.
+What follows from the weak pair alone (eigenpairs, flows, solves, products with K and M, the mass) is differentiable in
+both: its gradient is that of a sum of bilinear forms (`PairPlan.bilinear`). All else raises an error where a
+derivative is asked for: no gradient is zero, or lacks a part, in silence.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import Any
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
 
 import torch
-from jaxtyping import Float
 from torch import Tensor
 
-from torchlb.errors import DerivativeError
-from torchlb.galerkin.pair import BilinearForm
+from torchlb.errors import DerivativeError, first_few
+from torchlb.galerkin.forms import BilinearForm
+from torchlb.galerkin.medium import Field
 from torchlb.linalg.csr import side_by_side
 from torchlb.linalg.once import once_differentiable
-from torchlb.operator.plan import Plan
+from torchlb.operator.batching import shapes_of
+from torchlb.operator.medium import elements_of, plain
 
-Forms = Callable[[Float[Tensor, "..."]], list[BilinearForm]]
-"""From the gradient of a result the bilinear forms whose sum has its derivative."""
+Forms = Callable[..., Sequence[BilinearForm]]
+"""From the gradients of results the bilinear forms whose sum has their derivative."""
+
+
+class _Origin(NamedTuple):
+    """What the weak pair of one shape follows from: a plan at points that require a gradient, or elements; a medium."""
+
+    points: Tensor
+    medium: dict[str, Field]
+    evaluated: Any
+
+    @property
+    def variables(self) -> list[Tensor]:
+        """The points and fields that require a gradient."""
+        every = [self.points, *(field.values for field in self.medium.values())]
+        return [t for t in every if t.requires_grad]
+
+    def gradient(self, forms: Sequence[BilinearForm]) -> list[Tensor]:
+        """The derivative of a sum of forms in the variables; DerivativeError where it is not finite."""
+        medium = plain(self.medium)
+        forms = [form for form in forms if form.name != "potential" or form.name in medium]
+        points = self.points.detach().cpu().double()
+        if self.points.requires_grad:
+            points.requires_grad_()
+        leaves = [f.values for name, f in medium.items() if self.medium[name].values.requires_grad]
+        with torch.enable_grad():
+            if self.points.requires_grad:
+                leaves = [points, *leaves]
+                total = self.evaluated.bilinear(points, forms, medium)
+            else:
+                total = self.evaluated.bilinear(forms, medium)
+            found = [torch.zeros_like(leaf) for leaf in leaves]
+            if total.requires_grad:  # M does not depend on the conductivity, for example
+                found = torch.autograd.grad(total, leaves, materialize_grads=True)
+        for g in found:
+            bad = (~g.isfinite()).nonzero()[:, 0].unique()
+            if len(bad):
+                raise DerivativeError(
+                    f"points or medium: the derivative at {len(bad)} points or faces ({first_few(bad)}) is not finite, "
+                    "as where all cells of a point are degenerate; remove these, or merge their corners"
+                )
+        return [g.to(v) for g, v in zip(found, self.variables, strict=True)]
+
+
+class Origins(NamedTuple):
+    """The origins of a shape, or of all shapes of a batch with their numbers of points."""
+
+    parts: list[_Origin]
+    sizes: list[int]
+
+    @property
+    def variables(self) -> list[Tensor]:
+        """All points and fields that require a gradient."""
+        return [v for part in self.parts for v in part.variables]
+
+    def gradient(self, forms: Sequence[BilinearForm]) -> list[Tensor]:
+        """The derivative of a sum of bilinear forms in the variables."""
+        rows: dict[int, tuple[Tensor, ...]] = {}
+        for f in (f for form in forms for f in (form.w, form.u)):
+            rows[id(f)] = f.detach().cpu().double().split(self.sizes)
+        found = []
+        for s, part in enumerate(self.parts):
+            if part.variables:
+                own = [
+                    BilinearForm(f.name, rows[id(f.w)][s], rows[id(f.u)][s], f.c.cpu().double())
+                    for f in forms
+                ]
+                found += part.gradient(own)
+        return found
+
+
+def origins(lb: Any) -> Origins | None:
+    """What the weak pair of an operator is differentiable in; None if nothing of it requires a gradient.
+
+    Raises DerivativeError for a batch whose shapes are no longer known.
+    """
+    held = [lb.points, *lb._medium.tensors.values()]
+    carries = lb._carries or any(t.requires_grad for t in held)
+    if not (carries and torch.is_grad_enabled()):
+        return None
+    shapes = [lb] if lb.sizes is None else shapes_of(lb)
+    if not shapes:
+        raise DerivativeError(
+            "a batch that was copied, cast or moved does not know the shapes whose points or medium require gradients; "
+            "move the shapes, and batch them then"
+        )
+    parts = []
+    for shape in shapes:
+        moved, medium = shape.points.requires_grad, shape._medium.fields(shape.num_points)
+        constant = not moved and not any(f.values.requires_grad for f in medium.values())
+        evaluated = None if constant else shape.plan if moved else elements_of(shape)
+        parts.append(_Origin(shape.points, medium, evaluated))
+    return Origins(parts, [shape.num_points for shape in shapes])
 
 
 class _Known(torch.autograd.Function):
-    """A result that is known, with its derivative in the points."""
+    """Results that are known, with their derivative in the variables of an operator."""
 
     @staticmethod
-    def forward(ctx: Any, points: Tensor, result: Tensor, plan: Plan, forms: Forms) -> Tensor:  # pyright: ignore[reportIncompatibleMethodOverride]
-        ctx.save_for_backward(points)
-        ctx.plan, ctx.forms = plan, forms
-        return result.clone()
+    def forward(ctx: Any, found: Origins, forms: Forms, count: int, *given: Tensor) -> Any:  # pyright: ignore[reportIncompatibleMethodOverride]
+        ctx.save_for_backward(*given[count:])
+        ctx.found, ctx.forms, ctx.count = found, forms, count
+        return tuple(result.clone() for result in given[:count])
 
     @staticmethod
     @once_differentiable
-    def backward(ctx: Any, grad: Tensor) -> tuple[Any, ...]:  # pyright: ignore[reportIncompatibleMethodOverride]
-        (points,) = ctx.saved_tensors
-        forms = ctx.forms(grad.cpu().double())
-        found = ctx.plan.gradient(points.detach().cpu().double(), forms)
-        return found.to(points), None, None, None
+    def backward(ctx: Any, *grads: Tensor) -> tuple[Any, ...]:  # pyright: ignore[reportIncompatibleMethodOverride]
+        forms = ctx.forms(*(g.cpu().double() for g in grads))
+        return None, None, None, *[None] * ctx.count, *ctx.found.gradient(forms)
 
 
 class _Refused(torch.autograd.Function):
-    """A value that depends on the points in a way that is not differentiated."""
+    """A value that depends on points or medium in a way that is not differentiated."""
 
     @staticmethod
-    def forward(ctx: Any, points: Tensor, value: Tensor, what: str) -> Tensor:  # pyright: ignore[reportIncompatibleMethodOverride]
+    def forward(ctx: Any, value: Tensor, what: str, *variables: Tensor) -> Tensor:  # pyright: ignore[reportIncompatibleMethodOverride]
         ctx.what = what
         return value.clone()
 
     @staticmethod
     def backward(ctx: Any, *grads: Any) -> Any:
         raise DerivativeError(
-            f"{ctx.what}: no derivative in the points; eigenvalues, the mass and lb.product(name, f) with the weak "
-            "pair have one. For derivatives in f, or of layers, take an operator at points.detach()"
+            f"{ctx.what}: no derivative in the points or in the medium; what follows from the weak pair has one: "
+            "eigenpairs, flows, solves, the mass and lb.product(name, f). For derivatives in f, take an operator at "
+            "points.detach()"
         )
 
 
-def refused(points: Tensor, value: Tensor, what: str) -> Tensor:
-    """The value, which raises DerivativeError where its derivative in the points is asked for."""
-    return _Refused.apply(points, value.detach(), what)  # pyright: ignore[reportReturnType]
+def refused(value: Tensor, what: str, *variables: Tensor) -> Tensor:
+    """The value, which raises DerivativeError where its derivative in the variables is asked for."""
+    return _Refused.apply(value.detach(), what, *variables)  # pyright: ignore[reportReturnType]
 
 
-def known(lb: Any, result: Tensor, what: str, forms: Forms) -> Tensor:
-    """A result with its derivative in the operator's points, by the forms that a gradient makes; of a batch refused."""
-    if lb.sizes is not None:
-        return refused(lb.points, result, f"{what} of a batch")
-    return _Known.apply(lb.points, result.detach(), lb.plan, forms)  # pyright: ignore[reportReturnType]
+def known(lb: Any, results: Sequence[Tensor], forms: Forms) -> Sequence[Tensor]:
+    """Results with their derivatives in the operator's variables, by the forms that gradients make."""
+    found = origins(lb)
+    if found is None:
+        return results
+    given = [result.detach() for result in results]
+    return _Known.apply(found, forms, len(given), *given, *found.variables)  # pyright: ignore[reportReturnType]
+
+
+def without(lb: Any, x: Tensor, what: str) -> Tensor:
+    """x, by which nothing is differentiable in points or medium: DerivativeError where that is asked for."""
+    found = origins(lb)
+    return x if found is None else x + refused(torch.zeros_like(x), what, *found.variables)
 
 
 def carrying(lb: Any, points: Any) -> Any:
@@ -80,7 +179,7 @@ def carrying(lb: Any, points: Any) -> Any:
     """
     if not (isinstance(points, Tensor) and points.requires_grad and torch.is_grad_enabled()):
         return lb
-    if not lb.has_weak_form or len(lb.weak.near.values) > 3 or len(lb.plan.moved):
+    if not lb.has_weak_form or lb.weak.near.values[3:4].any() or len(lb.plan.moved):
         raise DerivativeError(
             "points: they require gradients, which there are none of without a weak pair, with a Robin condition, "
             "and of noisy curves, whose points are moved; pass points.detach() if results may be constants of them"
@@ -91,21 +190,28 @@ def carrying(lb: Any, points: Any) -> Any:
         return [BilinearForm("lumped", one, g[:, None], one[0])]
 
     lb.points = points.to(lb.points).view_as(lb.points)  # a buffer is no Parameter
-    lb.mass = known(lb, lb.mass, "mass", forms)
-    lb.stencil.values = refused(points, lb.stencil.values, "rows of Δ and ∇")
-    lb.frames = refused(points, lb.frames, "frames")
-    lb.normals = refused(points, lb.normals, "normals")
+    (lb.mass,) = known(lb, [lb.mass], forms)
+    lb.stencil.values = refused(lb.stencil.values, "rows of Δ and ∇", points)
+    lb.frames = refused(lb.frames, "frames", points)
+    lb.normals = refused(lb.normals, "normals", points)
     return lb
 
 
 def through_product(lb: Any, name: Any, f: Tensor, result: Tensor) -> Tensor:
-    """The product of a matrix and f with its derivative in the points."""
+    """The product of a matrix and f with its derivative in points and medium."""
     if name == "boundary_mass":
-        return result + refused(lb.points, torch.zeros_like(result), name)
+        return without(lb, result, name)
+    if name == "laplacian":  # its values say so themselves
+        return result
 
     other = side_by_side(f.detach().cpu().double())
 
     def forms(g: Tensor) -> list[BilinearForm]:
         return [BilinearForm(name, side_by_side(g), other, torch.ones_like(other[0]))]
 
-    return result + known(lb, torch.zeros_like(result), name, forms)
+    return result + known(lb, [torch.zeros_like(result)], forms)[0]
+
+
+def energy(w: Tensor, u: Tensor, c: Tensor) -> list[BilinearForm]:
+    """Σ_k c_k w_kᵀ(K + C)u_k; the matrix C of a potential counts where there is one."""
+    return [BilinearForm("stiffness", w, u, c), BilinearForm("potential", w, u, c)]

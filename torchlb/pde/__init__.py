@@ -1,6 +1,6 @@
 """Equations on a shape, with the operator as an argument; nothing here learns.
 
-`checks`: checks of functions and of the operator. `systems`: linear systems and their factors. `conduction`: the
-stiffness of div κ∇. `solves`: implicit steps and Poisson problems. `pair_flow`: heat flow by such solves. `heat`: heat
-flow by solves, by the spectrum or by series. `geodesics`: distances.
+`checks`: checks of functions and of the operator. `solves`: implicit steps and Poisson problems.
+`pair_flow`: heat flow by such solves. `heat`: heat flow by solves, by the spectrum or by series. `geodesics`:
+distances.
 """

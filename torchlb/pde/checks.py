@@ -13,7 +13,6 @@ from torchlb.errors import InputError
 from torchlb.linalg.checks import check_finite, check_operator, check_tensor
 from torchlb.operator.laplace_beltrami import LaplaceBeltrami
 from torchlb.operator.pair_methods import check_pair
-from torchlb.operator.through import refused
 
 P = ParamSpec("P")
 T = TypeVar("T")
@@ -41,13 +40,6 @@ def as_columns(f: Tensor, lb: LaplaceBeltrami) -> Tensor:
         raise InputError(f"expected real f, got {x.dtype}; torch.view_as_real(f) makes channels")
     check_finite(x)
     return x if x.is_floating_point() else x.to(lb.dtype)
-
-
-def off_geometry(x: Tensor, lb: LaplaceBeltrami) -> Tensor:
-    """x, by which nothing is differentiable in the points of the operator: DerivativeError where that is asked for."""
-    if not lb.points.requires_grad:
-        return x
-    return x + refused(lb.points, torch.zeros_like(x), "flows and solves")
 
 
 def as_times(t: float | Tensor, x: Tensor, dtype: torch.dtype) -> Tensor:

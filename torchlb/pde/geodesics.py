@@ -22,7 +22,7 @@ from torchlb.geometry.neighbors import mesh_graph
 from torchlb.linalg.checks import check_operator
 from torchlb.linalg.precision import NEGLIGIBLE
 from torchlb.operator.laplace_beltrami import LaplaceBeltrami
-from torchlb.pde.checks import off_geometry
+from torchlb.operator.through import without
 
 FROM_MESH = ("mesh", "cotangent")
 """Sources of operators for which all edges are those of the faces."""
@@ -75,7 +75,7 @@ def geodesic_distance(
         foot = points[np.maximum(nearest, 0)]  # arbitrary where no path leads to a source
         enough = NEGLIGIBLE * float(length.mean())
         distance = _straightened(distance, foot, points, _triangles(lb), enough)
-    return off_geometry(torch.from_numpy(distance).to(lb.mass), lb)
+    return without(lb, torch.from_numpy(distance).to(lb.mass), "distances")
 
 
 def _sources(lb: LaplaceBeltrami, sources: int | Sequence[int] | Tensor) -> Int[Tensor, " S"]:

@@ -9,6 +9,7 @@ from jaxtyping import Float, Shaped
 from torch import Tensor
 
 from torchlb.errors import InputError
+from torchlb.galerkin.forms import BilinearForm
 from torchlb.linalg.checks import check_finite
 from torchlb.linalg.csr import shaped_like, side_by_side
 from torchlb.linalg.once import once_differentiable
@@ -17,9 +18,9 @@ from torchlb.linalg.sparse import compute_dtype, symmetric_product
 from torchlb.operator.checks import check_tolerance
 from torchlb.operator.laplace_beltrami import LaplaceBeltrami
 from torchlb.operator.pair_methods import check_pair
-from torchlb.pde.checks import as_columns, as_times, off_geometry, uncompiled
-from torchlb.pde.conduction import WithConductivity, with_conductivity
-from torchlb.pde.systems import solve_columns
+from torchlb.operator.systems import means, solve_columns
+from torchlb.operator.through import Origins, energy, origins, without
+from torchlb.pde.checks import as_columns, as_times, uncompiled
 
 TOLERANCE = 1e-10
 """Default relative error of solves: below the error of any mesh, and far above rounding."""
@@ -75,15 +76,15 @@ def implicit_step(
     x = as_columns(f, lb)
     dtype = torch.float64 if tolerance < SINGLE else compute_dtype(x, lb.mass)
     columns, time = _columns(x, as_times(t, x, torch.float64), dtype)
+    lb = lb if conductivity is None else lb.with_medium(conductivity=conductivity)
     given, fluxes = (_data(lb, d, n, f) for d, n in ((boundary_values, 0), (flux, 1)))
-    medium = lb if conductivity is None else with_conductivity(lb, conductivity)
     right = _product(lb, 1, columns)
     if fluxes is not None:
         right = right + time * lb.product("boundary_mass", fluxes)
     if given is not None:
-        right = right - _product(lb, 1, given) - time * _product(medium, 0, given)
-    u = _solve(off_geometry(right, lb), time, conductivity, given, medium, tolerance)
-    return shaped_like(u if given is None else u + given, f).to(x.dtype)
+        right = right - _product(lb, 1, given) - time * _product(lb, 0, given)
+    u = _solved(lb, right, time, columns, given, tolerance)
+    return shaped_like(u, f).to(x.dtype)
 
 
 @uncompiled
@@ -113,15 +114,15 @@ def poisson_solve(
     check_tolerance(tolerance)
     x = as_columns(f, lb)
     columns, _ = _columns(x, None)
+    lb = lb if conductivity is None else lb.with_medium(conductivity=conductivity)
     given, fluxes = (_data(lb, d, n, f) for d, n in ((boundary_values, 0), (flux, 1)))
-    medium = lb if conductivity is None else with_conductivity(lb, conductivity)
     right = _product(lb, 1, columns)
     if fluxes is not None:
         right = right + lb.product("boundary_mass", fluxes)
     if given is not None:
-        right = right - _product(medium, 0, given)
-    u = _solve(off_geometry(right, lb), None, conductivity, given, medium, tolerance)
-    return shaped_like(u if given is None else u + given, f).to(x.dtype)
+        right = right - _product(lb, 0, given)
+    u = _solved(lb, right, None, columns, given, tolerance)
+    return shaped_like(u, f).to(x.dtype)
 
 
 @uncompiled
@@ -160,7 +161,8 @@ def potential(
     if source is None and field is not None:
         source = field[..., 0, :]
     assert source is not None, "neither field nor source"
-    u = _solve(off_geometry(columns, lb), None, None, None, lb, tolerance)
+    columns = without(lb, columns, "potentials of fields")
+    u = _solve(columns, None, None, None, lb, None, tolerance)
     return shaped_like(u, source).to(source.dtype)
 
 
@@ -197,7 +199,7 @@ def _data(lb: LaplaceBeltrami, data: Tensor | float | None, kind: int, f: Tensor
 
 def _reached_by_flux(lb: LaplaceBeltrami, free: Tensor) -> Tensor:
     """Mask (N,) of the boundary points whose flux reaches a free point."""
-    if len(lb.weak.values) < 3:
+    if not lb.weak.has_boundary:
         return torch.zeros_like(free)
     size = lb.weak.values[2].abs()
     return symmetric_product(lb.weak.crow, lb.weak.col, size, free.to(size)[:, None])[:, 0] > 0
@@ -205,24 +207,40 @@ def _reached_by_flux(lb: LaplaceBeltrami, free: Tensor) -> Tensor:
 
 def _missing(lb: LaplaceBeltrami, kind: int) -> str:
     """Reason why there is no point for Dirichlet values (kind 0) or for fluxes (1)."""
-    if len(lb.weak.values) < 3:
+    if not lb.weak.has_boundary:
         return "the shape is closed; it has no boundary for them"
     if kind == 0:
         return "no Dirichlet condition; build with condition='dirichlet'"
     return "a Dirichlet condition holds along the whole boundary; pass a mask as `boundary` that leaves some of it"
 
 
-def _product(lb: LaplaceBeltrami | WithConductivity, number: int, x: Tensor) -> Tensor:
-    """K, with the term of a condition, or M times x."""
+def _product(lb: LaplaceBeltrami, number: int, x: Tensor) -> Tensor:
+    """K, with what is added to it, or M times x."""
     crow, col, values = lb.weak.pair
     return symmetric_product(crow, col, values[number].to(x), x)
+
+
+def _solved(
+    lb: LaplaceBeltrami,
+    right: Float[Tensor, "N C"],
+    time: Float[Tensor, " C"] | None,
+    f: Float[Tensor, "N C"],
+    given: Float[Tensor, "N C"] | None,
+    tolerance: float,
+) -> Float[Tensor, "N C"]:
+    """The solution with the boundary values u₀ that are given, differentiable in data, times, points and medium."""
+    found = origins(lb)
+    variables = () if found is None else found.variables
+    u = _solve(right, time, f, given, lb, found, tolerance, *variables)
+    return u if given is None else u + given
 
 
 class _Solve(torch.autograd.Function):
     """u of S(t)u = b: (M + tK)u = b, or Ku = b for a time of None; zero at Dirichlet points.
 
-    Its derivatives are solves with the same matrix: S⁻¹g in b, −⟨S⁻¹g, Ku⟩ in t, and −t⟨S⁻¹g, K'(κ)(u + u₀)⟩ in the
-    conductivity κ, for the cotangent g and the `given` boundary values u₀.
+    Its derivatives are solves with the same matrix: S⁻¹g in b and −⟨S⁻¹g, K(u + u₀)⟩ in t, for the cotangent g; in what
+    the matrices follow from those of ⟨w, dM(f − u − u₀)⟩ − t⟨w, dK(u + u₀)⟩, w = S⁻¹g. For a time of None f and g count
+    less their means, which the solve takes off in M.
     """
 
     @staticmethod
@@ -230,30 +248,39 @@ class _Solve(torch.autograd.Function):
         ctx: Any,
         b: Tensor,
         time: Tensor | None,
-        conductivity: Tensor | None,
+        f: Tensor | None,
         given: Tensor | None,
         lb: Any,
+        found: Origins | None,
         tolerance: Any,
+        *variables: Tensor,
     ) -> Tensor:
         u = solve_columns(lb, b, time, tolerance).to(b.dtype)  # pyright: ignore[reportCallIssue]
-        ctx.save_for_backward(time, u, conductivity, given)
-        ctx.rest = lb, tolerance
+        ctx.save_for_backward(time, u, b, f, given, *variables)
+        ctx.rest = lb, found, tolerance
         return u
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, g: Tensor) -> tuple[Any, ...]:  # pyright: ignore
-        time, u, conductivity, given = ctx.saved_tensors
-        lb, tolerance = ctx.rest
+        time, u, b, f, given, *_ = ctx.saved_tensors
+        lb, found, tolerance = ctx.rest
         w = solve_columns(lb, g, time, tolerance).to(g.dtype)  # pyright: ignore[reportCallIssue]
-        grad_t = None
+        whole, grad_t, gradients = u if given is None else u + given, None, []
         if time is not None and ctx.needs_input_grad[1]:
             grad_t = -(w * _product(lb, 0, u)).sum(0).to(time)
-        grad_kappa = None
-        if conductivity is not None and ctx.needs_input_grad[2]:
-            whole = u if given is None else u + given
-            grad_kappa = -lb.slope(conductivity, w if time is None else time * w, whole)
-        return w, grad_t, grad_kappa, None, None, None
+        if found is not None:
+            one = torch.ones_like(w[0])
+            if time is None:
+                forms = [
+                    *energy(w, whole, -one),
+                    BilinearForm("mass", w, f - means(lb, b), one),
+                    BilinearForm("mass", means(lb, g), u, -one),
+                ]
+            else:
+                forms = [*energy(w, whole, -time), BilinearForm("mass", w, f - whole, one)]
+            gradients = found.gradient(forms)
+        return w, grad_t, None, None, None, None, None, *gradients
 
 
 _solve: Any = _Solve.apply

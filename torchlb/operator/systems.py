@@ -1,6 +1,7 @@
 """The linear systems behind implicit steps and Poisson problems.
 
-A system is a K + b M, where K includes the term of a Robin condition, without the rows and columns of Dirichlet points.
+A system is a K + b M, where K includes the terms of a Robin condition and of a potential, without the rows and columns
+of Dirichlet points.
 It is solved by conjugate gradients, preconditioned with a factor of the P1 pair, which is spectrally close and 20 times
 sparser (`method.md`, section 10). Where rows of the fits have large weights, K is up to thirty times stiffer than K₁ at
 single points, in local functions: smoothing before and after the factor's solve then takes a third of the iterations.
@@ -29,17 +30,15 @@ from torchlb.linalg.precision import LOW, NEGLIGIBLE, SINGLE, TINY
 from torchlb.linalg.sparse import multiply, to_scipy
 from torchlb.linalg.two_grid import Matrix, absolute_row_sums, two_grid, without_small_entries
 from torchlb.operator.batching import shapes_of
-from torchlb.operator.laplace_beltrami import LaplaceBeltrami
-from torchlb.pde.conduction import WithConductivity
+from torchlb.operator.storage import OperatorStorage
 
 KEPT = 8
 """Number of factors kept for each operator."""
 SPACING = 4.0
 """Ratio of successive times with factors: M + tK and the matrix of its factor differ by its square root at most."""
-Operator = LaplaceBeltrami | WithConductivity
 
 
-def pair_system(lb: Operator) -> PairSystem:
+def pair_system(lb: OperatorStorage) -> PairSystem:
     """The system of an operator with a weak pair, for all times."""
     return _kept(lb.cache.systems, None, lambda: PairSystem(lb))
 
@@ -55,7 +54,7 @@ def _kept(kept: OrderedDict[Any, Any], key: Any, make: Callable[[], Any]) -> Any
 
 
 def solve_columns(
-    lb: Operator,
+    lb: OperatorStorage,
     b: Float[Tensor, "N C"],
     time: Float[Tensor, " C"] | None,
     tolerance: float | None,
@@ -68,10 +67,19 @@ def solve_columns(
     return pair_system(lb).solve(b, None if time is None else time.detach(), tolerance)
 
 
+def means(lb: OperatorStorage, b: Float[Tensor, "N C"]) -> Float[Tensor, "N C"]:
+    """1ᵀb over the area of each component on which K1 = 0, at its points; zero on others."""
+    shapes = shapes_of(lb)
+    if shapes:
+        blocks = zip(shapes, b.split([shape.num_points for shape in shapes]), strict=True)
+        return torch.cat([means(shape, part) for shape, part in blocks])
+    return pair_system(lb).mean(b.double()).expand_as(b)
+
+
 class _Components:
     """Means over the connected components of a shape; on components with a condition K is regular."""
 
-    def __init__(self, lb: Operator) -> None:
+    def __init__(self, lb: OperatorStorage) -> None:
         crow, col, _ = lb.weak.linear_pair
         where = (np.ones(len(col)), col.cpu().numpy(), crow.cpu().numpy())
         graph = sparse.csr_array(where, shape=lb.shape)
@@ -94,7 +102,7 @@ class _Components:
 class PairSystem:
     """K, and M + tK for every t, of a weak pair."""
 
-    def __init__(self, lb: Operator) -> None:
+    def __init__(self, lb: OperatorStorage) -> None:
         self.dim = lb.dim
         crow, col, values = lb.weak.pair
         self.stiffness, self.mass = self.parts = list(values.detach())
@@ -131,12 +139,44 @@ class PairSystem:
         if time is not None and bool(time[0] == time[-1]):
             time = time[:1]
         b = self.inside(b.double())
-        mean = self._mean(self.one, b)
+        mean = self.mean(b)
         right = torch.addcmul(b, self.ones_mass, mean, value=-1)
         near = partial(self._near, self._levels(time, b.shape[1]))
         x = near(right) if tolerance is None else self._solved(right, time, tolerance, near)
         shift = -self._mean(self.ones_mass, x)
         return x.add_(shift if time is None else shift + mean)
+
+    def solve_beyond(
+        self,
+        b: Float[Tensor, "N C"],
+        values: Float[Tensor, " C"],
+        known: Float[Tensor, "N m"],
+        largest: Float[Tensor, ""],
+    ) -> Float[Tensor, "N C"]:
+        """(K − λM)⁻¹b of every column by its λ, on the functions orthogonal in M to the known eigenvectors.
+
+        Their eigenvalues reach up to the largest, from which the λ should keep some distance.
+        """
+        left, time = self.mass_product(known), 1 / largest[None]
+        unit, shares = self._shares(time)
+        parts = [v.double() / of for v, of in zip(self.parts, self.units, strict=True)]
+        shares_of = shares[0], -values * time * shares[1]
+        terms = [(share, (*self.pattern, v)) for share, v in zip(shares_of, parts, strict=True)]
+        near = partial(self._near, self._levels(time, b.shape[1]))
+
+        def coarse(r: Tensor) -> Tensor:
+            return near(r.double()).mul_(unit).to(r)
+
+        cycle = self._cycle(shares, coarse) if self.smooths else None
+
+        def precondition(r: Tensor) -> Tensor:
+            r = r - left @ (known.T @ r)  # the vectors are known to the tolerance of their pairs
+            x = coarse(r) if cycle is None else cycle(r.float()).to(r)
+            return x - known @ (left.T @ x)
+
+        b = self.inside(b - left @ (known.T @ b))
+        x, _ = conjugate_gradients(partial(self._product, terms), b * time / unit, precondition)
+        return x
 
     def mass_product(self, x: Float[Tensor, "N C"]) -> Float[Tensor, "N C"]:
         """M x, in float64."""
@@ -246,6 +286,10 @@ class PairSystem:
             keep = sparse.diags_array(free)
             matrix = keep @ matrix @ keep + sparse.diags_array((1 - free) * matrix.diagonal())
         return Factor(sparse.csr_array((matrix + matrix.T) / 2))
+
+    def mean(self, b: Float[Tensor, "N C"]) -> Float[Tensor, "_ C"]:
+        """1ᵀb over the area of each component where K1 = 0, one row if there is one component."""
+        return self._mean(self.one, b)
 
     def _mean(self, weights: Tensor, x: Tensor) -> Tensor:
         """Weighted sums over components where K1 = 0, divided by their areas; 0 on the others."""

@@ -1,0 +1,151 @@
+"""The weak pair of an operator in a medium: what a medium may be, and its matrices (`method.md`, section 17)."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import torch
+from scipy import sparse
+from torch import Tensor
+
+from torchlb.errors import InputError, first_few
+from torchlb.galerkin.forms import Forms
+from torchlb.galerkin.medium import Field, Medium
+from torchlb.galerkin.pair import Pattern
+from torchlb.linalg.checks import check_tensor
+from torchlb.linalg.csr import Csr
+from torchlb.linalg.precision import ROOT_EPS
+from torchlb.linalg.sparse import to_scipy
+from torchlb.operator.parts import MediumFields, PairMatrices
+from torchlb.operator.storage import OperatorStorage
+
+Given = Mapping[str, Tensor | float | None]
+
+
+def elements_of(lb: Any) -> Forms:
+    """The elements of the weak pair of one shape, in the user's numbering, cached with the operator."""
+    if lb.cache.elements is None:
+        points = lb.points.detach().cpu().double()
+        linear = lb.source == "cotangent"
+        mass = lb.mass.detach().cpu().double()
+        made = Forms.linear(points, lb.faces.cpu(), mass) if linear else lb.plan.forms(points)
+        lb.cache.elements = made
+    return lb.cache.elements
+
+
+def checked_fields(lb: OperatorStorage, given: Given) -> MediumFields:
+    """The fields that are given, on the device of the operator, which carry gradients.
+
+    Raises InputError for a wrong shape, values that are not positive (of a potential: negative), tensors that are not
+    symmetric, and an operator without a weak pair.
+    """
+    fields = {name: x for name, x in given.items() if x is not None}
+    if not fields:
+        raise InputError("with_medium: expected a conductivity, a density or a potential, got none")
+    if not lb.weak.num_rows:
+        raise InputError("with_medium: this operator has no weak pair; build it with one")
+    found = {}
+    for name, x in fields.items():
+        if not isinstance(x, int | float):
+            check_tensor(x, name)
+        x = torch.as_tensor(x, device=lb.device)
+        x = x.expand(lb.num_points) if x.ndim == 0 else x
+        n, counts = lb.points.shape[1], (lb.num_points, len(lb.faces))
+        tensors = name == "conductivity" and x.shape[1:] == (n, n)
+        if len(x) not in counts or not (x.ndim == 1 or tensors):
+            more = f", or symmetric space tensors (…, {n}, {n})" if name == "conductivity" else ""
+            raise InputError(
+                f"{name}: expected one of each vertex, ({counts[0]},), or face, ({counts[1]},){more}, got "
+                f"{tuple(x.shape)}"
+            )
+        _check_values(name, x.detach().cpu().double())
+        found[name] = x.to(lb.points.dtype)
+    return MediumFields(found)
+
+
+def split_fields(batch: Any, shapes: Sequence[Any], given: Given) -> list[dict[str, Any]]:
+    """What of the fields of a batch is given to each of its shapes; numbers are given to all of them."""
+    found: list[dict[str, Any]] = [{} for _ in shapes]
+    counts = {len(batch.faces): [len(shape.faces) for shape in shapes]}
+    counts[batch.num_points] = [shape.num_points for shape in shapes]
+    for name, x in given.items():
+        parts: Any = [x] * len(shapes)
+        if isinstance(x, Tensor) and x.ndim:
+            if len(x) not in counts:
+                raise InputError(
+                    f"{name}: expected one of each vertex or face of the shapes, {' or '.join(map(str, counts))}, got "
+                    f"{tuple(x.shape)}"
+                )
+            parts = x.split(counts[len(x)])
+            if len(x) != batch.num_points and any(
+                len(p) == s.num_points for p, s in zip(parts, shapes, strict=True)
+            ):
+                raise InputError(
+                    f"{name}: a shape has as many faces as vertices; give the field at the vertices"
+                )
+        for own, part in zip(found, parts, strict=True):
+            own[name] = part
+    return found
+
+
+def _check_values(name: str, x: Tensor) -> None:
+    """Raise InputError unless a field is finite, and positive as it has to be."""
+    least, what, remedy = x, "positive", ""
+    if x.ndim == 3:
+        size = x.abs().amax((1, 2))
+        skew = (x - x.mT).abs().amax((1, 2)) > ROOT_EPS * size
+        safe = torch.where((x.isfinite().all(2).all(1) & ~skew)[:, None, None], x, 0.0)
+        least, what = torch.linalg.eigvalsh(safe)[:, 0], "symmetric, positive"
+        bad = least <= 0
+    elif name == "potential":
+        what, bad = "nonnegative", ~(x >= 0)
+        remedy = "; with c + μρ in place of c the eigenvalues are λ + μ"
+    else:
+        bad = ~(x > 0)
+    bad = (bad | ~least.isfinite()).nonzero()[:, 0]
+    if len(bad):
+        raise InputError(
+            f"{name}: expected finite, {what} values, got {x[bad[0]].tolist()}, … at {len(bad)} of {len(x)} vertices "
+            f"or faces ({first_few(bad)}){remedy}"
+        )
+
+
+def plain(medium: Medium) -> dict[str, Field]:
+    """The fields in float64 on the CPU, as leaves that require a gradient."""
+    return {
+        name: f._replace(values=f.values.detach().cpu().double().requires_grad_())
+        for name, f in medium.items()
+    }
+
+
+def pair_in(lb: OperatorStorage, medium: Medium) -> PairMatrices:
+    """The weak pair of one shape in a medium: K and M of its conductivity and density, and C of its potential."""
+    elements = elements_of(lb)
+    if any(flat.mix is None for flat in elements.flats):
+        faces = [name for name, field in medium.items() if field.on_faces]
+        if faces:
+            raise InputError(
+                f"{faces[0]}: some points of this cloud have local triangles beside the faces; give it at the vertices"
+            )
+    with torch.no_grad():
+        values = {name: elements.values(field) for name, field in plain(medium).items()}
+        kappa, rho, c = (values.get(name) for name in ("conductivity", "density", "potential"))
+        whole = elements.matrix(kappa, rho)
+        potential = None if c is None else elements.matrix(None, c).imag
+        linear = None
+        if lb.weak.linear.num_rows:
+            near = None if c is None else elements.near(None, c).imag
+            linear = _stored(lb.weak.linear, elements.near(kappa, rho), near)
+    whole = _stored(lb.weak, whole, potential)
+    return PairMatrices(whole.crow, whole.col, whole.values, linear)
+
+
+def _stored(pair: Csr, upper: Any, potential: Any) -> Csr:
+    """K and M in a medium from the upper triangle, with B and what a condition and the potential add to K."""
+    shape = pair.num_rows, pair.num_rows
+    rest = [to_scipy(pair.crow, pair.col, v.double(), shape) for v in pair.values[2:4]]
+    if potential is not None:
+        none: Any = sparse.csr_array(shape)
+        rest = [*[*rest, none, none][:2], potential + sparse.triu(potential, 1).T]
+    return Csr(**vars(Pattern.of(upper).pair(upper, *rest))).to(pair.values)
