@@ -18,9 +18,7 @@ from scipy import sparse
 from scipy.spatial import KDTree
 from torch import Tensor
 
-from torchlb.geometry.compatibility import (
-    normal_frames,
-)
+from torchlb.geometry.compatibility import normal_frames
 from torchlb.geometry.thresholds import AROUND, CREASE, HALF_CREASE, WIDER
 from torchlb.geometry.vectors import at
 
@@ -84,28 +82,6 @@ def longest_edges(
     return result
 
 
-class _Level:
-    """Neighbourhoods of one size, of the points asked for so far."""
-
-    def __init__(self, size: int, num_points: int) -> None:
-        self.size, self.held = size, 0
-        self.place = torch.full((num_points,), -1, dtype=torch.int32)
-        self.index = torch.empty(0, size, dtype=torch.int32)
-        self.count = torch.empty(0, dtype=torch.int32)
-
-    def add(self, centers: Tensor, index: Tensor, count: Tensor) -> None:
-        first, self.held = self.held, self.held + len(centers)
-        if self.held > len(self.count):  # double the capacity, at most to all points
-            room = min(max(2 * len(self.count), self.held), len(self.place))
-            for name in ("index", "count"):
-                old = getattr(self, name)
-                new = old.new_empty(room, *old.shape[1:])
-                new[:first] = old[:first]
-                setattr(self, name, new)
-        self.index[first : self.held], self.count[first : self.held] = index.int(), count.int()
-        self.place[centers] = torch.arange(first, self.held, dtype=torch.int32)
-
-
 class GraphNeighborhoods:
     """Nearest points of a k-hop neighbourhood, for any chunk of centres; results are kept.
 
@@ -128,11 +104,8 @@ class GraphNeighborhoods:
         frames: Float[Tensor, "N n d"],
         sides: Float[Tensor, "N n"] | None = None,
     ) -> None:
-        self.points = points
-        self.graph = graph
-        self.frames = frames
-        self.sides = sides
-        self._kept: list[_Level] = []
+        self.points, self.graph, self.frames, self.sides = points, graph, frames, sides
+        self._kept: dict[int, tuple[Tensor, Tensor]] = {}  # by size; a count of 0 is not known yet
 
     @property
     def dim(self) -> int:
@@ -178,15 +151,15 @@ class GraphNeighborhoods:
         count
             (B,), number of points before the padding.
         """
-        level = next((kept for kept in self._kept if kept.size >= size), None)
-        if level is None:
-            level = _Level(size, len(self.points))
-            self._kept.append(level)
-        missing = centers[level.place[centers] < 0]
+        largest = next((kept for kept in self._kept if kept >= size), size)
+        if largest not in self._kept:  # rows take memory once they are filled
+            index = torch.empty(len(self.points), largest, dtype=torch.int32)
+            self._kept[largest] = index, torch.zeros(len(index), dtype=torch.int32)
+        index, count = self._kept[largest]
+        missing = centers[count[centers] == 0]
         if len(missing):
-            level.add(missing, *self._grown(missing, level.size))
-        place = level.place[centers]
-        return level.index[place, :size].long(), level.count[place].long().clamp_max(size)
+            index[missing], count[missing] = self._grown(missing, largest)
+        return index[centers, :size].long(), count[centers].long().clamp_max(size)
 
     def _grown(
         self, centers: Int[Tensor, " B"], size: int
