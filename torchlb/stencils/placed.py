@@ -11,12 +11,7 @@ from torch import Tensor
 from torch.nn.functional import normalize, pad
 
 from torchlb.geometry.boundary import Boundary, BoundaryPlan
-from torchlb.geometry.frames import (
-    complete_frames,
-    mesh_frames,
-    normals_of_frames,
-    vertex_normals,
-)
+from torchlb.geometry.frames import complete_frames, mesh_frames, normals_of_frames, vertex_normals
 from torchlb.geometry.local_fits import FitPlan, LocalFits
 from torchlb.geometry.vectors import dot
 from torchlb.linalg.precision import TINY
@@ -134,10 +129,10 @@ class ShapePlan:
 
     def placed(self, fits: LocalFits) -> Placed:
         """Frames, normals and boundary from given fits."""
-        frames, normals = righthanded(fits.frames, None)
+        reference = None
         if self.side is not None:
             reference = self.side[:, None] * vertex_normals(fits.points, self.cells)
-            frames, normals = righthanded(fits.frames, reference)
+        frames, normals = righthanded(fits.frames, reference)
         boundary = None if self.boundary is None else self.boundary.at(fits.points, frames)
         return Placed(fits.points, frames, normals, boundary)
 

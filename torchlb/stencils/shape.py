@@ -17,11 +17,7 @@ from torchlb.geometry.boundary import BoundaryPlan, boundary_of_mesh
 from torchlb.geometry.compatibility import thin_sides
 from torchlb.geometry.complex import consistently_wound
 from torchlb.geometry.fit_search import FitSearch
-from torchlb.geometry.frames import (
-    mesh_frames,
-    normals_of_frames,
-    vertex_normals,
-)
+from torchlb.geometry.frames import mesh_frames, normals_of_frames, vertex_normals
 from torchlb.geometry.local_fits import FitPlan, LocalFits
 from torchlb.geometry.neighbors import GraphNeighborhoods, mesh_graph, nearest_neighbors
 from torchlb.geometry.thresholds import NEAREST
@@ -177,13 +173,14 @@ def _shape(
     on_mesh: bool = False,
 ) -> Shape:
     """Shape of a plan at the points that it was made for, with the data that the search for stencils needs."""
-    placed = plan.placed(fits)
+    placed, sides = plan.placed(fits), neighborhoods.sides
+    if sides is not None:  # by the normals of the refined frames
+        marked = (sides != 0).any(1, keepdim=True)
+        sides = turned(normals_of_frames(placed.frames), sides) * marked
     return Shape(
         **vars(placed),
         normal_order=plan.fits.order,
-        neighborhoods=neighborhoods.with_frames(
-            placed.frames, _follow(neighborhoods.sides, placed.frames)
-        ),
+        neighborhoods=neighborhoods.with_frames(placed.frames, sides),
         areas=areas,
         low_order=low_order,
         condition=Condition() if condition is None else condition,
@@ -204,19 +201,12 @@ def _part(boundary: BoundaryPlan | None, mask: Bool[Tensor, " N"]) -> BoundaryPl
     return None if boundary is None or not mask.any() else replace(boundary, mask=mask)
 
 
-def _follow(sides: Tensor | None, frames: Tensor) -> Tensor | None:
-    """Sides from the normals of the refined frames, where they were set."""
-    if sides is None:
-        return None
-    return turned(normals_of_frames(frames), sides) * (sides != 0).any(1, keepdim=True)
-
-
 def _searched(
     neighborhoods: GraphNeighborhoods,
     degree: int,
     num_neighbors: int | None,
     progress: bool,
-    fit_degrees: tuple[int, ...] = (),
+    fit_degrees: tuple[int, ...],
 ) -> tuple[FitPlan, LocalFits]:
     """Fit tangent planes of order q (initial ones if q = 0 or in a flat space), and functions."""
     flat = neighborhoods.dim == neighborhoods.points.shape[1]
