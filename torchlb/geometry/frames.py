@@ -125,9 +125,8 @@ def normals_of_frames(frames: Float[Tensor, "N n d"]) -> Float[Tensor, "N n"]:
         return torch.linalg.cross(*frames.unbind(-1))
     basis, _ = torch.linalg.qr(frames, mode="complete")
     normal = basis[..., -1:]
-    return (normal * torch.linalg.det(torch.cat([frames, normal], -1)).sign()[:, None, None])[
-        ..., 0
-    ]
+    hand = torch.linalg.det(torch.cat([frames, normal], -1)).sign()
+    return hand[:, None] * normal[..., 0]
 
 
 def _edges(vertices: Float[Tensor, "N n"], faces: Int[Tensor, "F v"]) -> Float[Tensor, "F edges n"]:
@@ -136,29 +135,22 @@ def _edges(vertices: Float[Tensor, "N n"], faces: Int[Tensor, "F v"]) -> Float[T
     return corners[:, 1:] - corners[:, :1]
 
 
-def face_normals(vertices: Float[Tensor, "N n"], faces: Int[Tensor, "F n"]) -> Float[Tensor, "N n"]:
-    """Area-weighted sum of the normals of the faces at every vertex (segments in R², triangles in R³).
+def vertex_normals(
+    vertices: Float[Tensor, "N n"], faces: Int[Tensor, "F n"]
+) -> Float[Tensor, "N n"]:
+    """Unit mean of the normals of the faces (segments in R², triangles in R³) at every vertex, weighted by area.
 
-    Counter-clockwise triangles face the viewer, counter-clockwise polygons outward.
+    Counter-clockwise triangles face the viewer, counter-clockwise polygons outward. Zero where the mean vanishes up to
+    the rounding of the faces.
     """
     edges = _edges(vertices, faces)
     if vertices.shape[1] == 3:
         normal = torch.linalg.cross(edges[:, 0], edges[:, 1])
     else:
         normal = torch.stack([edges[:, 0, 1], -edges[:, 0, 0]], dim=-1)
-    total = torch.zeros_like(vertices)
+    total, size = torch.zeros_like(vertices), torch.zeros_like(vertices[:, 0])
     for corner in faces.T:
         total.index_add_(0, corner, normal)
-    return total
-
-
-def vertex_normals(
-    vertices: Float[Tensor, "N n"], faces: Int[Tensor, "F n"]
-) -> Float[Tensor, "N n"]:
-    """Unit `face_normals`; zero where they vanish up to the rounding of the faces."""
-    total = face_normals(vertices, faces)
-    size, product = torch.zeros_like(vertices[:, 0]), _edges(vertices, faces).norm(dim=-1).prod(1)
-    for corner in faces.T:
-        size.index_add_(0, corner, product)
+        size.index_add_(0, corner, edges.norm(dim=-1).prod(1))
     length = total.norm(dim=1)
     return torch.where((length > ROUNDING * size)[:, None], total / length[:, None], 0.0)

@@ -8,6 +8,7 @@ ordered by distance. At a crease, where the tangent planes turn away, the walk e
 
 from __future__ import annotations
 
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from math import ceil
 
@@ -61,27 +62,7 @@ def mesh_graph(faces: Int[Tensor, "F v"], num_points: int) -> sparse.csr_array:
     return adjacency(i, j, num_points)
 
 
-def longest_edges(
-    points: Float[Tensor, "N n"], graph: sparse.csr_array, count: int
-) -> Int[Tensor, "N count"]:
-    """Neighbours of every point along its longest edges; padded by the point itself.
-
-    >>> path = mesh_graph(torch.tensor([[0, 1], [1, 2]]), 3)
-    >>> longest_edges(torch.tensor([[0.0], [1.0], [3.0]]), path, 1).tolist()
-    [[1], [2], [1]]
-    """
-    row, col = (torch.from_numpy(end.astype(np.int64)) for end in sparse.coo_array(graph).coords)
-    length = (points[col] - points[row]).square().sum(1)
-    order = torch.from_numpy(np.lexsort((-length.numpy(), row.numpy())))
-    row, col = row[order], col[order]
-    number = torch.bincount(row, minlength=len(points))
-    place = torch.arange(len(row)) - (number.cumsum(0) - number)[row]
-    result = torch.arange(len(points))[:, None].repeat(1, count)
-    keep = place < count
-    result[row[keep], place[keep]] = col[keep]
-    return result
-
-
+@dataclass(frozen=True, eq=False)
 class GraphNeighborhoods:
     """Nearest points of a k-hop neighbourhood, for any chunk of centres; results are kept.
 
@@ -97,15 +78,12 @@ class GraphNeighborhoods:
         (N, n) from `thin_sides`; points on the other side of a thin shape are refused. None if unknown.
     """
 
-    def __init__(
-        self,
-        points: Float[Tensor, "N n"],
-        graph: sparse.csr_array,
-        frames: Float[Tensor, "N n d"],
-        sides: Float[Tensor, "N n"] | None = None,
-    ) -> None:
-        self.points, self.graph, self.frames, self.sides = points, graph, frames, sides
-        self._kept: dict[int, tuple[Tensor, Tensor]] = {}  # by size; a count of 0 is not known yet
+    points: Float[Tensor, "N n"]
+    graph: sparse.csr_array
+    frames: Float[Tensor, "N n d"]
+    sides: Float[Tensor, "N n"] | None = None
+    # by size, indices and counts of all points; a count of 0 is not known yet
+    _kept: dict[int, tuple[Tensor, Tensor]] = field(default_factory=dict)
 
     @property
     def dim(self) -> int:
@@ -116,9 +94,7 @@ class GraphNeighborhoods:
         self, frames: Float[Tensor, "N n d"], sides: Float[Tensor, "N n"] | None
     ) -> GraphNeighborhoods:
         """Same neighbourhoods for slightly different frames, which decide those not found yet."""
-        neighborhoods = GraphNeighborhoods(self.points, self.graph, frames, sides)
-        neighborhoods._kept = self._kept
-        return neighborhoods
+        return replace(self, frames=frames, sides=sides)
 
     @cached_property
     def _arrays(self) -> dict[str, np.ndarray]:
@@ -131,8 +107,18 @@ class GraphNeighborhoods:
 
     @cached_property
     def longest(self) -> Int[Tensor, "N edges"]:
-        """Neighbours of every point along its longest `AROUND` edges, see `longest_edges`."""
-        return longest_edges(self.points, self.graph, AROUND)
+        """Neighbours of every point along its longest `AROUND` edges; padded by the point itself."""
+        points, ends = self.points, sparse.coo_array(self.graph).coords
+        row, col = (torch.from_numpy(end.astype(np.int64)) for end in ends)
+        length = (points[col] - points[row]).square().sum(1)
+        order = torch.from_numpy(np.lexsort((-length.numpy(), row.numpy())))
+        row, col = row[order], col[order]
+        number = torch.bincount(row, minlength=len(points))
+        place = torch.arange(len(row)) - (number.cumsum(0) - number)[row]
+        result = torch.arange(len(points))[:, None].repeat(1, AROUND)
+        keep = place < AROUND
+        result[row[keep], place[keep]] = col[keep]
+        return result
 
     def middles(self, centers: Int[Tensor, " B"]) -> Float[Tensor, "B edges d"]:
         """Midpoints of these edges in the centre's tangent plane, in its frame, ℓ."""
@@ -142,14 +128,9 @@ class GraphNeighborhoods:
     def __call__(
         self, centers: Int[Tensor, " B"], size: int
     ) -> tuple[Int[Tensor, "B K"], Int[Tensor, " B"]]:
-        """The `size` nearest compatible points of each centre, itself first.
+        """The `size` nearest compatible points of each centre, itself first, and how many there are.
 
-        Returns
-        -------
-        index
-            (B, size), padded by the centre where the neighbourhood holds fewer.
-        count
-            (B,), number of points before the padding.
+        Where the neighbourhood holds fewer, the centre is repeated.
         """
         largest = next((kept for kept in self._kept if kept >= size), size)
         if largest not in self._kept:  # rows take memory once they are filled

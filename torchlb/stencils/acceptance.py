@@ -24,26 +24,14 @@ RESOLVING_DEGREE = 4
 
 @dataclass(frozen=True)
 class Acceptance:
-    """Tests for the stencils of a shape.
+    """Tests for the stencils of a shape of dimension d, with coordinates by a projection.
 
-    Attributes
-    ----------
-    dim
-        Dimension d.
-    on_mesh
-        Whether low-order rows follow the surface better than a fit that misses heights.
-    projection
-        Projection of the coordinates.
+    On a mesh, low-order rows follow the surface better than a fit that misses heights.
     """
 
     dim: int
     on_mesh: bool
     projection: str
-
-    @staticmethod
-    def too_wide_at_boundary(candidate: Candidate) -> bool:
-        """Whether a stencil with boundary points would be so wide and one-sided that a lower order is better."""
-        return candidate.degree > 2 and candidate.factor > FACTOR
 
     def judge(
         self, weights: Weights, candidate: Candidate, touching: Bool[Tensor, " B"]

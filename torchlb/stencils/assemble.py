@@ -46,16 +46,8 @@ Gradients = tuple[Int[Tensor, " b"], Int[Tensor, "b K"], Float[Tensor, "b K d"],
 class Stencils:
     """Rows of a shape, each by the first of its candidates that passes.
 
-    Parameters
-    ----------
-    shape
-        Points, frames, neighbourhoods, boundary and low-order rows.
-    order
-        Order p ≥ 1 of the first candidates.
-    projection, weights
-        Keys of `PROJECTIONS` and `WEIGHT_RULES`.
-    num_neighbors
-        Size K of every candidate, instead of `SIZE_FACTORS`.
+    The first candidates have the order p ≥ 1, and all of them `num_neighbors` points, if that is given, instead of
+    `SIZE_FACTORS`. The projection is one of `PROJECTIONS`, the rule for the weights one of `WEIGHT_RULES`.
     """
 
     def __init__(
@@ -87,7 +79,7 @@ class Stencils:
         for number, tried, index in search:
             candidate = self.candidates[number]
             holds = self._holds_boundary(index)
-            if self.acceptance.too_wide_at_boundary(candidate):
+            if candidate.degree > 2 and candidate.factor > FACTOR:  # too wide beside a boundary
                 tried, index, holds = tried[~holds], index[~holds], holds[~holds]
                 if len(tried) == 0:
                     continue

@@ -154,10 +154,7 @@ class Rows:
 class RowsPlan:
     """Plan of rows; attributes are those of `Rows`.
 
-    Attributes
-    ----------
-    used
-        (nnz,), entries with weights: the non-zero ones of positive weights, and those of a low-order row's gradient.
+    Entries are `used` where positive weights are non-zero, and for the gradient of a low-order row.
     """
 
     length: Int[Tensor, " B"]

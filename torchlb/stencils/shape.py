@@ -24,7 +24,7 @@ from torchlb.geometry.thresholds import NEAREST
 from torchlb.linalg.precision import AT_ONCE
 from torchlb.stencils.conditions import Condition, Neumann
 from torchlb.stencils.low_order import MeshLowOrder
-from torchlb.stencils.placed import Beside, Placed, ShapePlan, first_frames, righthanded, turned
+from torchlb.stencils.placed import Beside, Placed, ShapePlan, righthanded, turned
 
 NEUMANN = Neumann()
 
@@ -140,9 +140,7 @@ def surface_shape(
         graph.eliminate_zeros()
     beside = Beside.of(given, surface.points, triangles, surface.neighbors[:, 1], surface.normals)
     points = beside.places(given, triangles)
-    neighborhoods = GraphNeighborhoods(
-        points, graph, first_frames(points, triangles, beside), sides
-    )
+    neighborhoods = GraphNeighborhoods(points, graph, beside.frames(points, triangles), sides)
     plan, fits = _searched(neighborhoods, normal_order, num_neighbors, progress, fit_degrees)
     edge = None
     if condition is not None:
