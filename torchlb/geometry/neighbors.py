@@ -8,7 +8,7 @@ ordered by distance. At a crease, where the tangent planes turn away, the walk e
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import cached_property
 from math import ceil
 
@@ -82,19 +82,13 @@ class GraphNeighborhoods:
     graph: sparse.csr_array
     frames: Float[Tensor, "N n d"]
     sides: Float[Tensor, "N n"] | None = None
-    # by size, indices and counts of all points; a count of 0 is not known yet
+    # by size, indices and counts of all points; a count of 0 is not known yet; copies share what is found
     _kept: dict[int, tuple[Tensor, Tensor]] = field(default_factory=dict)
 
     @property
     def dim(self) -> int:
         """Dimension d of the tangent planes."""
         return self.frames.shape[-1]
-
-    def with_frames(
-        self, frames: Float[Tensor, "N n d"], sides: Float[Tensor, "N n"] | None
-    ) -> GraphNeighborhoods:
-        """Same neighbourhoods for slightly different frames, which decide those not found yet."""
-        return replace(self, frames=frames, sides=sides)
 
     @cached_property
     def _arrays(self) -> dict[str, np.ndarray]:

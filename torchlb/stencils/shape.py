@@ -178,7 +178,7 @@ def _shape(
     return Shape(
         **vars(placed),
         normal_order=plan.fits.order,
-        neighborhoods=neighborhoods.with_frames(placed.frames, sides),
+        neighborhoods=replace(neighborhoods, frames=placed.frames, sides=sides),
         areas=areas,
         low_order=low_order,
         condition=Condition() if condition is None else condition,
