@@ -13,7 +13,7 @@ from scipy import sparse
 import torchlb
 from torchlb import LaplaceBeltrami, StabilityError, StabilityWarning
 from torchlb.certified.certificate import check_certificate
-from torchlb.certified.enforce import Schedule, certify
+from torchlb.certified.enforce import certify
 from torchlb.certified.null_vector import left_null_vector, shared_outflow
 from torchlb.cloud.surface import cloud_surface
 from torchlb.errors import warn
@@ -347,7 +347,7 @@ def test_uncertified_operator_says_so():
 
 
 def test_a_certificate_that_does_not_hold_is_a_warning_with_names(monkeypatch):
-    none = partial(certify, schedule=Schedule(most=0))
+    none = partial(certify, most=0)
     monkeypatch.setattr("torchlb.operator.build.certify", none)
     points = Sphere().random_points(500)
     message = r"does NOT hold.*where rounds end; the worst points: \d+, \d+"

@@ -13,10 +13,10 @@ from torchlb.geometry.fit_search import FitSearch
 from torchlb.geometry.frames import (
     PROJECTIONS,
     complete_frames,
-    face_normals,
     local_offsets,
     mesh_frames,
     normals_of_frames,
+    vertex_normals,
 )
 from torchlb.geometry.neighbors import GraphNeighborhoods, nearest_neighbors
 from torchlb.surfaces import (
@@ -129,11 +129,9 @@ def test_frames_of_a_polyline_and_of_a_flat_mesh():
 
 
 @each(HYPERSURFACES)
-def test_face_normals_point_outward(surface):
+def test_vertex_normals_point_outward(surface):
     vertices, faces = surface.mesh(1000)
-    normals = face_normals(vertices, faces)
-    exact = surface.normals(vertices)
-    assert ((normals * exact).sum(1) > 0.8 * normals.norm(dim=1)).all()
+    assert ((vertex_normals(vertices, faces) * surface.normals(vertices)).sum(1) > 0.8).all()
 
 
 @pytest.mark.parametrize("n", [2, 3, 4])
@@ -154,10 +152,9 @@ def test_offsets_are_the_vectors_themselves_in_a_flat_space(surface, projection)
     """With one common frame for all points both projections are Eᵀe."""
     points = surface.points(60)
     frames = surface.frames(points)[:1].expand(60, -1, -1)
-    neighbors = nearest_neighbors(points, 8)[:, 1:]
-    centers = torch.arange(60)
-    found = local_offsets(points, frames, centers, neighbors, projection)
-    close(found, (points[neighbors] - points[:, None]) @ frames[0])
+    index = nearest_neighbors(points, 8)
+    found = local_offsets(points, frames, index, projection)
+    close(found, (points[index[:, 1:]] - points[:, None]) @ frames[0])
 
 
 @each(HYPERSURFACES)
@@ -166,12 +163,12 @@ def test_normal_projection_is_the_formula_of_the_note_with_a_minus(surface):
     points = points_of(surface, 500)
     frames, normals = surface.frames(points), surface.normals(points)
     normals = normals * torch.randint(0, 2, (500, 1)).mul(2).sub(1)
-    centers, neighbors = torch.arange(500), nearest_neighbors(points, 12)[:, 1:]
-    e, n_k, n_i = points[neighbors] - points[:, None], normals[neighbors], normals[:, None]
+    index = nearest_neighbors(points, 12)
+    e, n_k, n_i = points[index[:, 1:]] - points[:, None], normals[index[:, 1:]], normals[:, None]
     ratio = (e * n_i).sum(-1, keepdim=True) / (n_k * n_i).sum(-1, keepdim=True)
     projected = e - n_k * ratio
     assert (projected * n_i).sum(-1).abs().max() < 1e-12
-    found = local_offsets(points, frames, centers, neighbors, "normal")
+    found = local_offsets(points, frames, index, "normal")
     close(found, projected @ frames)
 
 
@@ -181,11 +178,10 @@ def test_both_projections_agree_to_third_order(surface):
     sizes, apart, spacing = [500, 1000, 2000, 4000], [], []
     for n in sizes:
         points = points_of(surface, n)
-        centers = torch.arange(0, n, 10)
-        neighbors = nearest_neighbors(points, 9)[centers, 1:]
+        index = nearest_neighbors(points, 9)[::10]
         frames = surface.frames(points)
-        y_t, y_n = (local_offsets(points, frames, centers, neighbors, p) for p in PROJECTIONS)
+        y_t, y_n = (local_offsets(points, frames, index, p) for p in PROJECTIONS)
         apart.append(float((y_t - y_n).norm(dim=-1).square().mean().sqrt()))
-        spacing.append(float((points[neighbors] - points[centers, None]).norm(dim=-1).mean()))
+        spacing.append(float((points[index[:, 1:]] - points[index[:, :1]]).norm(dim=-1).mean()))
     assert slope_of(sizes, apart, surface.dim) >= 2.7
     assert apart[-1] <= 5 * spacing[-1] ** 3

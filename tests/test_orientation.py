@@ -10,7 +10,7 @@ from torchlb.cloud.frames import cloud_frames
 from torchlb.cloud.orientation import mended_normals, nearest_pairs
 from torchlb.geometry.compatibility import thin_sides
 from torchlb.geometry.complex import consistently_wound
-from torchlb.geometry.frames import complete_frames, face_normals, normals_of_frames
+from torchlb.geometry.frames import complete_frames, normals_of_frames, vertex_normals
 from torchlb.geometry.neighbors import nearest_neighbors
 from torchlb.surfaces import Ellipsoid, Sphere, StarShaped, Torus
 
@@ -141,7 +141,7 @@ def test_pairs_come_once_each():
 def test_one_flipped_face_spoils_the_winding():
     vertices, faces = Sphere().mesh(200)
     assert consistently_wound(faces)
-    assert ((face_normals(vertices, faces) * vertices).sum(1) > 0).all()
+    assert ((vertex_normals(vertices, faces) * vertices).sum(1) > 0).all()
     faces[7] = faces[7].flip(0)
     assert not consistently_wound(faces)
 

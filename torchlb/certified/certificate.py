@@ -64,16 +64,9 @@ class Certificate:
 def check_certificate(
     matrix: sparse.csr_array, areas: Float[Tensor, " N"], *, outflow: bool = False
 ) -> tuple[Float[Tensor, " N"], Certificate, Float[np.ndarray, "N k"]]:
-    """Return π, the certificate, and the contribution of each row to every vᵀSv > 0 that violates it.
+    """Return π, the certificate, and the contribution of each row of L to every vᵀSv > 0 that violates it.
 
-    Parameters
-    ----------
-    matrix
-        L, (N, N), 1/ℓ².
-    areas
-        Areas of the points, ℓ^d.
-    outflow
-        Whether rows may have L1 < 0, as beside a Dirichlet boundary.
+    With `outflow` rows may have L1 < 0, as beside a Dirichlet boundary.
     """
     q = shared_outflow(matrix, areas) if outflow else None
     mass, component, error = left_null_vector(matrix, areas, q)
@@ -96,16 +89,8 @@ def dissipation(
     so v is localised where S fails. It is A^{-1} applied to d_j times column j of the factor, one solve. Row i
     contributes π_i v_i (Lv)_i to vᵀSv > 0.
 
-    Beyond `krylov.LARGEST_FACTORED` points the v come from conjugate gradients.
-
-    Returns
-    -------
-    negative
-        Whether S ≤ 0, up to rounding.
-    max_s
-        Largest vᵀSv / vᵀDv, a lower bound of the largest eigenvalue; 0.0 if there is no v.
-    feed
-        (N, k), the contributions of the rows to each vᵀSv; k = 0 if there is none.
+    Beyond `krylov.LARGEST_FACTORED` points the v come from conjugate gradients. The violation is the largest vᵀSv /
+    vᵀDv, a lower bound of the largest eigenvalue; it is 0.0, and k = 0, if there is no v.
     """
     weighted = sparse.csr_array(sparse.diags_array(mass.numpy()) @ matrix)
     symmetric = (weighted + weighted.T) / 2

@@ -7,7 +7,7 @@ them to a later one of its candidates (`method.md`, section 5).
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 import torch
@@ -26,32 +26,21 @@ from torchlb.stencils.rows import Reason, Rows
 
 MARGIN = 0.02
 """Fraction of a point's area below which its weight π is small, so that rows around it are marked."""
+SINGLY = 4
+"""Number of marks of a row that each skip one candidate; then the number to skip doubles with every second mark."""
+MOST_ROUNDS = 80
+"""Largest number of rounds; then the operator is left as it is, with a warning."""
 Lower = Callable[[Int[Tensor, " J"], Int[Tensor, " J"]], Rows]
 
 
-@dataclass(frozen=True)
-class Schedule:
-    """Back-off schedule of marked rows along their candidates.
+def candidates_skipped(times: Int[Tensor, " N"]) -> Int[Tensor, " N"]:
+    """Number of candidates, from its first on, that a row skips when it is marked for the `times`-th time.
 
-    Attributes
-    ----------
-    single
-        Number of marks that each skip one candidate; then the number to skip doubles with every second mark.
-    most
-        Largest number of rounds; then the operator is left as it is, with a warning.
+    >>> candidates_skipped(torch.arange(13)).tolist()
+    [0, 1, 2, 3, 4, 6, 8, 12, 16, 23, 32, 46, 64]
     """
-
-    single: int = 4
-    most: int = 80
-
-    def way(self, times: Int[Tensor, " N"]) -> Int[Tensor, " N"]:
-        """Number of candidates, from its first on, that a row skips when it is marked for the `times`-th time.
-
-        >>> Schedule().way(torch.arange(13)).tolist()
-        [0, 1, 2, 3, 4, 6, 8, 12, 16, 23, 32, 46, 64]
-        """
-        doubled = self.single * 2 ** ((times - self.single) / 2)
-        return torch.where(times <= self.single, times, doubled.ceil().long())
+    doubled = SINGLY * 2 ** ((times - SINGLY) / 2)
+    return torch.where(times <= SINGLY, times, doubled.ceil().long())
 
 
 def certify(
@@ -61,23 +50,14 @@ def certify(
     bottom: int,
     *,
     outflow: bool = False,
-    schedule: Schedule = Schedule(),
+    most: int = MOST_ROUNDS,
     progress: bool = True,
 ) -> tuple[Rows, Float[Tensor, " N"], Certificate]:
     """Widen rows, or lower their order, until the certificate holds.
 
-    Parameters
-    ----------
-    rows
-        Rows, each by the first of its candidates that passed.
-    areas
-        Areas of the points, ℓ^d.
-    lower
-        Function (points, first candidates) → rows, each by the first candidate from there on that passes.
-    bottom
-        Number of candidates, the `Rows.candidate` of low-order rows, which cannot be lowered further.
-    outflow
-        Whether rows may have L1 < 0, as beside a Dirichlet boundary.
+    Each row is by the first of its candidates that passed; `lower` maps points and first candidates to rows by the
+    first candidate from there on that passes. `bottom` is the number of candidates, the `Rows.candidate` of low-order
+    rows, which cannot be lowered further. With `outflow` rows may have L1 < 0, as beside a Dirichlet boundary.
 
     Returns the rows, the mass π, (N,), ℓ^d, and the certificate; a `StabilityWarning` is issued if it does not hold.
     """
@@ -89,13 +69,13 @@ def certify(
             matrix = to_scipy(rows.crow, rows.col, rows.laplacian, (count, count))
             free = rows.candidate < bottom
             marked, start = _into_closed_classes(matrix) & free, torch.full_like(times, bottom)
-            if not marked.any() or rounds == schedule.most:  # else π is 0 outside those
+            if not marked.any() or rounds == most:  # else π is 0 outside those
                 mass, result, feed = check_certificate(matrix, areas, outflow=outflow)
                 marked = _marked(matrix, mass / areas, feed, free, spread=not result.holds)
-                if not marked.any() or rounds == schedule.most:
+                if not marked.any() or rounds == most:
                     break
                 times += marked
-                start = first.candidate + schedule.way(times)
+                start = first.candidate + candidates_skipped(times)
             rounds += 1
             rows = _lowered(rows, first, marked, start.clamp_max(bottom), lower)
             bar.set_postfix_str(f"{int(marked.sum())} rows marked", refresh=False)
@@ -106,7 +86,7 @@ def certify(
     if not result.holds:
         worst = (mass / areas).argsort() if feed.shape[1] == 0 else (-feed.max(1)).argsort()
         names = ", ".join(map(str, as_given(worst[:8]).tolist()))
-        stopped = ", where rounds end" if rounds == schedule.most else ""
+        stopped = ", where rounds end" if rounds == most else ""
         warn(
             f"{result}{stopped}; the worst points: {names}. Lower `order`, or repair the surface there.",
             StabilityWarning,

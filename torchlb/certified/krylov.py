@@ -59,12 +59,7 @@ def krylov_or_factors(
 class LowOrder:
     """M-matrix of a symmetric matrix: its positive off-diagonal entries as weights, and a loss at each point.
 
-    Parameters
-    ----------
-    symmetric
-        (N, N).
-    loss
-        Excess of each diagonal entry over the weights of its row; negative values are rounding.
+    The loss is the excess of the diagonal entry over the weights of its row; negative values are rounding.
     """
 
     def __init__(self, symmetric: sparse.csr_array, loss: Float[np.ndarray, " N"]) -> None:
@@ -133,14 +128,7 @@ def null_density(
 ) -> Float[np.ndarray, " N"] | None:
     """Solve (AL)ᵀx = −lost, A the areas, by GMRES with B; None if that does not converge.
 
-    Parameters
-    ----------
-    matrix, area, lost
-        L, the diagonal of A, the right-hand side.
-    component
-        Component of each point.
-    free
-        Whether the scale of x on a component is free, not fixed by `lost`; see `rescaled`.
+    On `free` components the scale of x is not fixed by `lost`, see `rescaled`.
     """
     weighted = sparse.csr_array((sparse.diags_array(area) @ matrix).T)
     loss = -area * (matrix.sum(axis=1) + GROUND * matrix.diagonal())

@@ -25,33 +25,14 @@ def left_null_vector(
     areas: Float[Tensor, " N"],
     outflow: Float[np.ndarray, " N"] | None = None,
 ) -> tuple[Float[Tensor, " N"], np.ndarray, float]:
-    """Left null vector π, πᵀL = −q, scaled on each component to the sum of the areas there.
+    """Left null vector π of L, πᵀL = −q, scaled on each component to the sum of the areas there.
 
     Inverse iteration uses the LU of (AL)ᵀ, A the areas, with a relative shift of each diagonal entry; beyond
-    `krylov.LARGEST_FACTORED` points it is GMRES with multigrid of the low-order part.
+    `krylov.LARGEST_FACTORED` points it is GMRES with multigrid of the low-order part. q ≥ 0 is the `outflow` of the
+    points where L1 < 0, from `shared_outflow`, ℓ^{d−2}; None where L1 = 0.
 
-    Parameters
-    ----------
-    matrix
-        L, (N, N), 1/ℓ².
-    areas
-        Diagonal of A, ℓ^d.
-    outflow
-        q ≥ 0, ℓ^(d−2), of the points where L1 < 0, from `shared_outflow`; None where L1 = 0.
-
-    Returns
-    -------
-    mass
-        π, ℓ^d.
-    component
-        Component of each point.
-    error
-        Componentwise backward error of π; `CONSERVED` is what rounding may leave.
-
-    Raises
-    ------
-    StabilityError
-        If there is no such π, as L is singular beyond its constants.
+    Returns π, the component of each point, and the componentwise backward error of π, of which rounding leaves at most
+    `CONSERVED`. Raises StabilityError if there is no such π, as L is singular beyond its constants.
     """
     area = areas.numpy()
     lost = np.zeros(len(area)) if outflow is None else outflow
@@ -74,18 +55,14 @@ SINGULAR = (
 )
 
 
-def has_outflow(matrix: sparse.csr_array, rounding: float = 0.0) -> Bool[np.ndarray, " N"]:
-    """Rows whose sum is not zero, up to a relative `rounding` of their entries."""
-    return np.abs(matrix.sum(axis=1)) > max(ROOT_EPS, 64 * rounding) * abs(matrix).sum(axis=1)
-
-
 def shared_outflow(matrix: sparse.csr_array, areas: Float[Tensor, " N"]) -> Float[np.ndarray, " N"]:
     """Outflow of the rows of non-zero sum, each shared equally among those of them that it has an entry with.
 
     Where almost nothing flows out of a row, π would almost vanish, and rows would be lowered for it.
     """
-    rows = np.flatnonzero(has_outflow(matrix))
-    own = np.maximum(-areas.numpy() * matrix.sum(axis=1), 0)[rows]
+    total = matrix.sum(axis=1)
+    rows = np.flatnonzero(np.abs(total) > ROOT_EPS * abs(matrix).sum(axis=1))
+    own = np.maximum(-areas.numpy() * total, 0)[rows]
     joined = matrix[rows][:, rows].astype(bool)
     joined = sparse.csr_array((joined + joined.T).astype(float))
     shared = np.zeros(len(areas))

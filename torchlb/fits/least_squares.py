@@ -19,19 +19,8 @@ def left_inverse(
     Modified Gram–Schmidt on √ω V = QR and back substitution give C = R⁻¹Qᵀ√ω, every row as accurate as by Householder's
     QR (`decisions.md`, *Compiled kernels*). Columns that are dependent to the last digit give non-finite results.
 
-    Parameters
-    ----------
-    values
-        V, K ≥ M, float64.
-    root
-        √ω.
-
-    Returns
-    -------
-    inverse
-        C.
-    condition
-        Frobenius norm ‖R⁻¹‖ for columns of √ω V scaled to unit length; ‖R‖ is then between 1 and √M.
+    V has K ≥ M rows, in float64; `root` is √ω. The condition is the Frobenius norm ‖R⁻¹‖ for columns of √ω V scaled to
+    unit length; ‖R‖ is then between 1 and √M.
 
     >>> left_inverse(torch.ones(1, 4, 1, dtype=torch.float64), torch.ones(1, 4, dtype=torch.float64))[0].tolist()
     [[[0.25, 0.25, 0.25, 0.25]]]

@@ -7,14 +7,8 @@ from jaxtyping import Float
 from torch import Tensor
 
 from torchlb.fits.least_squares import left_inverse
-from torchlb.fits.polynomials import monomials
-from torchlb.fits.weights import (
-    Weights,
-    finish,
-    functionals_of,
-    height_residual,
-    scaled_system,
-)
+from torchlb.fits.polynomials import functionals, monomials
+from torchlb.fits.weights import Weights, finish, height_residual, scaled_system
 
 
 def polyharmonic_weights(
@@ -30,7 +24,7 @@ def polyharmonic_weights(
     exponent = 2 * degree + 3
     radius, scaled, values, root = scaled_system(coords, degree)
     batch, _, dim = coords.shape
-    functionals = functionals_of(dim, degree).to(coords)
+    wanted = functionals(dim, degree).to(coords)
     coefficients, condition = left_inverse(values, root)
 
     nodes = torch.cat([scaled.new_zeros(batch, 1, dim), scaled], dim=1)
@@ -39,23 +33,17 @@ def polyharmonic_weights(
     polynomials = torch.cat([torch.ones_like(nodes[..., :1]), monomials(nodes, degree)], dim=-1)
     num_points, num_polynomials = polynomials.shape[1:]
     zero = kernel.new_zeros(batch, num_polynomials, num_polynomials)
-    matrix = torch.cat(
-        [
-            torch.cat([kernel, polynomials], dim=2),
-            torch.cat([polynomials.mT, zero], dim=2),
-        ],
-        dim=1,
-    )
-    constant = functionals.new_zeros(1, functionals.shape[1])
-    exact = torch.cat([constant, functionals]).expand(batch, -1, -1)
+    upper = torch.cat([kernel, polynomials], dim=2)
+    matrix = torch.cat([upper, torch.cat([polynomials.mT, zero], dim=2)], dim=1)
+    exact = torch.cat([wanted.new_zeros(1, dim + 1), wanted]).expand(batch, -1, -1)
     right = torch.cat([_kernel_derivatives(nodes, exponent), exact], dim=1)
     factors, pivots, _ = torch.linalg.lu_factor_ex(matrix)
     weights = torch.linalg.lu_solve(factors, pivots, right)[:, :num_points]
     moments = values.mT @ weights[:, 1:]
     # Points that nearly coincide have weights of any size, which cancel up to rounding.
     rounding = torch.finfo(weights.dtype).eps * weights.abs().sum(1).amax(1)
-    violation = (moments - functionals).abs().amax((1, 2)) + rounding
-    residual = violation / functionals.abs().max()
+    violation = (moments - wanted).abs().amax((1, 2)) + rounding
+    residual = violation / wanted.abs().max()
     left = torch.zeros_like(radius)
     if heights is not None:
         left = height_residual(values, coefficients, root, coords, heights)

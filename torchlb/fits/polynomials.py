@@ -90,22 +90,13 @@ def _lowered(dim: int, degree: int) -> tuple[Float[Tensor, "M d"], Int[Tensor, "
     return alpha.double(), torch.tensor(place)
 
 
-def gradient_functional(dim: int, degree: int) -> Float[Tensor, "M d"]:
-    """∂_c y^α (0) for c = 1 … d: 1 where α = e_c.
+def functionals(dim: int, degree: int) -> Float[Tensor, "M F"]:
+    """The d first derivatives of every monomial at y = 0, 1 where α = e_c, then Δ, 2 where α = 2 e_c.
 
-    >>> gradient_functional(2, 2).T.tolist()
-    [[1.0, 0.0, 0.0, 0.0, 0.0], [0.0, 1.0, 0.0, 0.0, 0.0]]
+    >>> functionals(2, 2).T.tolist()
+    [[1.0, 0.0, 0.0, 0.0, 0.0], [0.0, 1.0, 0.0, 0.0, 0.0], [0.0, 0.0, 2.0, 0.0, 2.0]]
     """
     alpha = exponents(dim, degree)
-    unit = torch.eye(dim, dtype=alpha.dtype)
-    return (alpha[:, None, :] == unit).all(-1).double()
-
-
-def laplacian_functional(dim: int, degree: int) -> Float[Tensor, "M 1"]:
-    """Σ_c ∂_c² y^α (0): 2 where α = 2 e_c.
-
-    >>> laplacian_functional(2, 2).T.tolist()
-    [[0.0, 0.0, 2.0, 0.0, 2.0]]
-    """
-    alpha = exponents(dim, degree)
-    return 2 * ((alpha == 2).any(1) & (alpha.sum(1) == 2)).double()[:, None]
+    gradient = (alpha[:, None, :] == torch.eye(dim, dtype=alpha.dtype)).all(-1)
+    laplacian = 2 * ((alpha == 2).any(1) & (alpha.sum(1) == 2))
+    return torch.cat([gradient, laplacian[:, None]], dim=1).double()

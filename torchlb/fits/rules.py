@@ -29,15 +29,7 @@ SIZE_FACTORS = {
 
 
 class Reference(NamedTuple):
-    """Figures of a good stencil.
-
-    Attributes
-    ----------
-    growth
-        ρ² Σ|w|.
-    off_diagonal_ratio
-        Σ_{j≠i}|w_j| / |w_i|.
-    """
+    """Figures of a good stencil: the growth ρ² Σ|w|, and the ratio Σ_{j≠i}|w_j| / |w_i|."""
 
     growth: float
     off_diagonal_ratio: float
@@ -65,11 +57,10 @@ def reference(
     nodes = nodes[nodes[:, 0] <= 0] if one_sided else nodes
     square = nodes.square().sum(1)
     nodes = nodes[(square <= square.sort().values[count - 1]) & (square > 0)]
-    flux = None
+    options = {}
     if one_sided:
-        flux = torch.zeros(1, len(nodes) + 1, dim, dtype=torch.float64)
-        flux[0, :, 0] = torch.cat([torch.ones(1), (nodes[:, 0] == 0).double()])
-    options = {} if flux is None else {"flux": flux}
+        options["flux"] = torch.zeros(1, len(nodes) + 1, dim, dtype=torch.float64)
+        options["flux"][0, :, 0] = torch.cat([torch.ones(1), (nodes[:, 0] == 0).double()])
     weights = WEIGHT_RULES[rule](nodes[None], degree, **options)
     center, others = weights.laplacian[0, 0].abs(), weights.laplacian[0, 1:].abs().sum()
     growth = weights.radius[0].square() * (center + others)

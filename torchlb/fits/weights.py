@@ -13,13 +13,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from torchlb.fits.least_squares import left_inverse
-from torchlb.fits.polynomials import (
-    gradient_functional,
-    laplacian_functional,
-    monomial_derivatives,
-    monomials,
-    num_monomials,
-)
+from torchlb.fits.polynomials import functionals, monomial_derivatives, monomials, num_monomials
 from torchlb.linalg.precision import NEGLIGIBLE, ROUNDING, SINGLE
 
 
@@ -58,11 +52,6 @@ class Weights:
         rows = rows.nonzero()[:, 0] if rows.dtype == torch.bool else rows
         return Weights(*(getattr(self, f.name).index_select(0, rows) for f in fields(Weights)))
 
-    def updated(self, rows: Tensor, part: Weights) -> Weights:
-        """Copy with the stencils of these rows replaced by `part`."""
-        names = [f.name for f in fields(Weights)]
-        return Weights(*(getattr(self, n).index_put((rows,), getattr(part, n)) for n in names))
-
     @staticmethod
     def stack(parts: Sequence[Weights]) -> Weights:
         """Concatenate batches of stencils of one size."""
@@ -81,11 +70,6 @@ def window(radius: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
 def _root_window(radius: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
     """√ω."""
     return (1 - (radius / 1.1).square()).clamp_min(0).square()
-
-
-def functionals_of(dim: int, degree: int) -> Float[Tensor, "M F"]:
-    """Right-hand sides: the d first derivatives, then Δ, which is zero below degree 2."""
-    return torch.cat([gradient_functional(dim, degree), laplacian_functional(dim, degree)], dim=1)
 
 
 def finish(
@@ -270,10 +254,10 @@ def least_squares_weights(
     if flux is not None:
         share = torch.as_tensor(share).to(coords).expand(flux.shape[:2]) * radius[:, None]
         values, constant, root = _with_data(scaled, values, root, flux, share, degree)
-    functionals = functionals_of(coords.shape[-1], degree).to(coords)
+    exact = functionals(coords.shape[-1], degree).to(coords)
     coefficients, condition = left_inverse(values, root)
-    rows = functionals.mT @ coefficients
-    residual = (rows @ values - functionals.mT).abs().amax((1, 2)) / functionals.abs().max()
+    rows = exact.mT @ coefficients
+    residual = (rows @ values - exact.mT).abs().amax((1, 2)) / exact.abs().max()
     if flux is not None:
         # The data would hide that points on a line, or in one place, do not determine derivatives across it.
         spread = torch.linalg.svdvals(scaled.nan_to_num())
@@ -328,7 +312,7 @@ def positive_weights(
     """
     keep = torch.ones(coords.shape[:2], dtype=torch.bool)
     weights = least_squares_weights(coords, degree, None, flux, share, heights)
-    first, rows = weights.height_residual, torch.arange(len(coords))
+    first, rows = weights.height_residual.clone(), torch.arange(len(coords))
     for _ in range(coords.shape[1]):
         last = weights[rows]
         others = last.laplacian[:, 1:]
@@ -342,5 +326,6 @@ def positive_weights(
         conormals = None if flux is None else flux[rows]
         own = share[rows] if isinstance(share, Tensor) else share
         again = least_squares_weights(coords[rows], degree, keep[rows], conormals, own)
-        weights = weights.updated(rows, again)
+        for f in fields(Weights):
+            getattr(weights, f.name)[rows] = getattr(again, f.name)
     return replace(weights, height_residual=first)

@@ -16,12 +16,14 @@ import torch
 from jaxtyping import Bool, Float, Int
 from scipy import sparse
 from torch import Tensor
+from torch.nn.functional import normalize
 
 from torchlb.geometry.fit_search import FitSearch
 from torchlb.geometry.frames import mesh_frames, normals_of_frames
 from torchlb.geometry.local_fits import FitPlan, LocalFits
 from torchlb.geometry.neighbors import GraphNeighborhoods, mesh_graph
 from torchlb.geometry.thresholds import CREASE, KINK
+from torchlb.linalg.precision import TINY
 
 
 @dataclass(frozen=True)
@@ -194,7 +196,7 @@ def outward_sums(
     size = torch.diagonal(triangle, dim1=-2, dim2=-1).prod(-1).abs()
     offset = (corners[:, 0] - vertices[opposite])[..., None]
     height = (offset - basis @ (basis.mT @ offset))[..., 0]
-    normal = size[:, None] * _unit(height)
+    normal = size[:, None] * normalize(height, dim=-1, eps=TINY)
     outward, total = torch.zeros_like(vertices), torch.zeros_like(vertices[:, 0])
     for corner in sides.T:
         outward.index_add_(0, corner, normal)
@@ -217,9 +219,4 @@ def _conormals(
     side = (conormal * outward).sum(-1, keepdim=True)
     conormal = torch.where(side < 0, -conormal, conormal)
     within = (frames @ (frames.mT @ outward[..., None]))[..., 0]
-    return torch.where(crease[:, None], _unit(within), conormal)
-
-
-def _unit(vectors: Float[Tensor, "G n"]) -> Float[Tensor, "G n"]:
-    """Vectors scaled to length one; zero stays zero."""
-    return torch.nn.functional.normalize(vectors, dim=-1, eps=torch.finfo(vectors.dtype).tiny)
+    return torch.where(crease[:, None], normalize(within, dim=-1, eps=TINY), conormal)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from itertools import product
 from math import ceil
 from typing import NamedTuple
 
@@ -17,18 +18,9 @@ from torchlb.linalg.precision import rows_at_once
 
 
 class Candidate(NamedTuple):
-    """Size of a neighbourhood, and the fit to be made in it.
+    """Degree of polynomials, size K of a neighbourhood with its centre, and rule of the weights, of `WEIGHT_RULES`.
 
-    Attributes
-    ----------
-    degree
-        Degree of the polynomials.
-    size
-        Number of points K, the centre included.
-    rule
-        Rule of the weights, a key of `WEIGHT_RULES`.
-    factor
-        Points per polynomial, from `SIZE_FACTORS`; 0 where the user has fixed the size.
+    The factor is that of `SIZE_FACTORS`, points per polynomial; 0 where the user has fixed the size.
     """
 
     degree: int
@@ -51,14 +43,11 @@ def list_candidates(
     Candidate(degree=2, size=20, rule='least_squares', factor=0.0)
     """
     found = []
-    for degree in degrees:
-        count = num_monomials(dim, degree)
-        for rule in rules:
-            if num_neighbors is not None:
-                found.append(Candidate(degree, num_neighbors, rule))
-                continue
-            sizes = [(ceil(factor * count - 1e-9), factor) for factor in SIZE_FACTORS[rule]]
-            found += [Candidate(degree, size, rule, factor) for size, factor in sizes]
+    for degree, rule in product(degrees, rules):
+        count, factors = num_monomials(dim, degree), SIZE_FACTORS[rule]
+        sizes = [(ceil(factor * count - 1e-9), factor) for factor in factors]
+        sizes = sizes if num_neighbors is None else [(num_neighbors, 0.0)]
+        found += [Candidate(degree, size, rule, factor) for size, factor in sizes]
     return found
 
 
@@ -95,12 +84,7 @@ class Search:
 
     Iteration yields (number of the candidate, rows of `centers` that try it, their neighbourhoods (b, K)), in chunks
     whose (b, K, M) arrays stay below `BYTES`. Rows are to be settled, or turned away from further candidates, before
-    the next chunk.
-
-    Parameters
-    ----------
-    start
-        First candidate of each row; the very first by default.
+    the next chunk. Each begins with its candidate `start`, by default the very first.
     """
 
     def __init__(
@@ -125,8 +109,7 @@ class Search:
     def __iter__(self) -> Iterator[tuple[int, Int[Tensor, " b"], Int[Tensor, "b K"]]]:
         """Yield the candidates that some rows can try; neighbourhoods start small, since most rows settle early."""
         pending, dim = torch.arange(len(self.centers)), self.neighborhoods.frames.shape[-1]
-        held = 0
-        index = count = torch.empty(0)
+        held, index, count = 0, torch.empty(0), torch.empty(0)
         for number, candidate in enumerate(self.candidates):
             left = self._next[pending] < len(self.candidates)
             if not left.all():

@@ -56,22 +56,20 @@ def compatible(
     over the centre's plane is at most 0.5 of its distance. `planes` are frames E, or the unit normals of a
     hypersurface, for which σ_min(E_kᵀE_i) = |n_k·n_i| takes less time. Orientation is irrelevant.
     """
-    parts = zip(centers.split(AT_ONCE), others.split(AT_ONCE), strict=True)
-    return torch.cat([_admissible_part(points, planes, *part) for part in parts])
-
-
-def _admissible_part(points: Tensor, planes: Tensor, centers: Tensor, others: Tensor) -> Tensor:
-    offset = at(points, others) - at(points, centers)
-    total = dot(offset, offset)
-    mine, theirs = at(planes, centers), at(planes, others)
-    if planes.ndim == 3:
-        flat = torch.einsum("pn,pnd->pd", offset, mine)
-        height = total - dot(flat, flat)
-        cosine = _smallest_singular_value(theirs, mine)
-    else:
-        height = dot(offset, mine).square()
-        cosine = dot(theirs, mine).abs()
-    return (height <= HALF_CREASE**2 * total) & (cosine >= CREASE)
+    found = []
+    for one, other in zip(centers.split(AT_ONCE), others.split(AT_ONCE), strict=True):
+        offset = at(points, other) - at(points, one)
+        total = dot(offset, offset)
+        mine, theirs = at(planes, one), at(planes, other)
+        if planes.ndim == 3:
+            flat = torch.einsum("pn,pnd->pd", offset, mine)
+            height = total - dot(flat, flat)
+            cosine = _smallest_singular_value(theirs, mine)
+        else:
+            height = dot(offset, mine).square()
+            cosine = dot(theirs, mine).abs()
+        found.append((height <= HALF_CREASE**2 * total) & (cosine >= CREASE))
+    return torch.cat(found)
 
 
 def admissible_neighbors(
@@ -111,5 +109,5 @@ def thin_sides(
     thin = torch.zeros(len(points), dtype=torch.bool)
     thin[both[:, alike]] = True
     beside = thin[i] | thin[j]
-    thin[torch.cat([i[beside], j[beside]])] = True
+    thin[i[beside]] = thin[j[beside]] = True
     return oriented * thin[:, None]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from math import ceil
 
 import torch
@@ -15,7 +16,7 @@ from torchlb.geometry.local_fits import FitPlan, LocalFits, Neighborhoods, slope
 from torchlb.geometry.neighbors import GraphNeighborhoods
 from torchlb.geometry.thresholds import CREASE, ROUGH, SLIGHT, WIDER
 from torchlb.geometry.vectors import at
-from torchlb.linalg.precision import AT_ONCE, NEGLIGIBLE, rows_at_once
+from torchlb.linalg.precision import AT_ONCE, NEGLIGIBLE
 
 MAX_LEBESGUE = 10.0
 """Largest Lebesgue constant of a fit at the midpoints of the edges of its vertex; that of good fits is below 2."""
@@ -26,37 +27,6 @@ REASONS = (
     "points do not resolve the surface",
 )
 IN_ROWS = REASONS.index("neighbours too close to a line or conic")
-
-
-class _Buffer:
-    """Append-only rows of several tensors, in large chunks of which only the filled rows take memory.
-
-    Thousands of small arrays kept between temporary ones would fragment the memory.
-    """
-
-    def __init__(self, room: int) -> None:
-        self.room, self.filled = min(room, rows_at_once(1)), 0
-        self.pieces: list[list[Tensor]] = []
-
-    def add(self, *rows: Tensor) -> None:
-        count = len(rows[0])
-        if not self.pieces or self.filled + count > len(self.pieces[-1][0]):
-            self._close()
-            room = max(self.room, count)
-            self.pieces.append([row.new_empty(room, *row.shape[1:]) for row in rows])
-            self.filled = 0
-        for column, row in zip(self.pieces[-1], rows, strict=True):
-            column[self.filled : self.filled + count] = row
-        self.filled += count
-
-    def _close(self) -> None:
-        if self.pieces:
-            self.pieces[-1] = [column[: self.filled] for column in self.pieces[-1]]
-
-    def rows(self) -> list[list[Tensor]]:
-        """All chunks, cut to the rows that are filled."""
-        self._close()
-        return self.pieces
 
 
 class FitSearch:
@@ -92,8 +62,8 @@ class FitSearch:
             torch.zeros(6, count, dtype=torch.int64)
         )
         self.reason, self._takings = torch.ones_like(self.order), 0
-        self._surface: dict[int, dict[int, _Buffer]] = {}
-        self._functions: dict[int, dict[int, _Buffer]] = {}
+        self._surface: dict[tuple[int, int], list[tuple[Tensor, ...]]] = {}
+        self._functions: dict[tuple[int, int], list[tuple[Tensor, ...]]] = {}
 
     def refine(self, centers: Int[Tensor, " B"]) -> None:
         """Find the tangent planes at `centers`, and try the same neighbourhoods for fits of functions.
@@ -136,16 +106,13 @@ class FitSearch:
                 keep = torch.arange(1, few) < count[some, None]
                 self._try(_block(degree, vertices[some], index[some], keep))
         surface, functions = [], []
-        for degree, buffers in self._surface.items():
-            for rows in (rows for buffer in buffers.values() for rows in buffer.rows()):
-                *block, owner = rows
-                block[-1] &= self.owner[block[0]] == owner
-                surface.append(_kept(degree, block, block[-1] | block[-2]))
-        for degree, buffers in self._functions.items():
-            for rows in (rows for buffer in buffers.values() for rows in buffer.rows()):
-                *block, coefficients = rows
-                functions.append(Neighborhoods(degree, *(column.clone() for column in block)))
-                self.fits.coefficients.append(coefficients)
+        for degree, (*block, owner) in _joined(self._surface):
+            block[-1] &= self.owner[block[0]] == owner
+            kept = block[-1] | block[-2]
+            surface.append(Neighborhoods(degree, *(column[kept] for column in block)))
+        for degree, (*block, coefficients) in _joined(self._functions):
+            functions.append(Neighborhoods(degree, *block))
+            self.fits.coefficients.append(coefficients)
         counts = self.order, self.surface_degree, self.degree, self.reason, self.size
         settings = self.highest, self.jet, self.reach
         return FitPlan(surface, functions, *counts, *settings), self.fits
@@ -183,7 +150,7 @@ class FitSearch:
             none = torch.zeros(2, len(found), dtype=torch.bool)
             points, kept = block.points[good].int(), fit.coefficients[good, :terms]
             rows = found, points, block.keep[good], *none, kept
-            self._pile(self._functions, block).add(*rows)
+            self._functions.setdefault((block.degree, size), []).append(rows)
             self.degree[found], self.size[found] = block.degree, size
             self.fits.radius[found] = fit.radius[good]
         return good
@@ -217,12 +184,9 @@ class FitSearch:
             self.owner[vertices[new]] = self._takings
             columns = (vertices, block.points.int(), block.keep, frame, new)
             owner = torch.full((len(rows),), self._takings)
-            self._pile(self._surface, block).add(*(at(column, rows) for column in columns), owner)
+            pile = self._surface.setdefault((block.degree, block.points.shape[1]), [])
+            pile.append((*(at(column, rows) for column in columns), owner))
         return good
-
-    def _pile(self, buffers: dict[int, dict[int, _Buffer]], block: Neighborhoods) -> _Buffer:
-        of_degree = buffers.setdefault(block.degree, {})
-        return of_degree.setdefault(block.points.shape[1], _Buffer(len(self.order)))
 
 
 def _block(
@@ -237,8 +201,13 @@ def _block(
     return Neighborhoods(degree, vertices, points, keep, *none)
 
 
-def _kept(degree: int, columns: list[Tensor], rows: Bool[Tensor, " b"]) -> Neighborhoods:
-    return Neighborhoods(degree, *(column[rows] for column in columns))
+def _joined(
+    piles: dict[tuple[int, int], list[tuple[Tensor, ...]]],
+) -> Iterator[tuple[int, list[Tensor]]]:
+    """Yield the degree of every pile and its columns joined; the piles are emptied."""
+    while piles:
+        degree, _ = key = next(iter(piles))
+        yield degree, [torch.cat(column) for column in zip(*piles.pop(key), strict=True)]
 
 
 def is_regular(fit: CenteredFit, middles: Tensor, degree: int) -> Bool[Tensor, " B"]:

@@ -7,7 +7,7 @@ frame of order q.
 
 from __future__ import annotations
 
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 import torch
 from jaxtyping import Float, Int
@@ -16,6 +16,9 @@ from torch import Tensor
 from torchlb.geometry.vectors import at, dot
 from torchlb.linalg.once import once_differentiable
 from torchlb.linalg.precision import ROUNDING
+
+Projection = Literal["tangent", "normal"]
+PROJECTIONS = get_args(Projection)
 
 
 def mesh_frames(
@@ -79,44 +82,34 @@ def orthonormalized(frames: Float[Tensor, "B n d"]) -> Float[Tensor, "B n d"]:
 def local_offsets(
     points: Float[Tensor, "N n"],
     frames: Float[Tensor, "N n d"],
-    centers: Int[Tensor, " B"],
-    neighbors: Int[Tensor, "B K"],
+    index: Int[Tensor, "B K"],
     projection: str,
-) -> Float[Tensor, "B K d"]:
-    """Coordinates y of the neighbours in the centre's tangent plane, in its frame.
+) -> Float[Tensor, "B neighbors d"]:
+    """Coordinates y of the neighbours in the centre's tangent plane, in its frame; `index` has the centre first.
 
     `"tangent"`: y = E_iᵀ e, the orthogonal projection of the offset e. `"normal"`: y = (E_kᵀ E_i)⁻¹ E_kᵀ e, the
     projection along the neighbour's normals, as in the note (with its sign corrected). Both give order p; see
     `method.md`, section 3.
     """
-    return PROJECTIONS[projection](points, frames, centers, neighbors)
-
-
-def local_heights(
-    points: Float[Tensor, "N n"],
-    frames: Float[Tensor, "N n d"],
-    centers: Int[Tensor, " B"],
-    neighbors: Int[Tensor, "B K"],
-    coords: Float[Tensor, "B K d"],
-) -> Float[Tensor, "B K n"]:
-    """Heights e − E_i y of the neighbours over their coordinates y in the centre's tangent plane, as vectors in Rⁿ."""
-    return at(points, neighbors) - at(points, centers)[:, None] - coords @ at(frames, centers).mT
-
-
-def _tangent_offsets(points: Tensor, frames: Tensor, centers: Tensor, neighbors: Tensor) -> Tensor:
-    return (at(points, neighbors) - at(points, centers)[:, None]) @ at(frames, centers)
-
-
-def _normal_offsets(points: Tensor, frames: Tensor, centers: Tensor, neighbors: Tensor) -> Tensor:
+    centers, neighbors = index[:, 0], index[:, 1:]
     offset = at(points, neighbors) - at(points, centers)[:, None]
+    if projection == "tangent":
+        return offset @ at(frames, centers)
     theirs = at(frames, neighbors).mT  # (B, K, d, n)
     product, right = theirs @ frames[centers, None], theirs @ offset[..., None]
     solution, _ = torch.linalg.solve_ex(product, right)  # not finite where planes are orthogonal
     return solution[..., 0]
 
 
-Projection = Literal["tangent", "normal"]
-PROJECTIONS = {"tangent": _tangent_offsets, "normal": _normal_offsets}
+def local_heights(
+    points: Float[Tensor, "N n"],
+    frames: Float[Tensor, "N n d"],
+    index: Int[Tensor, "B K"],
+    coords: Float[Tensor, "B neighbors d"],
+) -> Float[Tensor, "B neighbors n"]:
+    """Heights e − E_i y of the neighbours over their coordinates y in the centre's tangent plane, as vectors in Rⁿ."""
+    offset = at(points, index[:, 1:]) - at(points, index[:, 0])[:, None]
+    return offset - coords @ at(frames, index[:, 0]).mT
 
 
 def complete_frames(normals: Float[Tensor, "N n"]) -> Float[Tensor, "N n d"]:
@@ -135,9 +128,8 @@ def normals_of_frames(frames: Float[Tensor, "N n d"]) -> Float[Tensor, "N n"]:
         return torch.linalg.cross(*frames.unbind(-1))
     basis, _ = torch.linalg.qr(frames, mode="complete")
     normal = basis[..., -1:]
-    return (normal * torch.linalg.det(torch.cat([frames, normal], -1)).sign()[:, None, None])[
-        ..., 0
-    ]
+    hand = torch.linalg.det(torch.cat([frames, normal], -1)).sign()
+    return hand[:, None] * normal[..., 0]
 
 
 def _edges(vertices: Float[Tensor, "N n"], faces: Int[Tensor, "F v"]) -> Float[Tensor, "F edges n"]:
@@ -146,29 +138,22 @@ def _edges(vertices: Float[Tensor, "N n"], faces: Int[Tensor, "F v"]) -> Float[T
     return corners[:, 1:] - corners[:, :1]
 
 
-def face_normals(vertices: Float[Tensor, "N n"], faces: Int[Tensor, "F n"]) -> Float[Tensor, "N n"]:
-    """Area-weighted sum of the normals of the faces at every vertex (segments in R², triangles in R³).
+def vertex_normals(
+    vertices: Float[Tensor, "N n"], faces: Int[Tensor, "F n"]
+) -> Float[Tensor, "N n"]:
+    """Unit mean of the normals of the faces (segments in R², triangles in R³) at every vertex, weighted by area.
 
-    Counter-clockwise triangles face the viewer, counter-clockwise polygons outward.
+    Counter-clockwise triangles face the viewer, counter-clockwise polygons outward. Zero where the mean vanishes up to
+    the rounding of the faces.
     """
     edges = _edges(vertices, faces)
     if vertices.shape[1] == 3:
         normal = torch.linalg.cross(edges[:, 0], edges[:, 1])
     else:
         normal = torch.stack([edges[:, 0, 1], -edges[:, 0, 0]], dim=-1)
-    total = torch.zeros_like(vertices)
+    total, size = torch.zeros_like(vertices), torch.zeros_like(vertices[:, 0])
     for corner in faces.T:
         total.index_add_(0, corner, normal)
-    return total
-
-
-def vertex_normals(
-    vertices: Float[Tensor, "N n"], faces: Int[Tensor, "F n"]
-) -> Float[Tensor, "N n"]:
-    """Unit `face_normals`; zero where they vanish up to the rounding of the faces."""
-    total = face_normals(vertices, faces)
-    size, product = torch.zeros_like(vertices[:, 0]), _edges(vertices, faces).norm(dim=-1).prod(1)
-    for corner in faces.T:
-        size.index_add_(0, corner, product)
+        size.index_add_(0, corner, edges.norm(dim=-1).prod(1))
     length = total.norm(dim=1)
     return torch.where((length > ROUNDING * size)[:, None], total / length[:, None], 0.0)

@@ -96,16 +96,9 @@ class FitPlan:
 
 
 class LocalFits:
-    """Tangent planes, graphs and coefficients of the fits at given points.
+    """Tangent planes, graphs and coefficients of the fits at given points, over the `initial` frames.
 
-    Parameters
-    ----------
-    points
-        (N, n), ℓ.
-    initial
-        (N, n, d), initial frames.
-    degree
-        Degree up to which graphs are kept.
+    Graphs are kept up to a degree.
 
     Attributes
     ----------

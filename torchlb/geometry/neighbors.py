@@ -8,6 +8,7 @@ ordered by distance. At a crease, where the tangent planes turn away, the walk e
 
 from __future__ import annotations
 
+from dataclasses import dataclass, field
 from functools import cached_property
 from math import ceil
 
@@ -18,9 +19,7 @@ from scipy import sparse
 from scipy.spatial import KDTree
 from torch import Tensor
 
-from torchlb.geometry.compatibility import (
-    normal_frames,
-)
+from torchlb.geometry.compatibility import normal_frames
 from torchlb.geometry.thresholds import AROUND, CREASE, HALF_CREASE, WIDER
 from torchlb.geometry.vectors import at
 
@@ -63,49 +62,7 @@ def mesh_graph(faces: Int[Tensor, "F v"], num_points: int) -> sparse.csr_array:
     return adjacency(i, j, num_points)
 
 
-def longest_edges(
-    points: Float[Tensor, "N n"], graph: sparse.csr_array, count: int
-) -> Int[Tensor, "N count"]:
-    """Neighbours of every point along its longest edges; padded by the point itself.
-
-    >>> path = mesh_graph(torch.tensor([[0, 1], [1, 2]]), 3)
-    >>> longest_edges(torch.tensor([[0.0], [1.0], [3.0]]), path, 1).tolist()
-    [[1], [2], [1]]
-    """
-    row, col = (torch.from_numpy(end.astype(np.int64)) for end in sparse.coo_array(graph).coords)
-    length = (points[col] - points[row]).square().sum(1)
-    order = torch.from_numpy(np.lexsort((-length.numpy(), row.numpy())))
-    row, col = row[order], col[order]
-    number = torch.bincount(row, minlength=len(points))
-    place = torch.arange(len(row)) - (number.cumsum(0) - number)[row]
-    result = torch.arange(len(points))[:, None].repeat(1, count)
-    keep = place < count
-    result[row[keep], place[keep]] = col[keep]
-    return result
-
-
-class _Level:
-    """Neighbourhoods of one size, of the points asked for so far."""
-
-    def __init__(self, size: int, num_points: int) -> None:
-        self.size, self.held = size, 0
-        self.place = torch.full((num_points,), -1, dtype=torch.int32)
-        self.index = torch.empty(0, size, dtype=torch.int32)
-        self.count = torch.empty(0, dtype=torch.int32)
-
-    def add(self, centers: Tensor, index: Tensor, count: Tensor) -> None:
-        first, self.held = self.held, self.held + len(centers)
-        if self.held > len(self.count):  # double the capacity, at most to all points
-            room = min(max(2 * len(self.count), self.held), len(self.place))
-            for name in ("index", "count"):
-                old = getattr(self, name)
-                new = old.new_empty(room, *old.shape[1:])
-                new[:first] = old[:first]
-                setattr(self, name, new)
-        self.index[first : self.held], self.count[first : self.held] = index.int(), count.int()
-        self.place[centers] = torch.arange(first, self.held, dtype=torch.int32)
-
-
+@dataclass(frozen=True, eq=False)
 class GraphNeighborhoods:
     """Nearest points of a k-hop neighbourhood, for any chunk of centres; results are kept.
 
@@ -121,31 +78,17 @@ class GraphNeighborhoods:
         (N, n) from `thin_sides`; points on the other side of a thin shape are refused. None if unknown.
     """
 
-    def __init__(
-        self,
-        points: Float[Tensor, "N n"],
-        graph: sparse.csr_array,
-        frames: Float[Tensor, "N n d"],
-        sides: Float[Tensor, "N n"] | None = None,
-    ) -> None:
-        self.points = points
-        self.graph = graph
-        self.frames = frames
-        self.sides = sides
-        self._kept: list[_Level] = []
+    points: Float[Tensor, "N n"]
+    graph: sparse.csr_array
+    frames: Float[Tensor, "N n d"]
+    sides: Float[Tensor, "N n"] | None = None
+    # by size, indices and counts of all points; a count of 0 is not known yet; copies share what is found
+    _kept: dict[int, tuple[Tensor, Tensor]] = field(default_factory=dict)
 
     @property
     def dim(self) -> int:
         """Dimension d of the tangent planes."""
         return self.frames.shape[-1]
-
-    def with_frames(
-        self, frames: Float[Tensor, "N n d"], sides: Float[Tensor, "N n"] | None
-    ) -> GraphNeighborhoods:
-        """Same neighbourhoods for slightly different frames, which decide those not found yet."""
-        neighborhoods = GraphNeighborhoods(self.points, self.graph, frames, sides)
-        neighborhoods._kept = self._kept
-        return neighborhoods
 
     @cached_property
     def _arrays(self) -> dict[str, np.ndarray]:
@@ -158,8 +101,18 @@ class GraphNeighborhoods:
 
     @cached_property
     def longest(self) -> Int[Tensor, "N edges"]:
-        """Neighbours of every point along its longest `AROUND` edges, see `longest_edges`."""
-        return longest_edges(self.points, self.graph, AROUND)
+        """Neighbours of every point along its longest `AROUND` edges; padded by the point itself."""
+        points, ends = self.points, sparse.coo_array(self.graph).coords
+        row, col = (torch.from_numpy(end.astype(np.int64)) for end in ends)
+        length = (points[col] - points[row]).square().sum(1)
+        order = torch.from_numpy(np.lexsort((-length.numpy(), row.numpy())))
+        row, col = row[order], col[order]
+        number = torch.bincount(row, minlength=len(points))
+        place = torch.arange(len(row)) - (number.cumsum(0) - number)[row]
+        result = torch.arange(len(points))[:, None].repeat(1, AROUND)
+        keep = place < AROUND
+        result[row[keep], place[keep]] = col[keep]
+        return result
 
     def middles(self, centers: Int[Tensor, " B"]) -> Float[Tensor, "B edges d"]:
         """Midpoints of these edges in the centre's tangent plane, in its frame, ℓ."""
@@ -169,24 +122,19 @@ class GraphNeighborhoods:
     def __call__(
         self, centers: Int[Tensor, " B"], size: int
     ) -> tuple[Int[Tensor, "B K"], Int[Tensor, " B"]]:
-        """The `size` nearest compatible points of each centre, itself first.
+        """The `size` nearest compatible points of each centre, itself first, and how many there are.
 
-        Returns
-        -------
-        index
-            (B, size), padded by the centre where the neighbourhood holds fewer.
-        count
-            (B,), number of points before the padding.
+        Where the neighbourhood holds fewer, the centre is repeated.
         """
-        level = next((kept for kept in self._kept if kept.size >= size), None)
-        if level is None:
-            level = _Level(size, len(self.points))
-            self._kept.append(level)
-        missing = centers[level.place[centers] < 0]
+        largest = next((kept for kept in self._kept if kept >= size), size)
+        if largest not in self._kept:  # rows take memory once they are filled
+            index = torch.empty(len(self.points), largest, dtype=torch.int32)
+            self._kept[largest] = index, torch.zeros(len(index), dtype=torch.int32)
+        index, count = self._kept[largest]
+        missing = centers[count[centers] == 0]
         if len(missing):
-            level.add(missing, *self._grown(missing, level.size))
-        place = level.place[centers]
-        return level.index[place, :size].long(), level.count[place].long().clamp_max(size)
+            index[missing], count[missing] = self._grown(missing, largest)
+        return index[centers, :size].long(), count[centers].long().clamp_max(size)
 
     def _grown(
         self, centers: Int[Tensor, " B"], size: int

@@ -25,12 +25,8 @@ def conjugate_gradients(
     """Return A⁻¹b for a symmetric A ≥ 0, and the number of steps; each column has its own step lengths.
 
     Iterations stop when √(rᵀBr) ≤ `tolerance` √(bᵀBb) for every residual r, B the preconditioner, which estimates the
-    relative error in the norm of A. b has to be in the range of A.
-
-    Raises
-    ------
-    DiffusionError
-        If that is not reached within `max_steps`, or b is not finite.
+    relative error in the norm of A. b has to be in the range of A. Raises DiffusionError if that is not reached within
+    `max_steps`, or b is not finite.
 
     >>> a = torch.tensor([[2.0, 1.0], [1.0, 3.0]])
     >>> x, steps = conjugate_gradients(lambda v: a @ v, torch.tensor([[3.0], [4.0]]), lambda r: r, tolerance=1e-5)

@@ -93,13 +93,6 @@ class Tensors(nn.Module):
 class Record(Tensors):
     """Tensors with a row for each point; those of a batch concatenate the rows of its shapes.
 
-    Parameters
-    ----------
-    tensors
-        (N, …), of any type.
-    persistent
-        Whether `state_dict` includes them.
-
     >>> record = Record({"order": torch.tensor([3, 3, 0])})
     >>> [part.order.tolist() for part in record.split([2, 1])]
     [[3, 3], [0]]

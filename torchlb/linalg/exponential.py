@@ -57,35 +57,6 @@ def spectral_radius(stiffness: sparse.csr_array, mass: Float[np.ndarray, " N"]) 
     return radius
 
 
-def heat(
-    pattern: Sequence[Tensor],
-    values: Float[Tensor, " nnz"],
-    x: Float[Tensor, "N C"],
-    time: Float[Tensor, " C"],
-    radius: Float[Tensor, ""],
-    tolerance: float,
-    sizes: Sequence[int],
-) -> Float[Tensor, "N C"]:
-    """e^{t_c L}x_c for every channel c, differentiable once in x and t.
-
-    Parameters
-    ----------
-    pattern
-        [crow, col] of L.
-    values
-        Values of L, 1/ℓ²; they get no gradient.
-    time
-        t ≥ 0, ℓ².
-    radius
-        R, in float64 on the CPU: a tensor, since a number would be compiled anew for every operator.
-    tolerance
-        Error of the result, relative to x.
-    sizes
-        Numbers of rows of the diagonal blocks of L; (N,) for one shape.
-    """
-    return _heat(list(pattern), values, x, time, radius, tolerance, list(sizes))
-
-
 SCHEMA = (
     "(Tensor[] pattern, Tensor values, Tensor x, Tensor time, Tensor radius, float tolerance, "
     "SymInt[] sizes"
@@ -93,7 +64,13 @@ SCHEMA = (
 
 
 @torch.library.custom_op("torchlb::heat", mutates_args=(), schema=SCHEMA + ") -> Tensor")
-def _heat(pattern: Any, values: Tensor, x: Tensor, time: Tensor, *options: Any) -> Tensor:
+def heat(pattern: Any, values: Tensor, x: Tensor, time: Tensor, *options: Any) -> Tensor:
+    """e^{t_c L}x_c for every channel c, differentiable once in x and in the times t ≥ 0, ℓ².
+
+    `pattern` is [crow, col] of L; its values, 1/ℓ², get no gradient. The radius R is a float64 tensor on the CPU, since
+    a number would be compiled anew for every operator. The tolerance is relative to x; `sizes` are the numbers of rows
+    of the diagonal blocks of L, (N,) for one shape.
+    """
     y = torch.zeros_like(x, memory_format=torch.contiguous_format)
     for where, vector, coefficient, _ in _terms(pattern, values, x, time, *options):
         _add_scaled(y, where, vector, coefficient)
@@ -117,7 +94,7 @@ def _heat_backward(
     return grad_x, grad_t
 
 
-@_heat.register_fake
+@heat.register_fake
 def _(pattern: Any, values: Any, x: Tensor, *_: Any) -> Tensor:
     return torch.empty_like(x, memory_format=torch.contiguous_format)
 
@@ -138,7 +115,7 @@ def _backward(ctx: Any, grad: Tensor) -> tuple[Any, ...]:
     return [None] * len(pattern), None, *gradients, None, None, None
 
 
-_heat.register_autograd(_backward, setup_context=_save)
+heat.register_autograd(_backward, setup_context=_save)
 
 
 def _add_scaled(
@@ -214,9 +191,8 @@ def _polynomial(
     scaled = values * (2 / max(radius, TINY))
     for rows, matrix in _blocks(crow, col, scaled, x, sizes):
 
-        def shifted(v: Tensor, matrix: Any = matrix) -> Tensor:
-            crow, col, values = matrix
-            return multiply(crow, col, values, v).add_(v)
+        def shifted(v: Tensor, matrix: tuple[Tensor, Tensor, Tensor] = matrix) -> Tensor:
+            return multiply(*matrix, v).add_(v)
 
         for k, v in enumerate(chebyshev_vectors(shifted, x[rows], len(c))):
             yield (rows, slice(None)), v, c[k], radius * slope[k]

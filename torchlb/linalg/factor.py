@@ -71,10 +71,7 @@ def _check_real(name: str, is_complex: bool) -> None:
 class Factor:
     """A⁻¹ of a sparse matrix, factored in float64, once for each device of a right-hand side.
 
-    Attributes
-    ----------
-    is_cholesky
-        Whether the factor is Cholesky's, and the matrix thus positive definite.
+    `is_cholesky` says whether the factor is Cholesky's, and the matrix thus positive definite.
     """
 
     def __init__(self, matrix: sparse.csr_array) -> None:

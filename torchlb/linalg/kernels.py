@@ -63,14 +63,8 @@ def _scale(x: np.ndarray, factor: np.ndarray) -> None:
 def left_inverse(columns: np.ndarray, root: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """C = R⁻¹Qᵀ√ω of √ω V = QR by modified Gram–Schmidt, and the norms of R⁻¹.
 
-    `LANES` matrices are interleaved in memory, so that loops over them are vectorised.
-
-    Parameters
-    ----------
-    columns
-        (B, M, K), columns of every V, each contiguous.
-    root
-        (B, K), √ω.
+    `columns` are those of every V, (B, M, K), `root` is √ω, (B, K). `LANES` matrices are interleaved in memory, so that
+    loops over them are vectorised.
     """
     batch, terms, size = columns.shape
     lanes = max(min(LANES, batch), 1)
@@ -217,22 +211,10 @@ def k_hop_neighborhoods(
 ) -> tuple[np.ndarray, np.ndarray]:
     """The `size` nearest points of each k-hop neighbourhood, padded by the centre, and how many are real.
 
-    Parameters
-    ----------
-    points
-        (N, n).
-    normals
-        (N, n, n − d), orthonormal frames of the normal spaces.
-    sides
-        (N, n), side vectors: a point opposed to the centre's is rejected; zero where no sides are known.
-    indptr, indices
-        CSR pattern of the graph, without loops.
-    centers
-        (B,).
-    wanted, rings
-        Number of points, or of rings, at which a neighbourhood stops growing.
-    slope, alignment
-        Bounds of `compatible`.
+    Points are (N, n), `normals` orthonormal frames of their normal spaces, (N, n, n − d), `sides` vectors (N, n): a
+    point opposed to the centre's is rejected; they are zero where no sides are known. `indptr` and `indices` are the
+    CSR pattern of the graph, without loops. A neighbourhood stops growing at `wanted` points, or after so many rings;
+    `slope` and `alignment` are the bounds of `compatible`.
     """
     num_points, _, m = normals.shape
     index, count = np.empty((len(centers), size), np.int32), np.empty(len(centers), np.int32)

@@ -72,22 +72,16 @@ def lanczos(
 ) -> Pairs:
     """The k smallest eigenpairs except `null`, ascending and M-orthonormal, and `more` less accurate ones.
 
-    The Krylov space of (K + shift M)⁻¹M from fixed pseudo-random vectors is orthogonalised in full, without restarts.
+    The Krylov space of (K + shift M)⁻¹M, a product `solve` and M, from fixed pseudo-random vectors is orthogonalised in
+    full, without restarts. The shift, in the unit of λ, is small and positive; `least` is the smallest one worth trying
+    instead. The tolerance bounds the residuals in the M-norm, relative to 1/(λ + shift); the error of eigenvalues is
+    about its square.
 
-    Parameters
-    ----------
-    solve, mass_matrix
-        Product with (K + shift M)⁻¹, K positive semidefinite, (N, N); and M, positive definite.
-    shift, least
-        Small positive shift, in the unit of λ, and the smallest one worth trying instead.
-    tolerance
-        Bound on the residuals in the M-norm, relative to 1/(λ + shift); the error of eigenvalues is about its square.
-
-    Raises ShiftTooLarge if `LOW` times the shift serves better, and `least` allows that; EigenbasisError if N vectors
-    do not suffice, or `ROUNDS` times those requested.
+    Raises ShiftTooLarge if `LOW` times the shift serves better and `least` allows it; EigenbasisError if N vectors do
+    not suffice, or `ROUNDS` times those requested.
     """
-    size, count = len(mass_matrix.diagonal()), k + more
-    generator, first = np.random.default_rng(0), int(null is not None)
+    size, count, first = len(mass_matrix.diagonal()), k + more, int(null is not None)
+    generator, kind = np.random.default_rng(0), np.float32 if tolerance > SMALL else np.float64
     basis, dual = (np.empty((min(4 * count + 4 * BLOCK, size), size)) for _ in range(2))  # V, MV
     if null is not None:
         basis[0], dual[0] = null, mass_matrix @ null
@@ -101,15 +95,15 @@ def lanczos(
         except np.linalg.LinAlgError:  # the space is invariant: go on from new vectors
             z = generator.standard_normal((BLOCK, size))
             _orthogonalise(z, basis[:end], dual[:end], 2)
-            z, mz, r = _orthonormal(z, mass_matrix)
-            r = np.zeros_like(r)
+            (z, mz, _), r = _orthonormal(z, mass_matrix), np.zeros((BLOCK, BLOCK))
         if end >= look:
             theta, y = linalg.eigh(np.triu(h[first:, first:]), lower=False)
             theta, y = theta[: -count - 1 : -1], y[:, : -count - 1 : -1]
             if (bound := max(1 / theta[k - 1] - shift, least)) < LOW * shift:
                 raise ShiftTooLarge(bound)
             if (np.linalg.norm(r @ y[-BLOCK:, :k], axis=0) <= tolerance * theta[:k]).all():
-                return 1 / theta - shift, _combined(basis[first:end], y, tolerance)
+                found = basis[first:end].astype(kind, copy=False), y.astype(kind, copy=False)
+                return 1 / theta - shift, found[0].T @ found[1]
             look = end + CHECK * BLOCK
         if end + BLOCK > len(basis):
             basis, dual = (np.concatenate([x, np.empty_like(x)]) for x in (basis, dual))
@@ -129,12 +123,6 @@ def _orthogonalise(z: np.ndarray, basis: np.ndarray, dual: np.ndarray, passes: i
         z -= coefficients @ basis
         total += coefficients
     return total
-
-
-def _combined(basis: np.ndarray, y: np.ndarray, tolerance: float) -> np.ndarray:
-    """Eigenvectors, from their coefficients."""
-    kind = np.float32 if tolerance > SMALL else np.float64
-    return basis.astype(kind, copy=False).T @ y.astype(kind, copy=False)
 
 
 def _orthonormal(

@@ -119,35 +119,23 @@ def on_one_pattern(one: sparse.csr_array, other: sparse.csr_array) -> bool:
     return np.array_equal(one.indptr, other.indptr) and np.array_equal(one.indices, other.indices)
 
 
-class _Symmetric(torch.autograd.Function):
-    """A x for a symmetric A, whose derivative in x is the same product."""
-
-    @staticmethod
-    def forward(ctx: Any, crow: Tensor, col: Tensor, values: Tensor, x: Tensor) -> Tensor:  # pyright: ignore[reportIncompatibleMethodOverride]
-        ctx.save_for_backward(crow, col, values)
-        return multiply(crow, col, values, x)
-
-    @staticmethod
-    def backward(ctx: Any, g: Tensor) -> tuple[Any, ...]:  # pyright: ignore[reportIncompatibleMethodOverride]
-        crow, col, values = ctx.saved_tensors
-        return None, None, None, symmetric_product(crow, col, values, g)
-
-
 def symmetric_product(
     crow: Int[Tensor, " N_plus_1"],
     col: Int[Tensor, " nnz"],
     values: Float[Tensor, " nnz"],
     x: Float[Tensor, "N C"],
 ) -> Float[Tensor, "N C"]:
-    """A x for a symmetric A, differentiable any number of times in x alone; values and x of one type.
+    """A x for a symmetric A, differentiable any number of times in x alone; types as in `csr_product`.
 
     >>> x = torch.ones(2, 1, requires_grad=True)
     >>> y = symmetric_product(torch.tensor([0, 1, 2]), torch.tensor([0, 1]), torch.tensor([2.0, 4.0]), x)
     >>> torch.autograd.grad(y.sum(), x)[0].T
     tensor([[2., 4.]])
     """
-    product: Any = _Symmetric.apply
-    return product(crow, col, values, x)
+    order = torch.arange(
+        len(col), device=col.device
+    )  # as if A were its own transpose, entry by entry
+    return csr_product([crow, col, crow, col, order], values, x)
 
 
 def _product(*inputs: Any) -> Tensor:
@@ -283,9 +271,8 @@ def from_scipy(matrix: Any) -> tuple[Tensor, Tensor, Tensor]:
 
 def with_diagonal(matrix: sparse.csr_array) -> sparse.csr_array:
     """CSR with every diagonal entry stored, even where it is zero."""
-    row, col = sparse.coo_array(matrix).coords
-    size = len(matrix.indptr) - 1
-    diagonal = np.arange(size)
-    data = np.concatenate([sparse.coo_array(matrix).data, np.zeros(size)])
-    where = (np.concatenate([row, diagonal]), np.concatenate([col, diagonal]))
-    return sparse.csr_array((data, where), shape=(size, size))
+    entries = sparse.coo_array(matrix)
+    (row, col), every = entries.coords, np.arange(len(matrix.indptr) - 1)
+    where = np.append(row, every), np.append(col, every)
+    data = np.append(entries.data, np.zeros(len(every)))
+    return sparse.csr_array((data, where), shape=matrix.shape)

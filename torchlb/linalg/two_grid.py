@@ -24,14 +24,8 @@ def two_grid(product: Linear, sums: Float[Tensor, "N _"], coarse: Linear) -> Lin
     The smoother is a Chebyshev polynomial of degree 2 over the upper three quarters of the spectrum of D⁻¹A, D the
     absolute row sums or more, which bound it by one. Right-hand sides should be scaled to about one.
 
-    Parameters
-    ----------
-    product
-        Product with A, or with an approximation to A on rough functions.
-    sums
-        D, (N, 1), or (N, C) for columns with matrices of their own; rows of zeros are skipped.
-    coarse
-        Solve with an approximation to A on smooth functions.
+    `product` may approximate A on rough functions, the solve `coarse` on smooth ones. `sums` is D, (N, 1), or (N, C)
+    for columns with matrices of their own; rows of zeros are skipped.
 
     >>> diagonal = torch.tensor([[2.0], [4.0]])
     >>> cycle = two_grid(lambda x: diagonal * x, diagonal, torch.zeros_like)

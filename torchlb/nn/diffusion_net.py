@@ -188,14 +188,8 @@ class DiffusionNet(nn.Module):
     def load_original_state_dict(self, state: Mapping[str, Tensor]) -> None:
         """Load the weights of a trained network of the original code; strict.
 
-        ===============================================  ========================================== original
-        here ===============================================  ========================================== first_lin.*,
-        last_lin.*                          the same block_{i}.diffusion.diffusion_time
-        blocks.{i}.diffusion.raw_time, by its time block_{i}.gradient_features.A_re.weight (…)
-        blocks.{i}.gradient_features.A_re.weight block_{i}.mlp.miniMLP_mlp_layer_{jjj}.weight
-        blocks.{i}.mlp.linear_{j}.weight ===============================================
-        ==========================================
-
+        Parameters keep their names, but for ``block_{i}``, which is ``blocks.{i}``, ``mlp.miniMLP_mlp_layer_{jjj}``,
+        which is ``mlp.linear_{j}``, and ``diffusion.diffusion_time``, from which ``diffusion.raw_time`` follows.
         Times below 1e-8, which the original raises to it when it runs, become 1e-8. With method="spectral" and the same
         operators the network then computes the original's results.
 

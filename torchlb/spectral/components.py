@@ -7,16 +7,6 @@ from jaxtyping import Float
 from scipy import linalg
 
 
-def members(component: np.ndarray) -> list[np.ndarray]:
-    """Points of every component, ascending, from the component of each point.
-
-    >>> members(np.array([0, 1, 0]))
-    [array([0, 2]), array([1])]
-    """
-    order = np.argsort(component, kind="stable")
-    return np.split(order, np.cumsum(np.bincount(component))[:-1])
-
-
 def constants(
     component: np.ndarray, areas: Float[np.ndarray, " P"], k: int
 ) -> Float[np.ndarray, "N k"]:
@@ -34,12 +24,7 @@ def constants(
     on = areas > 0
     root = np.sqrt(areas[on])
     values = np.zeros((len(areas), k))
-    values[on] = global_first(root, k) / root[:, None]
+    q = np.linalg.qr(np.column_stack([root, np.eye(len(root), k - 1)]))[0]
+    values[on] = q * np.sign(q[0, 0]) / root[:, None]
     values[on, 0] = 1 / linalg.norm(root)
     return values[component]
-
-
-def global_first(root: Float[np.ndarray, " P"], k: int) -> Float[np.ndarray, "P k"]:
-    """Orthonormal columns, the first along √area, that recombine the constants of components."""
-    t = np.linalg.qr(np.column_stack([root, np.eye(len(root), k - 1)]))[0]
-    return t * np.sign(t[0, 0])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from numbers import Integral
 from typing import Protocol, runtime_checkable
 
@@ -41,6 +42,7 @@ class Spectral(Protocol):
         ...
 
 
+@dataclass(eq=False)
 class Eigenbasis:
     """Eigenpairs of −Δ, K φ = λ M φ: real, ascending, orthonormal in M.
 
@@ -62,18 +64,12 @@ class Eigenbasis:
         (k,) or (S, k), estimates for the eigenvalues; None without estimates.
     """
 
-    def __init__(
-        self,
-        eigenvalues: Float[Tensor, "*S k"],
-        eigenvectors: Float[Tensor, "N k"],
-        mass: Float[Tensor, " N"],
-        left: Float[Tensor, "N k"],
-        sizes: tuple[int, ...] | None = None,
-        relative_errors: Float[Tensor, "*S k"] | None = None,
-    ) -> None:
-        self.eigenvalues, self.eigenvectors = eigenvalues, eigenvectors
-        self.mass, self.left, self.sizes = mass, left, sizes
-        self.relative_errors = relative_errors
+    eigenvalues: Float[Tensor, "*S k"]
+    eigenvectors: Float[Tensor, "N k"]
+    mass: Float[Tensor, " N"]
+    left: Float[Tensor, "N k"]
+    sizes: tuple[int, ...] | None = None
+    relative_errors: Float[Tensor, "*S k"] | None = None
 
     def __repr__(self) -> str:
         n, k = self.eigenvectors.shape
@@ -123,14 +119,12 @@ class Eigenbasis:
         self, functions: Float[Tensor, "N k"], coefficients: Shaped[Tensor, "*S k C"]
     ) -> Float[Tensor, "*B N C"]:
         """Σ_k functions[:, k] c_k; in a batch, with the coefficients of each point's shape."""
-        if torch.is_autocast_enabled(coefficients.device.type):
-            with torch.autocast(coefficients.device.type, enabled=False):
-                return self.synthesise(functions, coefficients)
         functions, c, dtype = self._typed(functions, coefficients)
-        if self.sizes is None:
-            return (functions @ c).to(dtype)
-        parts = zip(functions.split(self.sizes), c.unbind(-3), strict=True)
-        return torch.cat([block @ column for block, column in parts], dim=-2).to(dtype)
+        with torch.autocast(c.device.type, enabled=False):
+            if self.sizes is None:
+                return (functions @ c).to(dtype)
+            parts = zip(functions.split(self.sizes), c.unbind(-3), strict=True)
+            return torch.cat([block @ column for block, column in parts], dim=-2).to(dtype)
 
     def analyse(
         self, functionals: Float[Tensor, "N k"], f: Shaped[Tensor, "*B N C"] | Shaped[Tensor, " N"]
@@ -143,14 +137,12 @@ class Eigenbasis:
             raise InputError(
                 f"expected f of shape (N,) or (…, N, C) with N = {len(self.mass)}, got {tuple(f.shape)}"
             )
-        if torch.is_autocast_enabled(f.device.type):
-            with torch.autocast(f.device.type, enabled=False):
-                return self.analyse(functionals, f)
         functionals, f, dtype = self._typed(functionals, f)
-        if self.sizes is None:
-            return (functionals.mT @ f).to(dtype)
-        parts = zip(functionals.split(self.sizes), f.split(self.sizes, dim=-2), strict=True)
-        return torch.stack([block.mT @ g for block, g in parts], dim=-3).to(dtype)
+        with torch.autocast(f.device.type, enabled=False):
+            if self.sizes is None:
+                return (functionals.mT @ f).to(dtype)
+            parts = zip(functionals.split(self.sizes), f.split(self.sizes, dim=-2), strict=True)
+            return torch.stack([block.mT @ g for block, g in parts], dim=-3).to(dtype)
 
     @staticmethod
     def _typed(functions: Tensor, f: Tensor) -> tuple[Tensor, Tensor, torch.dtype]:

@@ -36,7 +36,7 @@ from torchlb.linalg.precision import (
 )
 from torchlb.linalg.sparse import multiply, on_one_pattern
 from torchlb.linalg.two_grid import Matrix, absolute_row_sums, two_grid, without_small_entries
-from torchlb.spectral.components import constants, members
+from torchlb.spectral.components import constants
 from torchlb.spectral.eigenbasis import Eigenbasis
 
 SHARE = 6
@@ -148,9 +148,9 @@ def _parts(
 ) -> list[_Part]:
     """The components without fixed points, numbered by reverse Cuthill–McKee, which halves the time of products."""
     order = csgraph.reverse_cuthill_mckee(pattern, symmetric_mode=True)
+    order = order[np.argsort(component[order], kind="stable")]
     parts = []
-    for own in members(component[order]):
-        points = order[own]
+    for points in np.split(order, np.cumsum(np.bincount(component))[:-1]):
         free = points[~fixed[points]]
         if len(free):
             linear = None if near is None else _renumbered(near, free)

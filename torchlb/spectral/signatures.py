@@ -19,6 +19,13 @@ from torchlb.linalg.checks import check_operator
 from torchlb.spectral.eigenbasis import Eigenbasis, Spectral
 
 
+def _basis(lb: Spectral, k: int) -> tuple[Eigenbasis, Tensor]:
+    """The basis of k pairs, and its eigenvalues; InputTypeError for anything but an operator."""
+    check_operator(lb)
+    basis = lb.eigenbasis(k)
+    return basis, basis.eigenvalues
+
+
 def _present(basis: Eigenbasis) -> Tensor:
     """Mask of the pairs of each shape, without padding: (k,) or (S, k)."""
     k = torch.arange(basis.eigenvectors.shape[1], device=basis.mass.device)
@@ -81,9 +88,7 @@ def heat_kernel_signature(
     >>> bool((heat_kernel_signature(lb, torch.tensor([50.0])) * lb.mass.sum()).allclose(torch.tensor(1.0).double()))
     True
     """
-    check_operator(lb)
-    basis = lb.eigenbasis(k)
-    values = basis.eigenvalues
+    basis, values = _basis(lb, k)
     if times is None:
         first, last = values[..., -1:].log(), _first_positive(basis).log()
         times = 4 * math.log(10) / _evenly(first, last, count).exp()
@@ -113,9 +118,7 @@ def wave_kernel_signature(
     width
         Width σ of the Gaussians, in units of that spacing.
     """
-    check_operator(lb)
-    basis = lb.eigenbasis(k)
-    values = basis.eigenvalues
+    basis, values = _basis(lb, k)
     low, high = _first_positive(basis).log(), values[..., -1:].log()
     sigma = width * (high - low) / 100 + torch.finfo(values.dtype).eps
     if energies is None:
@@ -149,9 +152,7 @@ def spectral_wavelets(
     """
     if isinstance(f, Tensor) and f.ndim == 1:
         return spectral_wavelets(lb, f[:, None], scales, k=k)[..., 0]
-    check_operator(lb)
-    basis = lb.eigenbasis(k)
-    values = basis.eigenvalues
+    basis, values = _basis(lb, k)
     gains = _wavelet_gains(values, _numbers("scales", scales, values))
     coefficients = basis.to_basis(f)
     gains = gains.to(coefficients.dtype)[..., None]
@@ -177,9 +178,7 @@ def diffusion_map(
     The constants, of λ_0 = 0, are left out; a shape with a Dirichlet or Robin condition has none. `k`, at least dim +
     1, may be passed to share a basis. The time is in ℓ². On a cloud of any ambient dimension this is its diffusion map.
     """
-    check_operator(lb)
-    basis = lb.eigenbasis(max(dim + 1, k or 0))
-    values = basis.eigenvalues
+    basis, values = _basis(lb, max(dim + 1, k or 0))
     decay = torch.exp(-values * _numbers("time", time, values))
     chosen = torch.arange(min(dim, values.shape[-1] - 1), device=values.device)
     chosen = chosen + (values[..., :1] == 0).long()
@@ -204,8 +203,7 @@ def diffusion_distance(
         raise InputError(
             f"sources: expected numbers of points from 0 to {lb.num_points - 1}, in a list or tensor, got {sources!r}"
         )
-    basis = lb.eigenbasis(k)
-    values = basis.eigenvalues
+    basis, values = _basis(lb, k)
     coordinates = basis.eigenvectors * torch.exp(-values * _numbers("time", time, values))
     # By a matrix product the distance of a point from itself would not be zero.
     mode = "donot_use_mm_for_euclid_dist"

@@ -24,27 +24,14 @@ RESOLVING_DEGREE = 4
 
 @dataclass(frozen=True)
 class Acceptance:
-    """Tests for the stencils of a shape.
+    """Tests for the stencils of a shape of dimension d, with coordinates by a projection.
 
-    Attributes
-    ----------
-    dim
-        Dimension d.
-
-    on_mesh
-        Whether low-order rows follow the surface better than a fit that misses heights.
-    projection
-        Projection of the coordinates.
+    On a mesh, low-order rows follow the surface better than a fit that misses heights.
     """
 
     dim: int
     on_mesh: bool
     projection: str
-
-    @staticmethod
-    def too_wide_at_boundary(candidate: Candidate) -> bool:
-        """Whether a stencil with boundary points would be so wide and one-sided that a lower order is better."""
-        return candidate.degree > 2 and candidate.factor > FACTOR
 
     def judge(
         self, weights: Weights, candidate: Candidate, touching: Bool[Tensor, " B"]
@@ -59,24 +46,20 @@ class Acceptance:
         at_edge = FACTOR * max(edge.growth, FACTOR * inside.growth)
         max_growth = torch.where(touching, at_edge, FACTOR * inside.growth)
         max_ratio = FACTOR * torch.where(touching, edge.off_diagonal_ratio, 1.0)
-        resolved, resolvable = self._resolved(candidate)
+        bound, loosest = self.resolved(candidate)
         center, others = weights.laplacian[:, 0], weights.laplacian[:, 1:].abs().sum(1)
         determined = weights.residual <= NEGLIGIBLE  # false for NaN
         failure = torch.zeros(len(center), dtype=torch.int64)
         for reason, passed in (
             (Reason.MOMENTS, determined),
-            (Reason.UNRESOLVED, weights.height_residual <= resolved),
+            (Reason.UNRESOLVED, weights.height_residual <= bound),
             (Reason.RATIO, others <= -max_ratio * center),
             (Reason.GROWTH, weights.radius.square() * (others + center.abs()) <= max_growth),
         ):
             failure = torch.where((failure == 0) & ~passed, reason, failure)
-        return failure, determined & (weights.height_residual > resolvable)
+        return failure, determined & (weights.height_residual > loosest)
 
-    def follows(self, weights: Weights, candidate: Candidate) -> Bool[Tensor, " B"]:
-        """Whether the points resolve the surface for this candidate."""
-        return weights.height_residual <= self._resolved(candidate)[0]
-
-    def _resolved(self, candidate: Candidate) -> tuple[float, float]:
+    def resolved(self, candidate: Candidate) -> tuple[float, float]:
         """Bounds on the height residual: for this candidate, and for every candidate of its degree.
 
         On a mesh the bound shrinks with the number of points beyond 3 per polynomial: a fit to folds does not improve

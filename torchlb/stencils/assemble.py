@@ -8,7 +8,7 @@ only on request. The candidate of each point, and the reason for no better one, 
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import replace
 
 import torch
@@ -20,15 +20,9 @@ from torchlb.errors import StencilError, first_few
 from torchlb.fits.polynomials import num_monomials
 from torchlb.fits.rules import WEIGHT_RULES
 from torchlb.fits.weights import Weights, least_squares_weights, positive_weights
-from torchlb.geometry.candidates import (
-    Candidate,
-    Search,
-    list_candidates,
-    stencil_candidates,
-)
+from torchlb.geometry.candidates import Candidate, Search, list_candidates, stencil_candidates
 from torchlb.geometry.frames import local_heights, local_offsets
 from torchlb.geometry.thresholds import FACTOR
-from torchlb.geometry.vectors import at
 from torchlb.linalg.precision import AT_ONCE, NEGLIGIBLE, rows_at_once
 from torchlb.stencils.acceptance import Acceptance
 from torchlb.stencils.low_order import MeshLowOrder
@@ -38,28 +32,22 @@ from torchlb.stencils.rows import (
     RowsPlan,
     matrix_rows,
     stencil_rows,
-    to_tangent_vectors,
+    tangent_weights,
 )
 from torchlb.stencils.shape import Shape
 
 RULES = list(WEIGHT_RULES)
 GRADIENT_GROWTH = 30.0
 """Largest ρ Σ|w| of a first derivative beside a boundary; well-placed points have 5 to 15."""
+Gradients = tuple[Int[Tensor, " b"], Int[Tensor, "b K"], Float[Tensor, "b K d"], int]
+"""Gradients of some rows: (positions of the rows, points, weights in the frames, degree of the fit)."""
 
 
 class Stencils:
     """Rows of a shape, each by the first of its candidates that passes.
 
-    Parameters
-    ----------
-    shape
-        Points, frames, neighbourhoods, boundary and low-order rows.
-    order
-        Order p ≥ 1 of the first candidates.
-    projection, weights
-        Keys of `PROJECTIONS` and `WEIGHT_RULES`.
-    num_neighbors
-        Size K of every candidate, instead of `SIZE_FACTORS`.
+    The first candidates have the order p ≥ 1, and all of them `num_neighbors` points, if that is given, instead of
+    `SIZE_FACTORS`. The projection is one of `PROJECTIONS`, the rule for the weights one of `WEIGHT_RULES`.
     """
 
     def __init__(
@@ -73,7 +61,7 @@ class Stencils:
     ) -> None:
         dim, on_mesh = shape.frames.shape[-1], shape.on_mesh
         self.shape, self.order, self.projection = shape, order, projection
-        self.num_neighbors = num_neighbors
+        self.num_neighbors, self.placed = num_neighbors, (shape.points, shape.frames)
         triangles = isinstance(shape.low_order, MeshLowOrder)
         self.candidates = stencil_candidates(
             dim, order, weights, num_neighbors, on_mesh=on_mesh, triangles=triangles
@@ -91,12 +79,12 @@ class Stencils:
         for number, tried, index in search:
             candidate = self.candidates[number]
             holds = self._holds_boundary(index)
-            if self.acceptance.too_wide_at_boundary(candidate):
+            if candidate.degree > 2 and candidate.factor > FACTOR:  # too wide beside a boundary
                 tried, index, holds = tried[~holds], index[~holds], holds[~holds]
                 if len(tried) == 0:
                     continue
             with_data = holds & (self.share is not None)
-            weights = self._weights(centers[tried], index, candidate, with_data)
+            weights = self._weights(index, candidate, with_data)
             failure, rejected = self.acceptance.judge(weights, candidate, holds)
             if candidate.degree == self.order + 1 and candidate.rule != "positive":
                 reason[tried] = failure
@@ -106,22 +94,28 @@ class Stencils:
             splines = candidate.rule == "polyharmonic"
             rule = torch.full_like(tried, RULES.index(candidate.rule))
             rule[with_data & splines] = RULES.index("least_squares")
-            order = candidate.degree - 1
-            index, weights = index[passed], weights[passed]
-            gradient = self._tangent_vectors(centers[tried[passed]], index, weights.gradient)
-            weights = replace(weights, gradient=gradient)
-            blocks.append(stencil_rows(index, weights, number, order, rule[passed]))
+            parts = index[passed], weights[passed], number, candidate.degree - 1, rule[passed]
+            blocks.append(stencil_rows(*self.placed, *parts))
             taken.append(tried[passed])
         left = torch.ones(len(centers), dtype=torch.bool)
         left[torch.cat([*taken, torch.empty(0, dtype=torch.int64)])] = False
         if left.any():
-            blocks.append(self._low_order_rows(centers[left], reason[left]))
+            low, why = centers[left], reason[left]
+            fitted = ((why == Reason.RATIO) | (why == Reason.GROWTH)).nonzero()[:, 0]
+            blocks.append(self._low_order_rows(low, self._gradients(low, fitted)))
             taken.append(left.nonzero()[:, 0])
-        rows = Rows.stack(blocks)[torch.cat(taken).argsort()]
-        shape = self.shape
-        if shape.boundary is not None:
-            rows = shape.condition.finish(shape.points, shape.areas, shape.boundary, centers, rows)
+            self._check(low, blocks[-1])
+        rows = self._finished(centers, blocks, taken)
         return replace(rows, reason=torch.where(rows.order < self.order, reason, rows.reason))
+
+    def _finished(
+        self, centers: Int[Tensor, " B"], blocks: list[Rows], taken: list[Int[Tensor, " _"]]
+    ) -> Rows:
+        """Rows of `centers`, from blocks at the positions `taken`, with the effect of the boundary condition."""
+        rows, shape = Rows.stack(blocks)[torch.cat(taken).argsort()], self.shape
+        if shape.boundary is None:
+            return rows
+        return shape.condition.finish(shape.points, shape.areas, shape.boundary, centers, rows)
 
     def _holds_boundary(self, index: Int[Tensor, "B K"]) -> Bool[Tensor, " B"]:
         if self.shape.boundary is None:
@@ -137,65 +131,37 @@ class Stencils:
         weights = slope if self.share is None else rows.laplacian != 0
         positive = rows.rule == RULES.index("positive")
         used = (~positive[row] | weights) & (~own[row] | slope)
-        kinds = rows.candidate, rows.rule, rows.order, rows.slope, rows.reason
+        kinds = rows.candidate, rows.rule, rows.slope, rows.reason
         return RowsPlan(rows.length, rows.col.int(), *kinds, used)
 
     def evaluated(self, plan: RowsPlan) -> Rows:
         """Evaluate the planned rows of all points."""
         every, blocks, taken = torch.arange(len(plan.length)), [], []
+        start = plan.length.cumsum(0) - plan.length
         for number, candidate in enumerate(self.candidates):
             rows = every[plan.candidate == number]
             entry = candidate.size * num_monomials(self.shape.frames.shape[2], candidate.degree)
             for centers in rows.split(rows_at_once(entry)) if len(rows) else ():
-                places = plan.entries(centers)
+                places = start[centers, None] + torch.arange(int(plan.length[centers[0]]))
                 places = places.gather(1, _own_first(plan.col[places], centers))
                 index, used = plan.col[places].long(), plan.used[places][:, 1:]
                 with_data = self._holds_boundary(index) & (self.share is not None)
                 keep, slope = None if used.all() else used, plan.slope[centers]
-                weights = self._weights(centers, index, candidate, with_data, keep, slope)
-                gradient = self._tangent_vectors(centers, index, weights.gradient)
-                weights = replace(weights, gradient=gradient)
-                order = candidate.degree - 1
-                blocks.append(stencil_rows(index, weights, number, order, plan.rule[centers]))
+                weights = self._weights(index, candidate, with_data, keep, slope)
+                parts = index, weights, number, candidate.degree - 1, plan.rule[centers]
+                blocks.append(stencil_rows(*self.placed, *parts))
                 taken.append(centers)
         low = every[plan.candidate == len(self.candidates)]
         if len(low):
-            blocks.append(self._low_order_again(low, plan))
+            blocks.append(self._low_order_rows(low, self._planned_gradients(low, plan)))
             taken.append(low)
-        rows = Rows.stack(blocks)[torch.cat(taken).argsort()]
-        shape = self.shape
-        if shape.boundary is not None:
-            rows = shape.condition.finish(shape.points, shape.areas, shape.boundary, every, rows)
+        rows = self._finished(every, blocks, taken)
         rows = rows.on_pattern(plan) if len(low) else rows
         return replace(rows, reason=plan.reason)
 
-    def _low_order_again(self, centers: Int[Tensor, " B"], plan: RowsPlan) -> Rows:
-        """Low-order rows, with the planned gradients."""
-        assert self.shape.low_order is not None
-        matrix = self.shape.low_order.rows(centers)
-        rows = matrix_rows(matrix, self.shape.points, self.shape.frames, centers)
-        length = plan.length[centers]
-        start = (plan.length.cumsum(0) - plan.length)[centers]
-        row = torch.arange(len(centers)).repeat_interleave(length)
-        entry = start[row] + torch.arange(len(row)) - (length.cumsum(0) - length)[row]
-        entry, row = entry[plan.used[entry]], row[plan.used[entry]]
-        size, slope = torch.bincount(row, minlength=len(centers)), plan.slope[centers]
-        found = []
-        for degree, count in torch.stack([slope, size], 1)[slope > 0].unique(dim=0).tolist():
-            local = ((slope == degree) & (size == count)).nonzero()[:, 0]
-            index = plan.col[entry[torch.isin(row, local)]].long().view(-1, count)
-            index = index.gather(1, _own_first(index, centers[local]))
-            weights = self._free_weights(centers[local], index, Candidate(degree, count, RULES[0]))
-            gradient = self._tangent_vectors(centers[local], index, weights.gradient)
-            found.append((local.repeat_interleave(count), index.flatten(), gradient.flatten(0, 1)))
-        if found:
-            rows = rows.with_gradient(*(torch.cat(parts) for parts in zip(*found, strict=True)))
-        return replace(rows, candidate=plan.candidate[centers], slope=slope)
-
     def _weights(
         self,
-        centers: Tensor,
-        index: Tensor,
+        index: Int[Tensor, "B K"],
         candidate: Candidate,
         with_data: Bool[Tensor, " B"],
         keep: Bool[Tensor, "B neighbors"] | None = None,
@@ -211,29 +177,26 @@ class Stencils:
             if rows.any():
                 options = [None if x is None else x[rows] for x in (keep, slope)]
                 fit = self._weights_with_data if data else self._free_weights
-                parts.append(fit(centers[rows], index[rows], candidate, *options))
+                parts.append(fit(index[rows], candidate, *options))
                 order.append(rows.nonzero()[:, 0])
         return Weights.stack(parts)[torch.cat(order).argsort()] if len(parts) > 1 else parts[0]
 
     def _free_weights(
         self,
-        centers: Tensor,
-        index: Tensor,
+        index: Int[Tensor, "B K"],
         candidate: Candidate,
         keep: Bool[Tensor, "B neighbors"] | None = None,
         slope: Int[Tensor, " B"] | None = None,
     ) -> Weights:
-        points, frames = self.shape.points, self.shape.frames
-        coords = local_offsets(points, frames, centers, index[:, 1:], self.projection)
-        heights = self._heights(centers, index, coords) if slope is None else None
+        coords = local_offsets(*self.placed, index, self.projection)
+        heights = self._heights(index, coords) if slope is None else None
         if keep is not None:
             return least_squares_weights(coords, candidate.degree, keep, heights=heights)
         return WEIGHT_RULES[candidate.rule](coords, candidate.degree, heights=heights)
 
     def _weights_with_data(
         self,
-        centers: Tensor,
-        index: Tensor,
+        index: Int[Tensor, "B K"],
         candidate: Candidate,
         keep: Bool[Tensor, "B neighbors"] | None = None,
         slope: Int[Tensor, " B"] | None = None,
@@ -244,19 +207,18 @@ class Stencils:
         have no such form and are replaced by least squares. A few rows of points along the boundary may not suffice
         without the data: first derivatives are of the highest degree that the points determine.
         """
-        points, frames, degree = self.shape.points, self.shape.frames, candidate.degree
-        boundary, share = self.shape.boundary, self.share
+        boundary, share, degree = self.shape.boundary, self.share, candidate.degree
         assert boundary is not None
         assert share is not None
-        coords = local_offsets(points, frames, centers, index[:, 1:], "tangent")
-        flux = boundary.conormals[index] @ frames[centers]
+        coords = local_offsets(*self.placed, index, "tangent")
+        flux = boundary.conormals[index] @ self.shape.frames[index[:, 0]]
         if candidate.rule == "positive" and keep is None:
             weights = positive_weights(coords, degree, flux=flux, share=share[index])
         else:
             weights = least_squares_weights(coords, degree, keep, flux, share[index])
-        heights = self._heights(centers, index, coords) if slope is None else None
+        heights = self._heights(index, coords) if slope is None else None
         free = part = least_squares_weights(coords, degree, heights=heights)
-        gradient, left = free.gradient.clone(), torch.arange(len(centers))
+        gradient, left = free.gradient.clone(), torch.arange(len(index))
         settled = torch.zeros_like(left) if slope is None else slope
         for lower in range(degree - 1, 0, -1):
             if slope is None and len(left):
@@ -270,32 +232,34 @@ class Stencils:
         found = {"gradient": gradient, "slope": settled}
         return replace(weights, height_residual=free.height_residual, **found)
 
-    def _heights(self, centers: Tensor, index: Tensor, coords: Tensor) -> Float[Tensor, "B K n"]:
+    def _heights(self, index: Tensor, coords: Tensor) -> Float[Tensor, "B K n"]:
         """Heights that a fit has to follow; on a mesh, over the points of the plane with the given coordinates.
 
         This also tests coordinates along normals, which need normals that folds do not have. A cloud has no better rows
         to fall back to, so there the heights are those of the tangential projection.
         """
-        points, frames, neighbors = self.shape.points, self.shape.frames, index[:, 1:]
         if not self.shape.on_mesh and self.projection != "tangent":
-            coords = local_offsets(points, frames, centers, neighbors, "tangent")
-        return local_heights(points, frames, centers, neighbors, coords)
+            coords = local_offsets(*self.placed, index, "tangent")
+        return local_heights(*self.placed, index, coords)
 
-    def _tangent_vectors(
-        self,
-        centers: Int[Tensor, " B"],
-        index: Int[Tensor, "B K"],
-        gradient: Float[Tensor, "B K d"],
-    ) -> Float[Tensor, "B K d"]:
-        """Convert weights of derivatives along the coordinates to weights of ∇ in the frames."""
-        points, frames = self.shape.points, at(self.shape.frames, centers)
-        jacobian = gradient.mT @ (at(points, index) - at(points, centers)[:, None])
-        return gradient @ to_tangent_vectors(jacobian, frames).mT
-
-    def _low_order_rows(self, centers: Int[Tensor, " B"], reason: Int[Tensor, " B"]) -> Rows:
+    def _low_order_rows(self, centers: Int[Tensor, " B"], gradients: Iterable[Gradients]) -> Rows:
+        """Low-order rows, some of them with the gradients of fits."""
         assert self.shape.low_order is not None
         matrix = self.shape.low_order.rows(centers)
-        rows = matrix_rows(matrix, self.shape.points, self.shape.frames, centers)
+        rows = matrix_rows(matrix, *self.placed, centers)
+        rows = replace(rows, candidate=torch.full_like(centers, len(self.candidates)))
+        found = list(gradients)
+        if not found:
+            return rows
+        for local, _, _, degree in found:
+            rows.slope[local] = degree
+        local = [local.repeat_interleave(index.shape[1]) for local, index, *_ in found]
+        index = torch.cat([index.flatten() for _, index, *_ in found])
+        gradient = torch.cat([gradient.flatten(0, 1) for *_, gradient, _ in found])
+        return rows.with_gradient(torch.cat(local), index, gradient)
+
+    def _check(self, centers: Int[Tensor, " B"], rows: Rows) -> None:
+        """Raise StencilError for low-order rows without a centre."""
         bad = centers[~rows.off_diagonal_ratio.isfinite()]
         if len(bad):
             raise StencilError(
@@ -303,44 +267,43 @@ class Stencils:
                 f"{first_few(bad)}. Nothing compatible lies around them; remove them, or merge them with their "
                 "neighbours"
             )
-        rows = replace(rows, candidate=torch.full_like(centers, len(self.candidates)))
-        fitted = ((reason == Reason.RATIO) | (reason == Reason.GROWTH)).nonzero()[:, 0]
-        found = list(self._gradients(centers[fitted]))
-        if not found:
-            return rows
-        for row, _, _, degree in found:
-            rows.slope[fitted[row]] = degree
-        local = [fitted[row].repeat_interleave(index.shape[1]) for row, index, *_ in found]
-        index, gradient = (
-            torch.cat([part.flatten(0, 1) for part in parts])
-            for parts in ([f[1] for f in found], [f[2] for f in found])
-        )
-        return rows.with_gradient(torch.cat(local), index, gradient)
 
     def _gradients(
-        self, centers: Int[Tensor, " B"]
-    ) -> Iterator[tuple[Int[Tensor, " b"], Int[Tensor, "b K"], Float[Tensor, "b K d"], int]]:
+        self, centers: Int[Tensor, " B"], fitted: Int[Tensor, " b"]
+    ) -> Iterator[Gradients]:
         """Yield first derivatives of the highest acceptable degree where only Δ has no stencil, as at a boundary.
 
-        Batches are (indices into `centers`, points, weights, degree). At degree 1 the low-order row is as good.
+        At degree 1 the low-order row is as good.
         """
-        dim = self.shape.frames.shape[-1]
-        degrees = range(self.order + 1, 1, -1)
-        candidates = [
-            c
-            for c in list_candidates(dim, degrees, num_neighbors=self.num_neighbors)
-            if c.factor <= FACTOR
-        ]
+        dim, degrees = self.shape.frames.shape[-1], range(self.order + 1, 1, -1)
+        candidates = list_candidates(dim, degrees, num_neighbors=self.num_neighbors)
+        candidates = [c for c in candidates if c.factor <= FACTOR]
         assert self.shape.neighborhoods is not None
-        search = Search(self.shape.neighborhoods, centers, candidates)
+        search = Search(self.shape.neighborhoods, centers[fitted], candidates)
         for number, tried, index in search:
-            weights = self._free_weights(centers[tried], index, candidates[number])
-            passed = _good_slope(weights) & self.acceptance.follows(weights, candidates[number])
+            weights, candidate = self._free_weights(index, candidates[number]), candidates[number]
+            bound, _ = self.acceptance.resolved(candidate)
+            passed = _good_slope(weights) & (weights.height_residual <= bound)
             search.settle(tried[passed])
             if passed.any():
-                tried, index, gradient = tried[passed], index[passed], weights.gradient[passed]
-                gradient = self._tangent_vectors(centers[tried], index, gradient)
-                yield tried, index, gradient, candidates[number].degree
+                index = index[passed]
+                gradient = tangent_weights(*self.placed, index, weights.gradient[passed])
+                yield fitted[tried[passed]], index, gradient, candidate.degree
+
+    def _planned_gradients(self, centers: Int[Tensor, " B"], plan: RowsPlan) -> Iterator[Gradients]:
+        """Yield the planned gradients of low-order rows."""
+        length = plan.length[centers]
+        start = (plan.length.cumsum(0) - plan.length)[centers]
+        row = torch.arange(len(centers)).repeat_interleave(length)
+        entry = start[row] + torch.arange(len(row)) - (length.cumsum(0) - length)[row]
+        entry, row = entry[plan.used[entry]], row[plan.used[entry]]
+        size, slope = torch.bincount(row, minlength=len(centers)), plan.slope[centers]
+        for degree, count in torch.stack([slope, size], 1)[slope > 0].unique(dim=0).tolist():
+            local = ((slope == degree) & (size == count)).nonzero()[:, 0]
+            index = plan.col[entry[torch.isin(row, local)]].long().view(-1, count)
+            index = index.gather(1, _own_first(index, centers[local]))
+            weights = self._free_weights(index, Candidate(degree, count, RULES[0]))
+            yield local, index, tangent_weights(*self.placed, index, weights.gradient), degree
 
 
 def _good_slope(weights: Weights) -> Bool[Tensor, " B"]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from functools import cached_property
 from math import factorial
 
@@ -18,49 +19,27 @@ from torchlb.linalg.precision import ROUNDING
 from torchlb.linalg.sparse import with_diagonal
 
 
-def simplex_shares(
-    vertices: Float[Tensor, "N n"],
-    faces: Int[Tensor, "F v"],
-    shares: Float[Tensor, " F"] | None = None,
-) -> Float[Tensor, " N"]:
-    """Equal shares for each vertex of the length, area or volume of its simplices, ℓ^d: half, a third, a quarter.
-
-    >>> simplex_shares(torch.tensor([[0.0], [1.0], [3.0]]), torch.tensor([[0, 1], [1, 2]])).tolist()
-    [0.5, 1.5, 1.0]
-    """
-    dim = faces.shape[1] - 1
-    edges = vertices[faces[:, 1:]] - vertices[faces[:, :1]]
-    upper = torch.linalg.qr(edges.mT).R
-    volume = torch.diagonal(upper, dim1=-2, dim2=-1).prod(-1).abs() / factorial(dim)
-    volume = volume if shares is None else shares * volume
-    share = (volume / (dim + 1)).repeat_interleave(dim + 1)
-    return torch.zeros_like(vertices[:, 0]).index_add_(0, faces.reshape(-1), share)
-
-
+@dataclass(frozen=True, eq=False)
 class MeshLowOrder:
     """P1 elements with lumped mass; on triangles, of the intrinsic Delaunay triangulation (`delaunay_cover`).
 
     The rows are symmetric and negative semidefinite in the mass, so that the certificate holds for these rows alone;
     those of segments and of triangles are M-matrix rows, too. Where several segments meet, the fluxes balance.
 
-    Parameters
+    Attributes
     ----------
     points, cells
         (N, n), ℓ; (F, d + 1).
-    flips
+    planned
         Edge flips to the triangulation, the `flips` of the same shape before it moved; None to search for them.
     shares
         (F,), fraction of each cell that is integrated; None for all of it.
     """
 
-    def __init__(
-        self,
-        points: Float[Tensor, "N n"],
-        cells: Int[Tensor, "F corners"],
-        flips: list[Tensor] | None = None,
-        shares: Float[Tensor, " F"] | None = None,
-    ) -> None:
-        self.points, self.cells, self._flips, self.shares = points, cells, flips, shares
+    points: Float[Tensor, "N n"]
+    cells: Int[Tensor, "F corners"]
+    planned: list[Tensor] | None = None
+    shares: Float[Tensor, " F"] | None = None
 
     @property
     def flips(self) -> list[Tensor]:
@@ -74,7 +53,7 @@ class MeshLowOrder:
         cells, lengths = nodes.cells, sound_lengths(nodes.lengths(self.points), nodes.cells)
         if nodes.dim == 2:
             free = torch.zeros(len(nodes.edges), dtype=torch.bool)
-            cover = delaunay_cover(cells, lengths, nodes.edge, free, self._flips)
+            cover = delaunay_cover(cells, lengths, nodes.edge, free, self.planned)
             cells, lengths, flips = cover.faces, cover.lengths, cover.flips
             share = torch.full((len(cells),), 0.5).to(lengths)
         pair = linear_elements(lengths, cells, len(self.points), shares=share)
@@ -82,14 +61,16 @@ class MeshLowOrder:
 
     def areas(self) -> Float[Tensor, " N"]:
         """Equal shares of the cells around each vertex, ℓ^d, or lumped masses where some are almost zero."""
-        shares = simplex_shares(self.points, self.cells, self.shares)
-        longest = torch.zeros_like(shares)
-        square = (
-            lagrange_nodes(self.cells, len(self.points), 1).lengths(self.points).amax(1).square()
-        )
-        corner = self.cells.flatten(), square.repeat_interleave(self.cells.shape[1])
-        longest.scatter_reduce_(0, *corner, "amax")
-        sound = self.cells.shape[1] != 3 or (shares > ROUNDING * longest).all()
+        points, cells, corners = self.points, self.cells, self.cells.shape[1]
+        upper = torch.linalg.qr((points[cells[:, 1:]] - points[cells[:, :1]]).mT).R
+        volume = torch.diagonal(upper, dim1=-2, dim2=-1).prod(-1).abs() / factorial(corners - 1)
+        volume = volume if self.shares is None else self.shares * volume
+        share = (volume / corners).repeat_interleave(corners)
+        shares = torch.zeros_like(points[:, 0]).index_add_(0, cells.flatten(), share)
+        lengths = lagrange_nodes(cells, len(points), 1).lengths(points)
+        square = lengths.amax(1).square().repeat_interleave(corners)
+        longest = torch.zeros_like(shares).scatter_reduce(0, cells.flatten(), square, "amax")
+        sound = corners != 3 or (shares > ROUNDING * longest).all()
         return shares if sound else self._masses
 
     @cached_property

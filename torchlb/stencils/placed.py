@@ -11,12 +11,7 @@ from torch import Tensor
 from torch.nn.functional import normalize, pad
 
 from torchlb.geometry.boundary import Boundary, BoundaryPlan
-from torchlb.geometry.frames import (
-    complete_frames,
-    mesh_frames,
-    normals_of_frames,
-    vertex_normals,
-)
+from torchlb.geometry.frames import complete_frames, mesh_frames, normals_of_frames, vertex_normals
 from torchlb.geometry.local_fits import FitPlan, LocalFits
 from torchlb.geometry.vectors import dot
 from torchlb.linalg.precision import TINY
@@ -73,9 +68,11 @@ class Beside(NamedTuple):
         return space.index_add(0, self.moved, offset)[:, : points.shape[1]]
 
     def frames(
-        self, places: Float[Tensor, "N 3"], triangles: Int[Tensor, "F 3"]
-    ) -> Float[Tensor, "N 3 2"]:
-        """Frames orthogonal to the initial normals."""
+        self, places: Float[Tensor, "N n"], triangles: Int[Tensor, "F 3"]
+    ) -> Float[Tensor, "N n 2"]:
+        """Initial frames, orthogonal to the initial normals in R³."""
+        if places.shape[1] == 2:
+            return mesh_frames(places, triangles)
         axes, _ = _axes(places, triangles, self.neighbor)
         normal = normalize((self.normals[:, None] @ axes)[:, 0])
         first = normalize(axes[:, 1] - dot(axes[:, 1], normal)[:, None] * normal)
@@ -127,17 +124,20 @@ class ShapePlan:
 
     def at(self, points: Float[Tensor, "N n"]) -> tuple[Placed, LocalFits]:
         """Frames, normals and boundary at these points, and the fits behind them."""
-        places = points if self.beside is None else self.beside.places(points, self.cells)
-        initial = first_frames(places, self.cells, self.beside)
+        if self.beside is None:
+            places, initial = points, mesh_frames(points, self.cells)
+        else:
+            places = self.beside.places(points, self.cells)
+            initial = self.beside.frames(places, self.cells)
         fits = LocalFits.at(self.fits, places, initial)
         return self.placed(fits), fits
 
     def placed(self, fits: LocalFits) -> Placed:
         """Frames, normals and boundary from given fits."""
-        frames, normals = righthanded(fits.frames, None)
+        reference = None
         if self.side is not None:
             reference = self.side[:, None] * vertex_normals(fits.points, self.cells)
-            frames, normals = righthanded(fits.frames, reference)
+        frames, normals = righthanded(fits.frames, reference)
         boundary = None if self.boundary is None else self.boundary.at(fits.points, frames)
         return Placed(fits.points, frames, normals, boundary)
 
@@ -162,15 +162,6 @@ class Placed:
     frames: Float[Tensor, "N n d"]
     normals: Float[Tensor, "N n"] | None
     boundary: Boundary | None
-
-
-def first_frames(
-    places: Float[Tensor, "N n"], cells: Int[Tensor, "F corners"], beside: Beside | None
-) -> Float[Tensor, "N n d"]:
-    """Initial frames, over which the fits are made."""
-    if beside is None or places.shape[1] == 2:
-        return mesh_frames(places, cells)
-    return beside.frames(places, cells)
 
 
 def turned(normals: Tensor, reference: Tensor) -> Tensor:

@@ -15,6 +15,7 @@ from torchlb.fits.rules import WEIGHT_RULES
 from torchlb.fits.weights import Weights
 from torchlb.geometry.numbering import Numbering
 from torchlb.geometry.thresholds import SLIGHT
+from torchlb.geometry.vectors import at
 from torchlb.linalg.precision import NEGLIGIBLE, ROOT_EPS
 from torchlb.linalg.sparse import from_scipy
 
@@ -94,10 +95,12 @@ class Rows:
         rows = rows.nonzero()[:, 0] if rows.dtype == torch.bool else rows
         length = self.length[rows]
         first = (self.length.cumsum(0) - self.length)[rows] - (length.cumsum(0) - length)
-        entry = first.repeat_interleave(length) + torch.arange(int(length.sum()))
-        return Rows(
-            *(getattr(self, f.name)[entry if f.name in ENTRIES else rows] for f in fields(Rows))
-        )
+        return self._taken(first.repeat_interleave(length) + torch.arange(int(length.sum())), rows)
+
+    def _taken(self, entries: Int[Tensor, " e"], rows: Int[Tensor, " b"]) -> Rows:
+        """The fields of these entries, and of these rows."""
+        names = (f.name for f in fields(Rows))
+        return Rows(*(getattr(self, n)[entries if n in ENTRIES else rows] for n in names))
 
     def with_gradient(
         self, local: Int[Tensor, " e"], index: Int[Tensor, " e"], gradient: Float[Tensor, "e d"]
@@ -119,11 +122,7 @@ class Rows:
     def restored(self, numbering: Numbering) -> Rows:
         """All rows, in the user's numbers."""
         _, col, entry = numbering.restored_pattern(self.crow, self.col)
-        values = {
-            f.name: getattr(self, f.name)[entry if f.name in ENTRIES else numbering.here]
-            for f in fields(Rows)
-        }
-        return Rows(**values | {"col": col})
+        return replace(self._taken(entry, numbering.here), col=col)
 
     def on_pattern(self, other: Rows | RowsPlan) -> Rows:
         """Rows on the pattern of `other`; entries outside it are added to the diagonal."""
@@ -155,25 +154,16 @@ class Rows:
 class RowsPlan:
     """Plan of rows; attributes are those of `Rows`.
 
-    Attributes
-    ----------
-    used
-        (nnz,), entries with weights: the non-zero ones of positive weights, and those of a low-order row's gradient.
+    Entries are `used` where positive weights are non-zero, and for the gradient of a low-order row.
     """
 
     length: Int[Tensor, " B"]
     col: Int[Tensor, " nnz"]
     candidate: Int[Tensor, " B"]
     rule: Int[Tensor, " B"]
-    order: Int[Tensor, " B"]
     slope: Int[Tensor, " B"]
     reason: Int[Tensor, " B"]
     used: Bool[Tensor, " nnz"]
-
-    def entries(self, rows: Int[Tensor, " b"]) -> Int[Tensor, "b K"]:
-        """Indices of the entries of rows of equal length."""
-        start = (self.length.cumsum(0) - self.length)[rows]
-        return start[:, None] + torch.arange(int(self.length[rows[0]]))
 
 
 ENTRIES = {"col", "laplacian", "gradient"}
@@ -202,23 +192,38 @@ def to_tangent_vectors(
     return turn
 
 
+def tangent_weights(
+    points: Float[Tensor, "N n"],
+    frames: Float[Tensor, "N n d"],
+    index: Int[Tensor, "B K"],
+    gradient: Float[Tensor, "B K d"],
+) -> Float[Tensor, "B K d"]:
+    """Weights of ∇ in the frames, from those of derivatives along coordinates; `index` has the centre first."""
+    offset = at(points, index) - at(points, index[:, 0])[:, None]
+    turn = to_tangent_vectors(gradient.mT @ offset, at(frames, index[:, 0]))
+    return gradient @ turn.mT
+
+
 def stencil_rows(
-    index: Int[Tensor, "B K"], weights: Weights, candidate: int, order: int, rule: Int[Tensor, " B"]
+    points: Float[Tensor, "N n"],
+    frames: Float[Tensor, "N n d"],
+    index: Int[Tensor, "B K"],
+    weights: Weights,
+    candidate: int,
+    order: int,
+    rule: Int[Tensor, " B"],
 ) -> Rows:
-    """Convert a batch of stencils of one candidate to rows with ascending columns."""
+    """Convert a batch of stencils of one candidate, derivatives along coordinates, to rows with ascending columns."""
     batch, size = index.shape
     col, place = index.sort(dim=1)
-    laplacian = weights.laplacian
+    laplacian, gradient = weights.laplacian, weights.gradient
+    gradient = tangent_weights(points, frames, index, gradient)
     center, total = laplacian[:, 0].abs(), laplacian.abs().sum(1)
-
-    def entries(values: Tensor) -> Tensor:
-        return values.take_along_dim(place[..., None], dim=1).flatten(0, 1)
-
     return Rows(
         length=torch.full((batch,), size),
         col=col.flatten(),
         laplacian=laplacian.take_along_dim(place, dim=1).flatten(),
-        gradient=entries(weights.gradient),
+        gradient=gradient.take_along_dim(place[..., None], dim=1).flatten(0, 1),
         candidate=torch.full((batch,), candidate),
         rule=rule,
         order=torch.full((batch,), order),

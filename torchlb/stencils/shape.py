@@ -17,18 +17,14 @@ from torchlb.geometry.boundary import BoundaryPlan, boundary_of_mesh
 from torchlb.geometry.compatibility import thin_sides
 from torchlb.geometry.complex import consistently_wound
 from torchlb.geometry.fit_search import FitSearch
-from torchlb.geometry.frames import (
-    mesh_frames,
-    normals_of_frames,
-    vertex_normals,
-)
+from torchlb.geometry.frames import mesh_frames, normals_of_frames, vertex_normals
 from torchlb.geometry.local_fits import FitPlan, LocalFits
 from torchlb.geometry.neighbors import GraphNeighborhoods, mesh_graph, nearest_neighbors
 from torchlb.geometry.thresholds import NEAREST
 from torchlb.linalg.precision import AT_ONCE
 from torchlb.stencils.conditions import Condition, Neumann
 from torchlb.stencils.low_order import MeshLowOrder
-from torchlb.stencils.placed import Beside, Placed, ShapePlan, first_frames, righthanded, turned
+from torchlb.stencils.placed import Beside, Placed, ShapePlan, righthanded, turned
 
 NEUMANN = Neumann()
 
@@ -144,9 +140,7 @@ def surface_shape(
         graph.eliminate_zeros()
     beside = Beside.of(given, surface.points, triangles, surface.neighbors[:, 1], surface.normals)
     points = beside.places(given, triangles)
-    neighborhoods = GraphNeighborhoods(
-        points, graph, first_frames(points, triangles, beside), sides
-    )
+    neighborhoods = GraphNeighborhoods(points, graph, beside.frames(points, triangles), sides)
     plan, fits = _searched(neighborhoods, normal_order, num_neighbors, progress, fit_degrees)
     edge = None
     if condition is not None:
@@ -177,13 +171,14 @@ def _shape(
     on_mesh: bool = False,
 ) -> Shape:
     """Shape of a plan at the points that it was made for, with the data that the search for stencils needs."""
-    placed = plan.placed(fits)
+    placed, sides = plan.placed(fits), neighborhoods.sides
+    if sides is not None:  # by the normals of the refined frames
+        marked = (sides != 0).any(1, keepdim=True)
+        sides = turned(normals_of_frames(placed.frames), sides) * marked
     return Shape(
         **vars(placed),
         normal_order=plan.fits.order,
-        neighborhoods=neighborhoods.with_frames(
-            placed.frames, _follow(neighborhoods.sides, placed.frames)
-        ),
+        neighborhoods=replace(neighborhoods, frames=placed.frames, sides=sides),
         areas=areas,
         low_order=low_order,
         condition=Condition() if condition is None else condition,
@@ -204,19 +199,12 @@ def _part(boundary: BoundaryPlan | None, mask: Bool[Tensor, " N"]) -> BoundaryPl
     return None if boundary is None or not mask.any() else replace(boundary, mask=mask)
 
 
-def _follow(sides: Tensor | None, frames: Tensor) -> Tensor | None:
-    """Sides from the normals of the refined frames, where they were set."""
-    if sides is None:
-        return None
-    return turned(normals_of_frames(frames), sides) * (sides != 0).any(1, keepdim=True)
-
-
 def _searched(
     neighborhoods: GraphNeighborhoods,
     degree: int,
     num_neighbors: int | None,
     progress: bool,
-    fit_degrees: tuple[int, ...] = (),
+    fit_degrees: tuple[int, ...],
 ) -> tuple[FitPlan, LocalFits]:
     """Fit tangent planes of order q (initial ones if q = 0 or in a flat space), and functions."""
     flat = neighborhoods.dim == neighborhoods.points.shape[1]
