@@ -11,7 +11,7 @@ from jaxtyping import Int
 
 from torchlb.cloud.cocone import Cloud
 from torchlb.cloud.gaps import overlapping
-from torchlb.cloud.voronoi import natural_neighbors, star_of, unrolled
+from torchlb.cloud.voronoi import natural_neighbors, unrolled
 from torchlb.geometry.complex import Faces, edges_of, pieces_of, spanning_pairs
 from torchlb.geometry.thresholds import ROUGH
 
@@ -27,9 +27,13 @@ def local_stars(cloud: Cloud, centers: Int[np.ndarray, " B"]) -> Faces:
     valid = (normals[near[:, 1:]] * normal).sum(-1).abs() > ROUGH
     frame = torch.linalg.qr(normal.mT, mode="complete")[0][..., 1:]
     coords = unrolled(offset, frame)
-    angle, order, following, real = star_of(coords, natural_neighbors(coords, valid))
+    natural = natural_neighbors(coords, valid)
+    angle = torch.atan2(coords[..., 1], coords[..., 0]).masked_fill(~natural, torch.inf)
+    angle, order = angle.sort(dim=1)
+    place, number = torch.arange(angle.shape[1]), natural.sum(1, keepdim=True)
+    following = torch.where(place + 1 < number, place + 1, 0)
     turn = (angle.take_along_dim(following, 1) - angle) % (2 * torch.pi)
-    use = real & (turn > 0) & (turn < torch.pi)
+    use = (place < number) & (turn > 0) & (turn < torch.pi)
     ends = near[:, 1:].take_along_dim(order, 1)
     after = ends.take_along_dim(following, 1)
     found = torch.stack([near[:, :1].expand_as(ends)[use], ends[use], after[use]], 1)

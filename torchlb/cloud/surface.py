@@ -12,7 +12,7 @@ from scipy import sparse
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from torchlb.cloud.cocone import REACH, Candidates, Cloud, Tetrahedra
+from torchlb.cloud.cocone import REACH, Candidates, Cloud, Tetrahedra, best_manifold
 from torchlb.cloud.complexes import Complex
 from torchlb.cloud.frames import cloud_frames, refined_normals
 from torchlb.cloud.gaps import closed, filled, with_left_points
@@ -248,8 +248,12 @@ def _chosen(
     Tangent faces come first where a cavity would be cut off from points that belong to it, as where lips touch.
     """
     points, (i, j) = cloud.points, pairs
+
+    def best_of(first: Bool[np.ndarray, " F"]) -> Faces:
+        return best_manifold(points, found.triangles[np.argsort(~first, kind="stable")])
+
     first = found.parting if two_sided else found.tangent
-    faces = with_single_fans(found.best(points, first), len(points))
+    faces = with_single_fans(best_of(first), len(points))
     piece = pieces_of(faces, len(points))
     across = piece[i] != piece[j]
     if not across.any():
@@ -261,7 +265,7 @@ def _chosen(
     torn = np.zeros(len(points), dtype=bool)
     torn[i[across]] = torn[j[across]] = True
     first = np.where(torn[found.triangles].any(1), found.tangent, first)
-    return with_single_fans(found.best(points, first), len(points)) if torn.any() else faces
+    return with_single_fans(best_of(first), len(points)) if torn.any() else faces
 
 
 def _completed(

@@ -11,6 +11,7 @@ a star has.
 from __future__ import annotations
 
 from collections.abc import Iterable
+from functools import partial
 from itertools import permutations
 
 import numpy as np
@@ -21,7 +22,7 @@ from torch import Tensor
 
 from torchlb.cloud.complexes import Complex
 from torchlb.cloud.frames import cloud_frames
-from torchlb.cloud.manifold import boundary_loops
+from torchlb.cloud.manifold import boundary_loops, ears_of
 from torchlb.errors import InputError, first_few
 from torchlb.geometry.compatibility import mutually_admissible, planes_of
 from torchlb.geometry.complex import Faces, delaunay, edges_of
@@ -211,25 +212,8 @@ def circumradii(points: Float[np.ndarray, "N n"], faces: Faces) -> Float[np.ndar
 
 def _closed(points: Float[np.ndarray, "N n"], faces: Faces) -> Faces:
     """Faces with short boundary loops closed by ear clipping, the smallest circumradius first."""
-    count, new = len(points), [faces]
+    count = len(points)
     known = set(edges_of(faces, count).keys.tolist())
-    for loop in boundary_loops(faces, count):
-        if len(loop) > LOOP:
-            continue
-        ears, own = [], set()
-        while len(loop) > 3:
-            turn = np.stack([np.roll(loop, 1), loop, np.roll(loop, -1)], 1)
-            a, c = turn[:, 0], turn[:, 2]
-            keys = (np.minimum(a, c) * count + np.maximum(a, c)).tolist()
-            cost = circumradii(points, turn)
-            cost[[key in known or key in own for key in keys]] = np.inf
-            best = int(cost.argmin())
-            if not np.isfinite(cost[best]):
-                break
-            ears.append(turn[best])
-            own.add(keys[best])
-            loop = [*loop[:best], *loop[best + 1 :]]
-        if len(loop) == 3:
-            known |= own
-            new.append(np.array([*ears, loop]))
-    return np.concatenate(new)
+    loops = [loop for loop in boundary_loops(faces, count) if len(loop) <= LOOP]
+    found = [ears_of(loop, known, count, partial(circumradii, points)) for loop in loops]
+    return np.concatenate([faces, *(np.array(ears) for ears in found if ears)])
