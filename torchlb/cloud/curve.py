@@ -41,19 +41,9 @@ def cloud_curve(
     normals: Float[Tensor, "N n"] | None = None,
     boundary: Bool[Tensor, " N"] | None = None,
 ) -> Complex:
-    """The curve through all points: closed and open chains.
+    """The curve through all points: closed and open chains, which end at the points of the boundary.
 
-    Parameters
-    ----------
-    normals
-        Normals in R², whose side the curve faces where most of them agree; without them closed curves face outward.
-    boundary
-        Mask of the points where the curve ends, whatever lies beyond.
-
-    Raises
-    ------
-    InputError
-        If points are far from all others.
+    In R² it faces the side of the normals where most of them agree; without them closed chains face outward.
     """
     size = min(NEAR + 1, len(points))
     near, oriented = nearest_neighbors(points, size), False
@@ -76,11 +66,11 @@ def cloud_curve(
             "curve are apart, and no segment reaches them; leave them out, or add points between"
         )
     _warn(places, index, chains, noise, gaps)
-    cells = np.concatenate([chain.segments for chain in chains])
+    cells = [chain.segments for chain in chains]
     if points.shape[1] == 2:
         given = normals.numpy() if oriented and normals is not None else None
-        cells = np.concatenate([_facing_out(places, chain, given) for chain in chains])
-    return Complex(points=points, cells=torch.from_numpy(cells))
+        cells = [_facing_out(places, chain, given) for chain in chains]
+    return Complex(points=points, cells=torch.from_numpy(np.concatenate(cells)))
 
 
 class Chain(NamedTuple):

@@ -23,14 +23,12 @@ def with_single_fans(faces: Faces, count: int) -> Faces:
         part = faces[around]
         one, two = edges_of(part, count).twins
         corner = part.ravel()
-        left, right = [], []
-        for turn in (1, 2):  # the corners of both faces at the same end of their edge
-            mine = one - one % 3 + (one + turn) % 3
-            near, far = (two - two % 3 + (two + other) % 3 for other in (1, 2))
-            left.append(mine)
-            right.append(np.where(corner[near] == corner[mine], near, far))
-        joined = np.concatenate(left)
-        fan = components(joined, np.concatenate(right), len(corner))
+        near, far = (two - two % 3 + (two + turn) % 3 for turn in (1, 2))
+        # the corners of both faces at the same end of their edge
+        joined = np.concatenate([one - one % 3 + (one + turn) % 3 for turn in (1, 2)])
+        near, far = np.tile(near, 2), np.tile(far, 2)
+        beside = np.where(corner[near] == corner[joined], near, far)
+        fan = components(joined, beside, len(corner))
         size = np.bincount(fan)
         closed = np.bincount(fan[joined], minlength=len(size)) == size
         point = np.zeros_like(size)

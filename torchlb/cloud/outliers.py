@@ -71,11 +71,9 @@ def put_beside(
     tree = KDTree(points[others])
     host = np.asarray(tree.query(points[lone])[1])
     ring = np.asarray(tree.query(points[others[host]], k=min(AROUND + 1, len(others)))[1])
-    order = np.argsort(host, kind="stable")
+    order, size = np.argsort(host, kind="stable"), ring.shape[1] - 1
     turn = np.empty_like(host)  # index of a lone point among those of its host
-    first = np.searchsorted(host[order], host[order])
-    turn[order] = np.arange(len(host)) - first
-    size = ring.shape[1] - 1
+    turn[order] = np.arange(len(host)) - np.searchsorted(host[order], host[order])
     end = points[others[ring[np.arange(len(host)), 1 + turn % size]]]
     start = points[others[host]]
     share = 1 / (3.0 + turn // size)

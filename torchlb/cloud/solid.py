@@ -31,13 +31,7 @@ SHEAR = np.eye(3) + 1e-3 * np.array([[0, 0.9, 0.7], [0, 0, 0.8], [0, 0, 0]])
 
 
 def cloud_solid(points: Float[Tensor, "N 3"]) -> Complex:
-    """The solid filled by the points.
-
-    Raises
-    ------
-    InputError
-        If the points lie in a plane, or some are far from all others.
-    """
+    """The solid filled by the points; they must not lie in a plane, nor some of them far from all others."""
     places = points.numpy()
     spread = np.linalg.svd(places - places.mean(0), compute_uv=False)
     if spread[2] <= NEGLIGIBLE * spread[0]:

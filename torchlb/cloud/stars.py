@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import numpy as np
 import torch
-from jaxtyping import Int
+from jaxtyping import Bool, Int
 
 from torchlb.cloud.cocone import Cloud
 from torchlb.cloud.gaps import overlapping
@@ -40,15 +40,16 @@ def local_stars(cloud: Cloud, centers: Int[np.ndarray, " B"]) -> Faces:
     return cloud.small(found.numpy())
 
 
-def gaps_between(
+def at_gaps(
     faces: Faces, pairs: tuple[np.ndarray, np.ndarray], count: int
-) -> tuple[Int[np.ndarray, " P"], Int[np.ndarray, " P"]]:
-    """Pairs of points in different components, one without a closed fan of faces: sheets do not grow together."""
+) -> Bool[np.ndarray, " N"]:
+    """Points of pairs in different components, one without a closed fan of faces: sheets do not grow together."""
     i, j = pairs
-    piece = pieces_of(faces, count)
-    outer = edges_of(faces, count).outer
+    piece, outer = pieces_of(faces, count), edges_of(faces, count).outer
     across = (piece[i] != piece[j]) & (outer[i] | outer[j])
-    return i[across], j[across]
+    result = np.zeros(count, dtype=bool)
+    result[i[across]] = result[j[across]] = True
+    return result
 
 
 def stars_in_gaps(cloud: Cloud, faces: Faces, pairs: tuple[np.ndarray, np.ndarray]) -> Faces:
@@ -57,12 +58,9 @@ def stars_in_gaps(cloud: Cloud, faces: Faces, pairs: tuple[np.ndarray, np.ndarra
     `pairs` are edges of the neighbour graph; components still apart are joined along the shortest of them.
     """
     count = len(cloud.points)
-    at_gap = np.zeros(count, dtype=bool)
-    for end in gaps_between(faces, pairs, count):
-        at_gap[end] = True
-    at_gap &= edges_of(faces, count).outer
-    at_gap |= np.bincount(faces.ravel(), minlength=count) == 0
-    stars = local_stars(cloud, np.flatnonzero(at_gap))
+    centers = at_gaps(faces, pairs, count) & edges_of(faces, count).outer
+    centers |= np.bincount(faces.ravel(), minlength=count) == 0
+    stars = local_stars(cloud, np.flatnonzero(centers))
     around = faces[np.isin(faces, stars[:, 0]).any(1)]
     stars = stars[~overlapping(cloud, stars, around, corners=1)]
     return np.concatenate([stars, bridges(cloud, np.concatenate([faces, stars]), pairs)])

@@ -16,26 +16,20 @@ from torchlb.cloud.cocone import REACH, Candidates, Cloud, Tetrahedra, best_mani
 from torchlb.cloud.complexes import Complex
 from torchlb.cloud.frames import cloud_frames, refined_normals
 from torchlb.cloud.gaps import closed, filled, with_left_points
-from torchlb.cloud.manifold import (
-    boundary_loops,
-    facing_out,
-    with_single_fans,
-    wound_alike,
-)
+from torchlb.cloud.manifold import boundary_loops, facing_out, with_single_fans, wound_alike
 from torchlb.cloud.noise import denoised
 from torchlb.cloud.orientation import settled_normals
 from torchlb.cloud.outliers import lone_points, put_beside
 from torchlb.cloud.places import Places, in_words, places_of
 from torchlb.cloud.poles import Poles, corrected_normals
-from torchlb.cloud.stars import gaps_between, stars_in_gaps
-from torchlb.errors import InputError
+from torchlb.cloud.stars import at_gaps, stars_in_gaps
 from torchlb.geometry.compatibility import mutually_admissible
 from torchlb.geometry.complex import Faces, components, delaunay, pieces_of
 from torchlb.geometry.frames import vertex_normals
 from torchlb.geometry.neighbors import mesh_graph, nearest_neighbors
 from torchlb.geometry.thresholds import LEVEL, NEAREST, RING
 from torchlb.geometry.vectors import lengths
-from torchlb.linalg.precision import LOW, NEGLIGIBLE, ROOT_EPS
+from torchlb.linalg.precision import LOW, NEGLIGIBLE
 
 
 @dataclass(frozen=True)
@@ -136,16 +130,15 @@ def cloud_surface(
         normals, oriented = settled_normals(points, normals, candidates)
     start = _start(points, candidates, normals, boundary)
     cloud, found, given, count = start.cloud, start.found, normals, len(points)
-    places = cloud.points
+    places, pairs = cloud.points, _kin(cloud)
     outward = given.numpy() if given is not None and oriented else found.outward
-    pairs = _kin(cloud)
     every, seam = wound_alike(places, _chosen(cloud, found, start.two_sided, pairs))
     faces = with_single_fans(every[~seam], count) if seam.any() else every
     faces, done = _completed(cloud, faces, found.small, pairs, outward)
     if _single_seams(every, seam, count) and wound_alike(places, faces)[1].any():
         faces, done = _completed(cloud, every, found.small, pairs, outward)
     # not by the faces, which may lead into a mouth from outside
-    cloud = _along(_oriented(cloud, faces), outward)
+    cloud = _along(_along(cloud, _of_faces(cloud, faces)), outward)
     if given is None:
         cloud = _righted(cloud, faces)
     stars = stars_in_gaps(cloud, faces, pairs)
@@ -153,9 +146,8 @@ def cloud_surface(
     pieces = pieces_of(np.concatenate([faces, stars]), count)
     figures = len(np.unique(faces)), len(stars), len(done), len(loops), int(pieces.max()) + 1
     touched = _contacts(cloud, faces)
-    where = places_of(places, cloud.neighbors, touched)
-    found_of_it = *figures, start.noise, int(touched.sum()), where, int(start.lone.sum())
-    summary = SurfaceSummary(count, *found_of_it)
+    contacts = int(touched.sum()), places_of(places, cloud.neighbors, touched)
+    summary = SurfaceSummary(count, *figures, start.noise, *contacts, int(start.lone.sum()))
     parts = (places, faces, stars, cloud.normals, cloud.neighbors, start.lone)
     names = "points", "cells", "stars", "normals", "neighbors", "lone"
     found: Any = {name: torch.from_numpy(part) for name, part in zip(names, parts, strict=True)}
@@ -278,9 +270,12 @@ def _completed(
     """(faces turned outward, with gaps filled from the pool or closed, and all points; the loops closed)."""
     places, count = cloud.points, len(cloud.points)
     bare = facing_out(places, bare, outward)
-    cloud = _oriented(cloud, bare)
+    cloud = _along(cloud, _of_faces(cloud, bare))
     faces = _without_gaps(cloud, bare, pool)
-    faces, done = closed(cloud, faces, _at_gaps(faces, pairs, count))
+    # the loop of a point with a neighbour in another component is no hole
+    within = np.isin(pairs, faces).all(0)
+    kept = at_gaps(faces, (pairs[0][within], pairs[1][within]), count)
+    faces, done = closed(cloud, faces, kept)
     faces = with_left_points(cloud, faces)
     if faces is not bare:
         faces = facing_out(places, wound_alike(places, faces)[0], outward)
@@ -304,22 +299,9 @@ def _without_gaps(cloud: Cloud, faces: Faces, pool: Faces) -> Faces:
     return faces if more is faces else with_single_fans(more, count)
 
 
-def _at_gaps(
-    faces: Faces, pairs: tuple[np.ndarray, np.ndarray], count: int
-) -> Bool[np.ndarray, " N"]:
-    """Points with a neighbour in another component of the faces, so that the loop they are on is no hole."""
-    used, result = np.zeros(count, dtype=bool), np.zeros(count, dtype=bool)
-    used[faces.ravel()] = True
-    both = used[pairs[0]] & used[pairs[1]]
-    for end in gaps_between(faces, (pairs[0][both], pairs[1][both]), count):
-        result[end] = True
-    return result
-
-
-def _oriented(cloud: Cloud, faces: Faces) -> Cloud:
-    """Cloud with its normals on the side of the faces, where there are any."""
-    points, triangles = torch.from_numpy(cloud.points), torch.from_numpy(faces)
-    return _along(cloud, vertex_normals(points, triangles).numpy())
+def _of_faces(cloud: Cloud, faces: Faces) -> Float[np.ndarray, "N 3"]:
+    """Unit normals of the faces at every point, zero where there are none."""
+    return vertex_normals(torch.from_numpy(cloud.points), torch.from_numpy(faces)).numpy()
 
 
 def _along(cloud: Cloud, vectors: Float[np.ndarray, "N 3"]) -> Cloud:
@@ -330,8 +312,7 @@ def _along(cloud: Cloud, vectors: Float[np.ndarray, "N 3"]) -> Cloud:
 
 def _righted(cloud: Cloud, faces: Faces) -> Cloud:
     """Cloud with normals realigned to those of its faces where they are misaligned, on their previous side."""
-    points, triangles = torch.from_numpy(cloud.points), torch.from_numpy(faces)
-    of_faces = vertex_normals(points, triangles).numpy()
+    of_faces = _of_faces(cloud, faces)
     cosine = (cloud.normals * of_faces).sum(1)
     misaligned = (np.abs(cosine) < LEVEL) & of_faces.any(1)
     realigned = of_faces * np.where(cosine < 0, -1.0, 1.0)[:, None]
@@ -373,12 +354,3 @@ def _kin(cloud: Cloud) -> tuple[np.ndarray, np.ndarray]:
     lone = (np.bincount(piece) < NEAREST)[piece]
     near |= (lone[:, None] & (np.arange(good.shape[1]) < RING)).ravel()
     return i[near], j[near]
-
-
-def check_spread(points: Float[Tensor, "N n"]) -> None:
-    """Raise InputError if the points of a surface lie on a line."""
-    spread = torch.linalg.svdvals(points - points.mean(0))
-    if spread[1] <= ROOT_EPS * spread[0]:
-        raise InputError(
-            f"points: all {len(points)} lie on a line, and no surface goes through them; a curve has dim=1"
-        )

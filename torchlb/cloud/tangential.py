@@ -38,13 +38,7 @@ LOOP = 12
 
 
 def cloud_stars(points: Float[Tensor, "N n"], dim: int) -> Complex:
-    """Complex of dimension d ≥ 2 through a cloud in Rⁿ, n > d: a surface of triangles, or all simplices of the stars.
-
-    Raises
-    ------
-    InputError
-        If points are in no cell.
-    """
+    """Complex of dimension d ≥ 2 through a cloud in Rⁿ, n > d: a surface of triangles, or all simplices of stars."""
     near = nearest_neighbors(points, min(CANDIDATES[dim], len(points)))
     frames = cloud_frames(points, near, dim)
     stars, places, shares = delaunay_stars(points, frames, near), points.numpy(), None
@@ -169,7 +163,8 @@ class _Fans:
 
     def take(self, face: list[int]) -> bool:
         """Add a triangle if it fits; return whether it does."""
-        keys = [min(a, b) * len(self.points) + max(a, b) for a, b in _sides(face)]
+        pairs = zip(face, [face[-1], *face], strict=False)
+        keys = [min(pair) * len(self.points) + max(pair) for pair in pairs]
         if not self.open[face].all() or any(self.uses.get(key, 0) >= 2 for key in keys):
             return False
         for point, start, width in self._wedges_of(face):
@@ -194,10 +189,6 @@ class _Fans:
             one, two = np.arctan2(y, x).tolist()
             width = (two - one) % (2 * np.pi)
             yield (point, one, width) if width <= np.pi else (point, two, 2 * np.pi - width)
-
-
-def _sides(face: list[int]) -> list[tuple[int, int]]:
-    return [(face[k - 1], face[k]) for k in range(len(face))]
 
 
 def circumradii(points: Float[np.ndarray, "N n"], faces: Faces) -> Float[np.ndarray, " F"]:
