@@ -112,7 +112,12 @@ class Tetrahedra:
         found = delaunay(moved)
         cells, beyond = (x.astype(np.int64) for x in (found.simplices, found.neighbors))
         del found
-        centers = _bounded_centers(moved, cells)
+        total, volume = circumcenters(moved, cells)
+        with np.errstate(all="ignore"):
+            centers = total / volume[:, None]
+        most = np.ptp(moved, axis=0).max() / NEGLIGIBLE  # bounds the centres of nearly flat cells
+        centers = np.nan_to_num(centers, posinf=most, neginf=-most).clip(-most, most)
+        centers += moved.take(cells[:, 0], 0)
         number, first = np.nonzero(np.arange(len(cells)) > beyond.T)
         others = np.array([[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]])
         triangles = cells[first[:, None], others[number]]
@@ -123,8 +128,8 @@ class Tetrahedra:
         normal /= np.maximum(lengths(normal), TINY)[:, None]
         inside = a - moved[apex[hull]]
         away = np.sign(inner(inside, normal))[:, None] * normal
-        far = centers[first[hull]] + np.ptp(points, axis=0).max() / NEGLIGIBLE * away
         second[hull] = len(cells) + np.arange(hull.sum())
+        far = centers[first[hull]] + np.ptp(points, axis=0).max() / NEGLIGIBLE * away
         centers = np.concatenate([centers, far])
         return cls(points, cells, centers, triangles, (first, second), hull)
 
@@ -171,17 +176,6 @@ class Candidates:
     tangent: Bool[np.ndarray, " F"]
     parting: Bool[np.ndarray, " F"]
     outward: Float[np.ndarray, "N 3"]
-
-
-def _bounded_centers(points: np.ndarray, cells: Int[np.ndarray, "T 4"]) -> Float[np.ndarray, "T 3"]:
-    """Circumcentres; those of nearly flat tetrahedra are at most 1e6 extents of the cloud away."""
-    total, volume = circumcenters(points, cells)
-    with np.errstate(all="ignore"):
-        center = total / volume[:, None]
-    most = np.ptp(points, axis=0).max() / NEGLIGIBLE
-    return points.take(cells[:, 0], 0) + np.clip(
-        np.nan_to_num(center, posinf=most, neginf=-most), -most, most
-    )
 
 
 def _leaves_cone(

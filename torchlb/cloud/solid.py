@@ -47,7 +47,11 @@ def cloud_solid(points: Float[Tensor, "N 3"]) -> Complex:
     even = count * np.mean((lengths(places[near[:, 1]] - places) / reach) ** 3)
     # random points have 24π²/35 Delaunay tetrahedra each (Meijering 1953)
     chance = (np.log(24 / 35 * np.pi**2 * len(points)) + SURE) / count / max(1.0, even / WIDER)
-    kept = ~_outside(flat | (radius <= chance ** (1 / 3) * np.sort(reach[cells], 1)[:, 2]), beside)
+    kept = flat | (radius <= chance ** (1 / 3) * np.sort(reach[cells], 1)[:, 2])
+    i, j = np.arange(len(kept)).repeat(4), beside.ravel()
+    both = (j >= 0) & ~kept[i] & ~kept[j]
+    piece = components(i[both], j[both], len(kept))
+    kept |= np.bincount(piece)[piece] < RING  # a dent of few cells is none
     beyond = np.append(kept, False)  # index −1 is beyond the hull, where nothing is kept
     while (peeled := kept & flat & ~beyond[beside].all(1)).any():
         kept &= ~peeled
@@ -71,13 +75,3 @@ def _spheres(
         lengths(points[cells[:, i]] - points[cells[:, j]]) for i, j in combinations(range(4), 2)
     ]
     return radius, np.abs(six) / 6 <= NEGLIGIBLE * np.max(edges, axis=0) ** 3
-
-
-def _outside(
-    kept: Bool[np.ndarray, " T"], beside: Int[np.ndarray, "T 4"]
-) -> Bool[np.ndarray, " T"]:
-    """Rejected tetrahedra in components too large for a dent."""
-    i, j = np.arange(len(kept)).repeat(4), beside.ravel()
-    both = (j >= 0) & ~kept[i] & ~kept[j]
-    piece = components(i[both], j[both], len(kept))
-    return ~kept & (np.bincount(piece)[piece] >= RING)
