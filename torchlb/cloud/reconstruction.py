@@ -14,7 +14,6 @@ from torchlb.cloud.solid import cloud_solid
 from torchlb.cloud.surface import cloud_surface
 from torchlb.cloud.tangential import cloud_stars
 from torchlb.errors import InputError, first_few
-from torchlb.linalg.precision import ROOT_EPS
 
 
 def reconstruct(
@@ -73,9 +72,4 @@ def reconstruct(
         return cloud_solid(space)
     if dim == 3 or ambient > 3:
         return cloud_stars(space, dim)
-    spread = torch.linalg.svdvals(space - space.mean(0))
-    if spread[1] <= ROOT_EPS * spread[0]:
-        raise InputError(
-            f"points: all {count} lie on a line, and no surface goes through them; a curve has dim=1"
-        )
     return cloud_surface(pad(space, (0, 3 - ambient)), normals=given, boundary=mask)

@@ -15,6 +15,9 @@ from torchlb.cloud.voronoi import natural_neighbors, unrolled
 from torchlb.geometry.complex import Faces, edges_of, pieces_of, spanning_pairs
 from torchlb.geometry.thresholds import ROUGH
 
+Pairs = tuple[Int[np.ndarray, " P"], Int[np.ndarray, " P"]]
+"""Edges of the neighbour graph."""
+
 
 def local_stars(cloud: Cloud, centers: Int[np.ndarray, " B"]) -> Faces:
     """Delaunay triangles around each centre in its tangent plane, among neighbours with similar normals.
@@ -40,9 +43,7 @@ def local_stars(cloud: Cloud, centers: Int[np.ndarray, " B"]) -> Faces:
     return cloud.small(found.numpy())
 
 
-def at_gaps(
-    faces: Faces, pairs: tuple[np.ndarray, np.ndarray], count: int
-) -> Bool[np.ndarray, " N"]:
+def at_gaps(faces: Faces, pairs: Pairs, count: int) -> Bool[np.ndarray, " N"]:
     """Points of pairs in different components, one without a closed fan of faces: sheets do not grow together."""
     i, j = pairs
     piece, outer = pieces_of(faces, count), edges_of(faces, count).outer
@@ -52,11 +53,8 @@ def at_gaps(
     return result
 
 
-def stars_in_gaps(cloud: Cloud, faces: Faces, pairs: tuple[np.ndarray, np.ndarray]) -> Faces:
-    """Stars of points in no face or at a gap between components, unless they overlap faces; then bridges.
-
-    `pairs` are edges of the neighbour graph; components still apart are joined along the shortest of them.
-    """
+def stars_in_gaps(cloud: Cloud, faces: Faces, pairs: Pairs) -> Faces:
+    """Stars of points in no face or at a gap between components, unless they overlap faces; then bridges."""
     count = len(cloud.points)
     centers = at_gaps(faces, pairs, count) & edges_of(faces, count).outer
     centers |= np.bincount(faces.ravel(), minlength=count) == 0
@@ -66,7 +64,7 @@ def stars_in_gaps(cloud: Cloud, faces: Faces, pairs: tuple[np.ndarray, np.ndarra
     return np.concatenate([stars, bridges(cloud, np.concatenate([faces, stars]), pairs)])
 
 
-def bridges(cloud: Cloud, faces: Faces, pairs: tuple[np.ndarray, np.ndarray]) -> Faces:
+def bridges(cloud: Cloud, faces: Faces, pairs: Pairs) -> Faces:
     """Two triangles, one from either side, at the shortest pairs that connect the components still apart."""
     count = len(cloud.points)
     piece = pieces_of(faces, count)

@@ -22,14 +22,15 @@ from torchlb.cloud.orientation import settled_normals
 from torchlb.cloud.outliers import lone_points, put_beside
 from torchlb.cloud.places import Places, in_words, places_of
 from torchlb.cloud.poles import Poles, corrected_normals
-from torchlb.cloud.stars import at_gaps, stars_in_gaps
+from torchlb.cloud.stars import Pairs, at_gaps, stars_in_gaps
+from torchlb.errors import InputError
 from torchlb.geometry.compatibility import mutually_admissible
 from torchlb.geometry.complex import Faces, components, delaunay, pieces_of
 from torchlb.geometry.frames import vertex_normals
 from torchlb.geometry.neighbors import mesh_graph, nearest_neighbors
 from torchlb.geometry.thresholds import LEVEL, NEAREST, RING
 from torchlb.geometry.vectors import lengths
-from torchlb.linalg.precision import LOW, NEGLIGIBLE
+from torchlb.linalg.precision import LOW, NEGLIGIBLE, ROOT_EPS
 
 
 @dataclass(frozen=True)
@@ -125,6 +126,11 @@ def cloud_surface(
 
     `normals` tell the outward side where most of them agree; `boundary` marks points of a true boundary.
     """
+    spread = torch.linalg.svdvals(points - points.mean(0))
+    if spread[1] <= ROOT_EPS * spread[0]:
+        raise InputError(
+            f"points: all {len(points)} lie on a line, and no surface goes through them; a curve has dim=1"
+        )
     candidates, oriented = nearest_neighbors(points, min(NEAREST, len(points))), False
     if normals is not None:
         normals, oriented = settled_normals(points, normals, candidates)
@@ -179,18 +185,20 @@ def _start(
         candidates = nearest_neighbors(points, candidates.shape[1])
     frames, near = cloud_frames(points, candidates, 2, rounds=1), candidates.numpy()
     on_boundary = np.zeros(len(points), dtype=bool) if boundary is None else boundary.numpy()
-    planar = _planar_triangles(points.numpy())
+
+    def cloud_of(points: Tensor, normals: Tensor) -> Cloud:
+        places = points.numpy()
+        return Cloud(places, normals.numpy(), near, _reaches(places, near), on_boundary)
+
+    planar, normals = _planar_triangles(points.numpy()), given
     if planar is not None:
         faces, normal = planar
         up = torch.from_numpy(normal if normal[2] >= 0 else -normal).expand_as(points)
-        normals, places = up if given is None else given, points.numpy()
-        cloud = Cloud(places, normals.numpy(), near, _reaches(places, near), on_boundary)
+        cloud = cloud_of(points, up if given is None else given)
         small = cloud.small(faces)
         every = np.ones(len(small), dtype=bool)
-        return _Start(
-            cloud, Candidates(small, small, every, every, up.numpy()), True, frames, 0.0, lone
-        )
-    normals = given
+        found = Candidates(small, small, every, every, up.numpy())
+        return _Start(cloud, found, True, frames, 0.0, lone)
     if normals is None:
         first = torch.linalg.cross(*frames.unbind(-1))
         normals = refined_normals(points, first, candidates, rounds=2)
@@ -204,7 +212,7 @@ def _start(
     if given is None:
         normals = corrected_normals(points, normals, candidates, poles)
     side, two_sided = poles.sides(normals)
-    cloud = Cloud(places, normals.numpy(), near, _reaches(places, near), on_boundary)
+    cloud = cloud_of(points, normals)
     return _Start(cloud, tetrahedra.candidates(cloud, side), two_sided, frames, noise, lone)
 
 
@@ -232,9 +240,7 @@ def _upright(
     return torch.stack([first, torch.linalg.cross(normals, first)], -1)
 
 
-def _chosen(
-    cloud: Cloud, found: Candidates, two_sided: bool, pairs: tuple[np.ndarray, np.ndarray]
-) -> Faces:
+def _chosen(cloud: Cloud, found: Candidates, two_sided: bool, pairs: Pairs) -> Faces:
     """Choose faces with single fans, first those that part the outside from the inside if there are two sides.
 
     Tangent faces come first where a cavity would be cut off from points that belong to it, as where lips touch.
@@ -264,7 +270,7 @@ def _completed(
     cloud: Cloud,
     bare: Faces,
     pool: Faces,
-    pairs: tuple[np.ndarray, np.ndarray],
+    pairs: Pairs,
     outward: Float[np.ndarray, "N 3"],
 ) -> tuple[Faces, list[list[int]]]:
     """(faces turned outward, with gaps filled from the pool or closed, and all points; the loops closed)."""
@@ -344,7 +350,7 @@ def _contacts(cloud: Cloud, faces: Faces) -> Bool[np.ndarray, " N"]:
     return touched
 
 
-def _kin(cloud: Cloud) -> tuple[np.ndarray, np.ndarray]:
+def _kin(cloud: Cloud) -> Pairs:
     """Edges of the graph of the `RING` nearest compatible neighbours, or of all nearest ones in small components."""
     points, normals = torch.from_numpy(cloud.points), torch.from_numpy(cloud.normals)
     i, j, good = mutually_admissible(points, normals, torch.from_numpy(cloud.neighbors))

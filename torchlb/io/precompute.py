@@ -142,13 +142,8 @@ def precompute_operators(
     check_options_of(operator, options)
     cache = Path(out).expanduser()
     sources, skipped = _sources(shapes, cache)
-    settings: dict[str, Any] = {
-        "cache": str(cache.resolve()),
-        "operator": operator,
-        "k": k,
-        "clean": clean,
-    }
-    work = partial(_solve, **settings, options=options)
+    settings: dict[str, Any] = {"operator": operator, "k": k, "options": options}
+    work = partial(_solve, cache=str(cache.resolve()), clean=clean, **settings)
     cache.mkdir(parents=True, exist_ok=True)
     _remove_stale(cache)
     results: dict[int, ShapeResult] = {}
