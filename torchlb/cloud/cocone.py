@@ -149,7 +149,9 @@ class Tetrahedra:
         for corner in triangles.T:
             left = np.flatnonzero(tangent)
             apex, axis = (x.take(corner[left], 0) for x in (cloud.points, cloud.normals))
-            tangent[left] = _leaves_cone(apex, axis, tuple(end.take(left, 0) for end in ends))
+            offsets = [end.take(left, 0) - apex for end in ends]
+            one, two = (inner(x, axis) / np.maximum(lengths(x), TINY) for x in offsets)
+            tangent[left] = (np.abs(one) <= COCONE) | (np.abs(two) <= COCONE) | (one * two < 0)
         one, two = (side[number[kept]] for number in self.sides)
         parting = one != two
         out = (ends[0] - ends[1])[parting] * one[parting, None]
@@ -176,15 +178,6 @@ class Candidates:
     tangent: Bool[np.ndarray, " F"]
     parting: Bool[np.ndarray, " F"]
     outward: Float[np.ndarray, "N 3"]
-
-
-def _leaves_cone(
-    apex: np.ndarray, normal: np.ndarray, ends: tuple[np.ndarray, ...]
-) -> Bool[np.ndarray, " F"]:
-    """Whether the segment between `ends` reaches into the cocone at the apex."""
-    offsets = [end - apex for end in ends]
-    one, two = (inner(x, normal) / np.maximum(lengths(x), TINY) for x in offsets)
-    return (np.abs(one) <= COCONE) | (np.abs(two) <= COCONE) | (one * two < 0)
 
 
 def conormals(

@@ -195,16 +195,14 @@ def _cut(
 ) -> tuple[list[Chain], Int[np.ndarray, " G"]]:
     """(chains cut at their gaps; ends of the gaps that are less than twice as long as the limit)."""
     turns = (np.append(chain, chain[:1]) if closed else chain for chain, closed in chains)
-    steps, uneven, found = [np.diff(points[turn], axis=0) for turn in turns], [], []
-    for step in steps:
-        length = lengths(step)
-        uneven.append(np.abs(np.diff(length)) / np.maximum(length[1:] + length[:-1], TINY))
-    spread = np.concatenate(uneven)
+    steps = [np.diff(points[turn], axis=0) for turn in turns]
+    sizes = [lengths(step) for step in steps]
+    uneven = (np.abs(np.diff(x)) / np.maximum(x[1:] + x[:-1], TINY) for x in sizes)
+    spread = np.concatenate(list(uneven))
     random = min(1.0, 2 * float(np.median(spread))) if len(spread) else 0.0
     limit = FACTOR + random * (np.log(len(points)) + RANDOM)
-    doubtful: list[int] = []
-    for (chain, closed), step in zip(chains, steps, strict=True):
-        length = lengths(step)
+    found, doubtful = [], []
+    for (chain, closed), step, length in zip(chains, steps, sizes, strict=True):
         usual = _usual(length, closed) if len(length) > 1 else length
         cosine = inner(step, np.roll(step, 1, 0)) / np.maximum(length * np.roll(length, 1), TINY)
         turn = np.arccos(np.clip(cosine, -1, 1))

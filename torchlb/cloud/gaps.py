@@ -16,14 +16,7 @@ from torchlb.geometry.vectors import inner, largest, lengths, smallest
 from torchlb.linalg.precision import LOW, TINY
 
 
-def filled(
-    cloud: Cloud,
-    faces: Faces,
-    pool: Faces,
-    *,
-    oriented: bool,
-    strict: bool,
-) -> Faces:
+def filled(cloud: Cloud, faces: Faces, pool: Faces, *, oriented: bool, strict: bool) -> Faces:
     """Faces extended by triangles that neither fold nor overlap; the very array if there are none.
 
     Triangles of the pool, or ears between two boundary edges, are added best first, in rounds, until none fits; no ear
@@ -50,9 +43,8 @@ def filled(
         new = _proposals(cloud, edges, half, candidates, oriented, ROUGH if strict else LOW)
         new = new[~overlapping(cloud, new, around)] if strict else new
         if len(new) == 0:
-            return (
-                faces if len(away) + len(around) == len(faces) else np.concatenate([away, around])
-            )
+            done = len(away) + len(around) == len(faces)
+            return faces if done else np.concatenate([away, around])
         best = np.full(count, len(new))
         np.minimum.at(best, new.ravel(), np.arange(len(new)).repeat(3))
         chosen = (best[new] == np.arange(len(new))[:, None]).all(1)

@@ -11,7 +11,7 @@ from itertools import combinations
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float
 from torch import Tensor
 
 from torchlb.cloud.complexes import Complex
@@ -42,7 +42,11 @@ def cloud_solid(points: Float[Tensor, "N 3"]) -> Complex:
     reach = lengths(places[near[:, -1]] - places)
     found = delaunay(places @ SHEAR)
     cells, beside = (x.astype(np.int64) for x in (found.simplices, found.neighbors))
-    radius, flat = _spheres(places, cells)
+    center, six = circumcenters(places, cells)
+    radius = lengths(center) / np.maximum(np.abs(six), TINY)
+    ends = [places[cells[:, k]] for k in range(4)]
+    longest = np.max([lengths(a - b) for a, b in combinations(ends, 2)], axis=0)
+    flat = np.abs(six) / 6 <= NEGLIGIBLE * longest**3
     count = near.shape[1] - 1
     even = count * np.mean((lengths(places[near[:, 1]] - places) / reach) ** 3)
     # random points have 24π²/35 Delaunay tetrahedra each (Meijering 1953)
@@ -63,15 +67,3 @@ def cloud_solid(points: Float[Tensor, "N 3"]) -> Complex:
             "a solid are apart, and no tetrahedron reaches them; leave them out, or add points between"
         )
     return Complex(points=points, cells=torch.from_numpy(cells[kept]))
-
-
-def _spheres(
-    points: Float[np.ndarray, "N 3"], cells: Int[np.ndarray, "T 4"]
-) -> tuple[Float[np.ndarray, " T"], Bool[np.ndarray, " T"]]:
-    """Circumradii, ℓ, and which tetrahedra have no volume."""
-    center, six = circumcenters(points, cells)
-    radius = lengths(center) / np.maximum(np.abs(six), TINY)
-    edges = [
-        lengths(points[cells[:, i]] - points[cells[:, j]]) for i, j in combinations(range(4), 2)
-    ]
-    return radius, np.abs(six) / 6 <= NEGLIGIBLE * np.max(edges, axis=0) ** 3

@@ -154,11 +154,11 @@ def cloud_surface(
     touched = _contacts(cloud, faces)
     contacts = int(touched.sum()), places_of(places, cloud.neighbors, touched)
     summary = SurfaceSummary(count, *figures, start.noise, *contacts, int(start.lone.sum()))
-    parts = (places, faces, stars, cloud.normals, cloud.neighbors, start.lone)
-    names = "points", "cells", "stars", "normals", "neighbors", "lone"
-    found: Any = {name: torch.from_numpy(part) for name, part in zip(names, parts, strict=True)}
-    frames = _upright(start.frames, found["normals"])
-    return CloudSurface(**found, frames=frames, summary=summary)
+    parts = {"points": places, "cells": faces, "stars": stars, "normals": cloud.normals}
+    parts |= {"neighbors": cloud.neighbors, "lone": start.lone}
+    tensors: Any = {name: torch.from_numpy(part) for name, part in parts.items()}
+    frames = _upright(start.frames, tensors["normals"])
+    return CloudSurface(**tensors, frames=frames, summary=summary)
 
 
 class _Start(NamedTuple):

@@ -76,10 +76,7 @@ def natural_neighbors(
     return natural & valid
 
 
-def cell_volume(
-    coords: Float[Tensor, "B K d"],
-    valid: Bool[Tensor, "B K"],
-) -> Float[Tensor, " B"]:
+def cell_volume(coords: Float[Tensor, "B K d"], valid: Bool[Tensor, "B K"]) -> Float[Tensor, " B"]:
     """Volume of the cell, ℓ^d: that of the unit ball times the mean of r^d.
 
     An open cell ends half-way to the farthest valid neighbour; in directions without one within 60° it ends at the

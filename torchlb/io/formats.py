@@ -99,9 +99,8 @@ def read_ply(path: Path) -> Polygons:
             lists = [title for title, _, size in properties if size]
             corners = columns[next((n for n in lists if n.startswith("vertex_ind")), lists[0])]
             if name == "tristrips":
-                corners = [
-                    triangle for strip in corners for triangle in _strip(strip.astype(np.int32))
-                ]
+                strips = (_strip(strip.astype(np.int32)) for strip in corners)
+                corners = list(chain.from_iterable(strips))
             faces = corners if faces is None else [*faces, *corners]
     return _polygons(vertices, [] if faces is None else faces)
 

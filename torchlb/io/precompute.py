@@ -229,9 +229,8 @@ def _parallel(
     lazy = getattr(backend, "supports_return_generator", False)
     way = "generator_unordered" if lazy else "list"
     settings: dict[str, Any] = {"n_jobs": workers, "batch_size": 1, "return_as": way}
-    calls = [joblib.delayed(work)(index, *task) for index, task in tasks.items()]
-    found: Any = joblib.Parallel(**settings)(calls)
-    return found
+    parallel: Any = joblib.Parallel(**settings)
+    return parallel([joblib.delayed(work)(index, *task) for index, task in tasks.items()])
 
 
 def _solve(
