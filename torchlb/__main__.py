@@ -19,7 +19,7 @@ from click.core import ParameterSource
 from torchlb.errors import OperatorFileError
 from torchlb.fits.rules import WeightsName
 from torchlb.geometry.frames import Projection
-from torchlb.io.cache import describe_file
+from torchlb.io.cache import load_with_header
 from torchlb.io.files import read_shape
 from torchlb.io.precompute import concerns_the_shape, precompute_operators
 from torchlb.operator.cleaning import clean_mesh, cleaned
@@ -186,7 +186,7 @@ def info(file: Path) -> None:
       python -m torchlb info bunny.ply
     """
     try:
-        found = describe_file(file)
+        lb, header = load_with_header(file)
     except OperatorFileError:
         vertices, faces = read_shape(file)
         low, high = vertices.amin(0), vertices.amax(0)
@@ -196,11 +196,10 @@ def info(file: Path) -> None:
             loose = len(vertices) - len(clean_mesh(vertices, faces)[2])
             click.echo(f"{loose} vertices belong to no face with distinct corners")
         return
-    lb = found["operator"]
     click.echo(f"{lb}\n\n{lb.report}\n{_stability(lb)}")
     pairs = lb.modes.left.shape[-1]
     click.echo(f"{pairs} eigenpairs stored")
-    click.echo(f"{file.stat().st_size / 1e6:.1f} MB, written by torchlb {found['version']}")
+    click.echo(f"{file.stat().st_size / 1e6:.1f} MB, written by torchlb {header['version']}")
 
 
 def _size(vertices: Any, faces: Any) -> str:

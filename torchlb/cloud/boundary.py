@@ -20,12 +20,8 @@ from torchlb.geometry.thresholds import RING
 class CloudBoundaryPlan(BoundaryPlan):
     """Neighbours of the boundary points of a cloud, where a mask gives the boundary and not a complex.
 
-    Attributes
-    ----------
-    inside
-        (b, q), nearest points off the boundary, which tell the side of the shape.
-    near
-        (b, K), nearest boundary points by their position in `members`, for the initial tangents.
+    `inside` are the nearest points off the boundary, which tell the side of the shape; `near` the nearest boundary
+    points, by their position in `members`, for the initial tangents.
     """
 
     inside: Int[Tensor, "_ q"]

@@ -31,20 +31,9 @@ one layer of triangles, not several that mix."""
 
 @dataclass(frozen=True)
 class Cloud:
-    """Points with normals and neighbours, from which triangles are made.
+    """Points with unit normals and nearest points, themselves first, from which triangles are made.
 
-    Attributes
-    ----------
-    points
-        (N, 3), ℓ.
-    normals
-        (N, 3), unit.
-    neighbors
-        (N, K), nearest points, itself first.
-    reach
-        (N,), ℓ, largest circumradius of a triangle at each point; half of it if all corners are on the boundary.
-    boundary
-        (N,), points of a declared boundary.
+    `reach` bounds the circumradius of triangles at each point, ℓ; half of it does if all corners are on the boundary.
     """
 
     points: Float[np.ndarray, "N 3"]
@@ -93,20 +82,9 @@ class Cloud:
 
 @dataclass(frozen=True)
 class Tetrahedra:
-    """Delaunay tetrahedra of a cloud; their circumcentres are the vertices of its Voronoi cells.
+    """Delaunay tetrahedra of a cloud, each triangle once, and which triangles are on the convex hull.
 
-    Attributes
-    ----------
-    cells
-        (T, 4), corners.
-    centers
-        (T + H, 3), ℓ, circumcentres; then, beyond each triangle of the hull, a point far away.
-    triangles
-        (F, 3), each once.
-    sides
-        Indices into `centers` for the two sides of each triangle, (F,) each.
-    hull
-        (F,), which triangles are on the convex hull.
+    `sides` index the circumcentres on the two sides of each triangle; those beyond the hull are points far away.
     """
 
     points: Float[np.ndarray, "N 3"]
@@ -134,27 +112,24 @@ class Tetrahedra:
         found = delaunay(moved)
         cells, beyond = (x.astype(np.int64) for x in (found.simplices, found.neighbors))
         del found
-        centers = _bounded_centers(moved, cells)
-        faces, here, there, apex = [], [], [], []
-        for k in range(4):
-            own = np.flatnonzero(beyond[:, k] < np.arange(len(cells)))
-            faces.append(np.delete(cells[own], k, 1))
-            here.append(own)
-            there.append(beyond[own, k])
-            apex.append(cells[own, k])
-        triangles, first, second = (
-            np.concatenate(faces),
-            np.concatenate(here),
-            np.concatenate(there),
-        )
+        total, volume = circumcenters(moved, cells)
+        with np.errstate(all="ignore"):
+            centers = total / volume[:, None]
+        most = np.ptp(moved, axis=0).max() / NEGLIGIBLE  # bounds the centres of nearly flat cells
+        centers = np.nan_to_num(centers, posinf=most, neginf=-most).clip(-most, most)
+        centers += moved.take(cells[:, 0], 0)
+        number, first = np.nonzero(np.arange(len(cells)) > beyond.T)
+        others = np.array([[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]])
+        triangles = cells[first[:, None], others[number]]
+        second, apex = beyond[first, number], cells[first, number]
         hull = second < 0
         a, b, c = moved[triangles[hull]].swapaxes(0, 1)
         normal = np.cross(b - a, c - a)
         normal /= np.maximum(lengths(normal), TINY)[:, None]
-        inside = a - moved[np.concatenate(apex)[hull]]
+        inside = a - moved[apex[hull]]
         away = np.sign(inner(inside, normal))[:, None] * normal
-        far = centers[first[hull]] + np.ptp(points, axis=0).max() / NEGLIGIBLE * away
         second[hull] = len(cells) + np.arange(hull.sum())
+        far = centers[first[hull]] + np.ptp(points, axis=0).max() / NEGLIGIBLE * away
         centers = np.concatenate([centers, far])
         return cls(points, cells, centers, triangles, (first, second), hull)
 
@@ -174,7 +149,9 @@ class Tetrahedra:
         for corner in triangles.T:
             left = np.flatnonzero(tangent)
             apex, axis = (x.take(corner[left], 0) for x in (cloud.points, cloud.normals))
-            tangent[left] = _leaves_cone(apex, axis, tuple(end.take(left, 0) for end in ends))
+            offsets = [end.take(left, 0) - apex for end in ends]
+            one, two = (inner(x, axis) / np.maximum(lengths(x), TINY) for x in offsets)
+            tangent[left] = (np.abs(one) <= COCONE) | (np.abs(two) <= COCONE) | (one * two < 0)
         one, two = (side[number[kept]] for number in self.sides)
         parting = one != two
         out = (ends[0] - ends[1])[parting] * one[parting, None]
@@ -190,20 +167,10 @@ class Tetrahedra:
 
 @dataclass(frozen=True)
 class Candidates:
-    """Candidate triangles of a surface, best first.
+    """Candidate triangles of a surface, best first: those that pass the cocone test, or part outside from inside.
 
-    Attributes
-    ----------
-    small
-        (P, 3), all triangles within the reach of their corners, in no order.
-    triangles
-        (F, 3), the tangent and the parting ones among these.
-    tangent
-        (F,), which triangles pass the cocone test.
-    parting
-        (F,), which triangles have the outside on one side and the inside on the other.
-    outward
-        (N, 3), ℓ²: sum of the outward area vectors of the small parting triangles at each point.
+    `small` are all triangles within the reach of their corners, in no order; `outward` is the sum of the outward area
+    vectors of the parting ones among these at each point, ℓ².
     """
 
     small: Faces
@@ -211,33 +178,6 @@ class Candidates:
     tangent: Bool[np.ndarray, " F"]
     parting: Bool[np.ndarray, " F"]
     outward: Float[np.ndarray, "N 3"]
-
-    def best(self, points: Float[np.ndarray, "N 3"], first: Bool[np.ndarray, " F"]) -> Faces:
-        """Manifold of the triangles that are `first`, with those of the others that fit."""
-        return best_manifold(points, self.triangles[np.argsort(~first, kind="stable")])
-
-
-def _bounded_centers(points: np.ndarray, cells: Int[np.ndarray, "T 4"]) -> Float[np.ndarray, "T 3"]:
-    """Circumcentres; those of nearly flat tetrahedra are at most 1e6 extents of the cloud away."""
-    total, volume = circumcenters(points, cells)
-    with np.errstate(all="ignore"):
-        center = total / volume[:, None]
-    most = np.ptp(points, axis=0).max() / NEGLIGIBLE
-    return points.take(cells[:, 0], 0) + np.clip(
-        np.nan_to_num(center, posinf=most, neginf=-most), -most, most
-    )
-
-
-def _leaves_cone(
-    apex: np.ndarray, normal: np.ndarray, ends: tuple[np.ndarray, ...]
-) -> Bool[np.ndarray, " F"]:
-    """Whether the segment between `ends` reaches into the cocone at the apex."""
-    rise = []
-    for end in ends:
-        offset = end - apex
-        rise.append(inner(offset, normal) / np.maximum(lengths(offset), TINY))
-    one, two = rise
-    return (np.abs(one) <= COCONE) | (np.abs(two) <= COCONE) | (one * two < 0)
 
 
 def conormals(

@@ -41,19 +41,9 @@ def cloud_curve(
     normals: Float[Tensor, "N n"] | None = None,
     boundary: Bool[Tensor, " N"] | None = None,
 ) -> Complex:
-    """The curve through all points: closed and open chains.
+    """The curve through all points: closed and open chains, which end at the points of the boundary.
 
-    Parameters
-    ----------
-    normals
-        Normals in R², whose side the curve faces where most of them agree; without them closed curves face outward.
-    boundary
-        Mask of the points where the curve ends, whatever lies beyond.
-
-    Raises
-    ------
-    InputError
-        If points are far from all others.
+    In R² it faces the side of the normals where most of them agree; without them closed chains face outward.
     """
     size = min(NEAR + 1, len(points))
     near, oriented = nearest_neighbors(points, size), False
@@ -76,11 +66,11 @@ def cloud_curve(
             "curve are apart, and no segment reaches them; leave them out, or add points between"
         )
     _warn(places, index, chains, noise, gaps)
-    cells = np.concatenate([chain.segments for chain in chains])
+    cells = [chain.segments for chain in chains]
     if points.shape[1] == 2:
         given = normals.numpy() if oriented and normals is not None else None
-        cells = np.concatenate([_facing_out(places, chain, given) for chain in chains])
-    return Complex(points=points, cells=torch.from_numpy(cells))
+        cells = [_facing_out(places, chain, given) for chain in chains]
+    return Complex(points=points, cells=torch.from_numpy(np.concatenate(cells)))
 
 
 class Chain(NamedTuple):
@@ -205,16 +195,14 @@ def _cut(
 ) -> tuple[list[Chain], Int[np.ndarray, " G"]]:
     """(chains cut at their gaps; ends of the gaps that are less than twice as long as the limit)."""
     turns = (np.append(chain, chain[:1]) if closed else chain for chain, closed in chains)
-    steps, uneven, found = [np.diff(points[turn], axis=0) for turn in turns], [], []
-    for step in steps:
-        length = lengths(step)
-        uneven.append(np.abs(np.diff(length)) / np.maximum(length[1:] + length[:-1], TINY))
-    spread = np.concatenate(uneven)
+    steps = [np.diff(points[turn], axis=0) for turn in turns]
+    sizes = [lengths(step) for step in steps]
+    uneven = (np.abs(np.diff(x)) / np.maximum(x[1:] + x[:-1], TINY) for x in sizes)
+    spread = np.concatenate(list(uneven))
     random = min(1.0, 2 * float(np.median(spread))) if len(spread) else 0.0
     limit = FACTOR + random * (np.log(len(points)) + RANDOM)
-    doubtful: list[int] = []
-    for (chain, closed), step in zip(chains, steps, strict=True):
-        length = lengths(step)
+    found, doubtful = [], []
+    for (chain, closed), step, length in zip(chains, steps, sizes, strict=True):
         usual = _usual(length, closed) if len(length) > 1 else length
         cosine = inner(step, np.roll(step, 1, 0)) / np.maximum(length * np.roll(length, 1), TINY)
         turn = np.arccos(np.clip(cosine, -1, 1))

@@ -124,9 +124,7 @@ def _coarse_space(sound: sparse.csr_matrix) -> Any:
 
 
 def _elements(
-    points: Float[np.ndarray, "N 3"],
-    faces: Faces,
-    weight: Float[np.ndarray, " F"],
+    points: Float[np.ndarray, "N 3"], faces: Faces, weight: Float[np.ndarray, " F"]
 ) -> tuple[sparse.csr_array, Float[np.ndarray, " N"]]:
     """P1 stiffness matrix and lumped mass; the heights of flat triangles are bounded from below."""
     count = len(points)

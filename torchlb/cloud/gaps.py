@@ -9,21 +9,14 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from torchlb.cloud.cocone import REACH, Cloud, conormals
-from torchlb.cloud.manifold import boundary_loops
+from torchlb.cloud.manifold import boundary_loops, ears_of
 from torchlb.geometry.complex import Edges, Faces, edges_of
 from torchlb.geometry.thresholds import CREASE, NEAREST, ROUGH, SLIGHT
 from torchlb.geometry.vectors import inner, largest, lengths, smallest
 from torchlb.linalg.precision import LOW, TINY
 
 
-def filled(
-    cloud: Cloud,
-    faces: Faces,
-    pool: Faces,
-    *,
-    oriented: bool,
-    strict: bool,
-) -> Faces:
+def filled(cloud: Cloud, faces: Faces, pool: Faces, *, oriented: bool, strict: bool) -> Faces:
     """Faces extended by triangles that neither fold nor overlap; the very array if there are none.
 
     Triangles of the pool, or ears between two boundary edges, are added best first, in rounds, until none fits; no ear
@@ -50,9 +43,8 @@ def filled(
         new = _proposals(cloud, edges, half, candidates, oriented, ROUGH if strict else LOW)
         new = new[~overlapping(cloud, new, around)] if strict else new
         if len(new) == 0:
-            return (
-                faces if len(away) + len(around) == len(faces) else np.concatenate([away, around])
-            )
+            done = len(away) + len(around) == len(faces)
+            return faces if done else np.concatenate([away, around])
         best = np.full(count, len(new))
         np.minimum.at(best, new.ravel(), np.arange(len(new)).repeat(3))
         chosen = (best[new] == np.arange(len(new))[:, None]).all(1)
@@ -108,28 +100,26 @@ def _proposals(
 
 def overlapping(cloud: Cloud, new: Faces, faces: Faces, corners: int = 3) -> Bool[np.ndarray, " T"]:
     """Which new triangles overlap a face at one of their first `corners` corners, seen along the normal there."""
-    count = len(cloud.points)
     rows, places = np.nonzero(np.isin(faces, new[:, :corners]))
-    point = faces[rows, places]
-    order = np.argsort(point, kind="stable")
-    rows, places = rows[order], places[order]
-    number = np.bincount(point, minlength=count)
-    start = np.cumsum(number) - number
     theirs = _wedges(cloud, faces[rows], places)
     result = np.zeros(len(new), dtype=bool)
     for k in range(corners):
         ours = _wedges(cloud, new, np.full(len(new), k))
-        uses = number[new[:, k]]
-        i = np.arange(len(new)).repeat(uses)
-        j = _ranges(uses) + start[new[:, k]].repeat(uses)
+        i, j = _matches(new[:, k], faces[rows, places], len(cloud.points))
         a, b = (np.stack([x[i] for x in ours], 1), np.stack([x[j] for x in theirs], 1))
         result[i[_meet(a, b) | _meet(b, a)]] = True
     return result
 
 
-def _ranges(sizes: Int[np.ndarray, " n"]) -> Int[np.ndarray, " total"]:
-    """0, 1, …, size − 1 for each size in turn."""
-    return np.arange(sizes.sum()) - (np.cumsum(sizes) - sizes).repeat(sizes)
+def _matches(
+    wanted: Int[np.ndarray, " W"], found: Int[np.ndarray, " F"], count: int
+) -> tuple[Int[np.ndarray, " P"], Int[np.ndarray, " P"]]:
+    """All (i, j) with wanted[i] = found[j], two lists of numbers below `count`."""
+    order, number = np.argsort(found, kind="stable"), np.bincount(found, minlength=count)
+    uses, start = number[wanted], np.cumsum(number) - number
+    i = np.arange(len(wanted)).repeat(uses)
+    first = start[wanted] - (np.cumsum(uses) - uses)
+    return i, order[np.arange(len(i)) + first[i]]
 
 
 def _wedges(
@@ -170,6 +160,12 @@ def closed(
     count = len(cloud.points)
     edges = edges_of(faces, count)
     known, new, done = set(edges.keys.tolist()), [faces], []
+
+    def cost(turn: Faces) -> Float[np.ndarray, " T"]:
+        radius, normal = cloud.circles(turn)
+        alignment = np.abs(inner(normal[:, None], cloud.normals[turn])).mean(1)
+        return radius / np.maximum(alignment, SLIGHT) ** 2
+
     reach = cloud.reach.copy()
     np.maximum.at(reach, faces, cloud.limits(faces)[:, None])
     for loop in boundary_loops(faces, count):
@@ -180,34 +176,11 @@ def closed(
             continue
         if max(lengths(places - place).max() for place in places) > wide:
             continue
-        ears = _clipped(cloud, loop, known)
+        ears = ears_of(loop, known, count, cost)
         if ears is not None:
             done.append(loop)
             new.append(np.array(ears))
     return np.concatenate(new) if done else faces, done
-
-
-def _clipped(cloud: Cloud, loop: list[int], known: set[int]) -> list[list[int]] | None:
-    """Triangles that close a loop, the best ear first; None if an edge would be used a third time."""
-    count, loop, ears = len(cloud.points), list(loop), []
-    own: set[int] = set()
-    while len(loop) > 3:
-        size = len(loop)
-        turn = np.array([[loop[k - 1], loop[k], loop[(k + 1) % size]] for k in range(size)])
-        radius, normal = cloud.circles(turn)
-        alignment = np.abs(inner(normal[:, None], cloud.normals[turn])).mean(1)
-        cost = radius / np.maximum(alignment, SLIGHT) ** 2
-        a, c = turn[:, 0], turn[:, 2]
-        keys = np.minimum(a, c) * count + np.maximum(a, c)
-        cost[[key in known or key in own for key in keys.tolist()]] = np.inf
-        best = int(cost.argmin())
-        if not np.isfinite(cost[best]):
-            return None
-        ears.append(turn[best].tolist())
-        own.add(int(keys[best]))
-        del loop[best]
-    known |= own
-    return [*ears, loop]
 
 
 def with_left_points(cloud: Cloud, faces: Faces) -> Faces:
@@ -217,14 +190,10 @@ def with_left_points(cloud: Cloud, faces: Faces) -> Faces:
         outside = np.ones(count, dtype=bool)
         outside[faces.ravel()] = False
         left = np.flatnonzero(outside)
-        corner = np.argsort(faces.ravel(), kind="stable")
-        number = np.bincount(faces.ravel(), minlength=count)
-        start = np.cumsum(number) - number
         near = cloud.neighbors[left, 1:NEAREST]
-        uses = number[near]
-        row = np.arange(len(left)).repeat(uses.sum(1))
-        under = corner[_ranges(uses.ravel()) + start[near].ravel().repeat(uses.ravel())] // 3
-        points, triangle = left[row], faces[under]
+        row, corner = _matches(near.ravel(), faces.ravel(), count)
+        points, under = left.repeat(near.shape[1])[row], corner // 3
+        triangle = faces[under]
         radius, normal = cloud.circles(triangle)
         corners = cloud.points[triangle] - cloud.points[points, None]
         height = np.abs(inner(corners[:, 0], normal))

@@ -2,18 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float
 
 from torchlb.geometry.complex import Faces, components, edges_of, tree_sides
 from torchlb.geometry.vectors import inner, lengths
 from torchlb.linalg.precision import TINY
-
-
-def patches(faces: Faces, count: int) -> Int[np.ndarray, " F"]:
-    """Label of the patch of each face: faces connected by edges of two faces."""
-    one, two = edges_of(faces, count).twins
-    return components(one // 3, two // 3, len(faces))
 
 
 def with_single_fans(faces: Faces, count: int) -> Faces:
@@ -27,14 +23,12 @@ def with_single_fans(faces: Faces, count: int) -> Faces:
         part = faces[around]
         one, two = edges_of(part, count).twins
         corner = part.ravel()
-        left, right = [], []
-        for turn in (1, 2):  # the corners of both faces at the same end of their edge
-            mine = one - one % 3 + (one + turn) % 3
-            near, far = (two - two % 3 + (two + other) % 3 for other in (1, 2))
-            left.append(mine)
-            right.append(np.where(corner[near] == corner[mine], near, far))
-        joined = np.concatenate(left)
-        fan = components(joined, np.concatenate(right), len(corner))
+        near, far = (two - two % 3 + (two + turn) % 3 for turn in (1, 2))
+        # the corners of both faces at the same end of their edge
+        joined = np.concatenate([one - one % 3 + (one + turn) % 3 for turn in (1, 2)])
+        near, far = np.tile(near, 2), np.tile(far, 2)
+        beside = np.where(corner[near] == corner[joined], near, far)
+        fan = components(joined, beside, len(corner))
         size = np.bincount(fan)
         closed = np.bincount(fan[joined], minlength=len(size)) == size
         point = np.zeros_like(size)
@@ -82,10 +76,11 @@ def wound_alike(
 def facing_out(
     points: Float[np.ndarray, "N 3"], faces: Faces, outward: Float[np.ndarray, "N 3"]
 ) -> Faces:
-    """Faces turned so that every patch as a whole faces the outward vectors at its corners."""
+    """Faces turned so that every patch, connected by edges, as a whole faces the outward vectors at its corners."""
     if len(faces) == 0:
         return faces
-    vectors, patch = face_vectors(points, faces), patches(faces, len(points))
+    one, two = edges_of(faces, len(points)).twins
+    patch, vectors = components(one // 3, two // 3, len(faces)), face_vectors(points, faces)
     vote = inner(outward.take(faces, 0).sum(1), vectors)
     turned = (np.bincount(patch, vote) < 0)[patch]
     return np.where(turned[:, None], faces[:, ::-1], faces)
@@ -122,3 +117,27 @@ def boundary_loops(faces: Faces, count: int) -> list[list[int]]:
                 at = int(head[half] if tail[half] == at else tail[half])
         found.append(loop)
     return found
+
+
+def ears_of(
+    loop: list[int], known: set[int], count: int, cost: Callable[[Faces], Float[np.ndarray, " T"]]
+) -> list[list[int]] | None:
+    """Triangles that close a loop, the ear of least cost first, and None if an edge would be used a third time.
+
+    `known` are the keys of the edges in use, low · count + high, to which those of the triangles are added.
+    """
+    loop, ears, own = list(loop), [], set()
+    while len(loop) > 3:
+        turn = np.stack([np.roll(loop, 1), loop, np.roll(loop, -1)], 1)
+        a, c = turn[:, 0], turn[:, 2]
+        keys = (np.minimum(a, c) * count + np.maximum(a, c)).tolist()
+        costs = cost(turn)
+        costs[[key in known or key in own for key in keys]] = np.inf
+        best = int(costs.argmin())
+        if not np.isfinite(costs[best]):
+            return None
+        ears.append(turn[best].tolist())
+        own.add(keys[best])
+        del loop[best]
+    known |= own
+    return [*ears, loop]

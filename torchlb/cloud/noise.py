@@ -11,7 +11,6 @@ from torch import Tensor
 from torchlb.fits.polynomials import monomials, num_monomials
 from torchlb.geometry.compatibility import admissible_neighbors
 from torchlb.geometry.frames import complete_frames
-from torchlb.geometry.vectors import dot
 from torchlb.linalg.precision import AT_ONCE, LOW, NEGLIGIBLE, ROUNDING
 
 SMOOTH = 4.0
@@ -89,18 +88,14 @@ def _residuals(
     degree: int,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """(radius; number of compatible neighbours; sum of squared residuals of polynomials; their offset at 0)."""
-    index, plane = candidates[centers], planes[centers]
+    index = candidates[centers]
     offset = points[index] - points[centers, None]
     good = admissible_neighbors(points, planes, index)
     good[:, 0] = True
     radius = (offset.norm(dim=-1) * good).amax(1)
-    if planes.ndim == 2:
-        coords = offset @ complete_frames(plane)
-        heights = dot(offset, plane[:, None])[..., None]
-    else:
-        coords = offset @ plane
-        heights = offset - coords @ plane.mT
-    heights = heights * good[..., None]
+    frames = complete_frames(planes[centers]) if planes.ndim == 2 else planes[centers]
+    coords = offset @ frames
+    heights = (offset - coords @ frames.mT) * good[..., None]
     scale = radius.clamp_min(torch.finfo(radius.dtype).tiny)[:, None, None]
     terms = monomials(coords / scale, degree).mT
     terms = torch.cat([torch.ones_like(terms[:, :1]), terms], 1) * good[:, None]
@@ -108,5 +103,4 @@ def _residuals(
     square += ROUNDING * good.sum(1)[:, None, None] * torch.eye(square.shape[-1]).to(square)
     coefficients = torch.linalg.solve(square, terms @ heights)
     left = heights - terms.mT @ coefficients
-    middle = coefficients[:, 0] * plane if planes.ndim == 2 else coefficients[:, 0]
-    return radius, good.sum(1), left.square().sum((1, 2)), middle
+    return radius, good.sum(1), left.square().sum((1, 2)), coefficients[:, 0]

@@ -50,17 +50,12 @@ def lone_points(
             own = far[octave == scale]
             found = KDTree(alike).query(points[own], k=RING + 1)
             distance, mates = (np.asarray(part) for part in found)
-            flat = _in_a_plane(alike[mates[:, 1:]] - points[own, None])
-            lone[own] &= ~(flat & (distance[:, -1] <= 2 * spacing[own]))
+            offset = alike[mates[:, 1:]] - points[own, None]
+            offset = np.concatenate([0 * offset[:, :1], offset], 1)
+            offset -= offset.mean(1, keepdims=True)
+            _, middle, least = np.linalg.svd(offset, compute_uv=False).T
+            lone[own] &= (least >= ROUGH * middle) | (distance[:, -1] > 2 * spacing[own])
     return lone
-
-
-def _in_a_plane(offset: Float[np.ndarray, "B K 3"]) -> Bool[np.ndarray, " B"]:
-    """Whether the points of each row of offsets, and their origin, lie near a plane."""
-    offset = np.concatenate([0 * offset[:, :1], offset], 1)
-    offset -= offset.mean(1, keepdims=True)
-    _, middle, least = np.linalg.svd(offset, compute_uv=False).T
-    return least < ROUGH * middle
 
 
 def put_beside(
@@ -71,11 +66,9 @@ def put_beside(
     tree = KDTree(points[others])
     host = np.asarray(tree.query(points[lone])[1])
     ring = np.asarray(tree.query(points[others[host]], k=min(AROUND + 1, len(others)))[1])
-    order = np.argsort(host, kind="stable")
+    order, size = np.argsort(host, kind="stable"), ring.shape[1] - 1
     turn = np.empty_like(host)  # index of a lone point among those of its host
-    first = np.searchsorted(host[order], host[order])
-    turn[order] = np.arange(len(host)) - first
-    size = ring.shape[1] - 1
+    turn[order] = np.arange(len(host)) - np.searchsorted(host[order], host[order])
     end = points[others[ring[np.arange(len(host)), 1 + turn % size]]]
     start = points[others[host]]
     share = 1 / (3.0 + turn // size)

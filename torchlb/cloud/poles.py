@@ -7,7 +7,7 @@ point, those farthest up and down the normal are its two *poles* (Amenta and Ber
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cached_property, reduce
+from functools import reduce
 from typing import Any
 
 import numpy as np
@@ -32,16 +32,9 @@ SHARP, RESIDUAL = 16.0, 0.01
 
 @dataclass(frozen=True)
 class Poles:
-    """Vertices of the Voronoi cells of all points.
+    """Rays from every point to the vertices of its Voronoi cell; beyond the convex hull these are far away.
 
-    Attributes
-    ----------
-    tetrahedra
-        Tetrahedra whose circumcentres are the vertices; beyond the convex hull, the far points of its triangles are.
-    point, ball
-        (R,), point of each ray, and number of a sphere through it: of a tetrahedron, or of a hull triangle after these.
-    ray
-        (R, 3), ℓ, from the point to the centre.
+    `ball` numbers the sphere around the end of each ray, of a tetrahedron, or of a hull triangle after these.
     """
 
     tetrahedra: Tetrahedra
@@ -73,30 +66,6 @@ class Poles:
         last = torch.full((count,), len(value) - 1)
         return last.scatter_reduce(0, self.point[rays], rays, "amin")
 
-    @cached_property
-    def _longest(self) -> tuple[Float[Tensor, "N 3"], Float[Tensor, " N"]]:
-        """Longest ray of every point, and its length."""
-        length = dot(self.ray, self.ray).sqrt()
-        first = self.farthest(length)
-        return self.ray[first], length[first]
-
-    def corrected(
-        self, normals: Float[Tensor, "N 3"], where: Bool[Tensor, " N"] | None = None
-    ) -> Float[Tensor, "N 3"]:
-        """Normals, replaced by the direction of the longest ray where the Voronoi cell is short along them.
-
-        If `where` is given, only its points are looked at.
-        """
-        seen = slice(None) if where is None else at(where, self.point).nonzero()[:, 0]
-        point = self.point[seen]
-        along = dot(self.ray[seen], at(normals, point)).abs()
-        most = along.new_full((len(normals),), torch.inf).scatter_reduce(
-            0, point, along, "amax", include_self=False
-        )
-        longest, length = self._longest
-        short = most * LONG < length
-        return torch.where(short[:, None], longest / length[:, None], normals)
-
     def sides(self, normals: Float[Tensor, "N 3"]) -> tuple[Float[np.ndarray, " S"], bool]:
         """(1 for spheres outside of the surface, −1 for those inside; whether it has two sides at all).
 
@@ -110,18 +79,21 @@ class Poles:
         opposed = -_cosine(self.ray[up], self.ray[down]).numpy()
         one, two, sure = self._touching()
         ends = torch.stack([self.ball[up], self.ball[down]]).numpy()
-        i, j = np.concatenate([one, ends[0]]), np.concatenate([two, ends[1]])
         first = len(self.tetrahedra.cells)
         outside = np.arange(first + int(self.tetrahedra.hull.sum())) >= first
-        relations = _Relations.of(
-            i, j, np.concatenate([sure, opposed]), np.arange(len(i)) >= len(one), outside
-        )
-        side, tree = relations.vote(), relations.tree()
-        wrong, by_tree = relations.contradicted(side), relations.contradicted(tree)
+        cosine = np.concatenate([sure, opposed])
+        i, j = np.concatenate([one, ends[0]]), np.concatenate([two, ends[1]])
+        order = torch.from_numpy(cosine).argsort(descending=True, stable=True).numpy()
+        order = order[i[order] != j[order]]
+        i, j, against = i[order], j[order], order >= len(one)
+        weight = np.exp(SHARP * (cosine[order] - 1))
+        side = _vote(i, j, np.where(against, -weight, weight), outside)
+        tree = np.where(tree_sides(i, j, against, len(outside)), 1.0, -1.0)
+        wrong, by_tree = (float(weight @ (against ^ (x[i] != x[j]))) for x in (side, tree))
         if FACTOR * by_tree < wrong:  # a ratio of 8 and more on open surfaces, else 1.4
             side, wrong = tree, by_tree
         # a share of 0.13 and more on one-sided bands, else 0.04
-        two_sided = wrong <= LOW * float(relations.weight[relations.against].sum())
+        two_sided = wrong <= LOW * float(weight[against].sum())
         around = side[first:].mean()
         if abs(around) < 2 * (1 - LOW) - 1:  # an open surface faces up
             upward = normals[:, -1].numpy()
@@ -147,62 +119,25 @@ class Poles:
         )
 
 
-@dataclass(frozen=True)
-class _Relations:
-    """Pairs (i, j) of spheres on the same side of a surface, or on different ones, the surest first.
-
-    Attributes
-    ----------
-    i, j, against, weight
-        (P,), the spheres, whether they are on different sides, and the weight of that.
-    outside
-        (S,), which spheres are outside if the surface is closed.
-    """
-
-    i: Int[np.ndarray, " P"]
-    j: Int[np.ndarray, " P"]
-    against: Bool[np.ndarray, " P"]
-    weight: Float[np.ndarray, " P"]
-    outside: Bool[np.ndarray, " S"]
-
-    @classmethod
-    def of(
-        cls,
-        i: Int[np.ndarray, " R"],
-        j: Int[np.ndarray, " R"],
-        cosine: Float[np.ndarray, " R"],
-        against: Bool[np.ndarray, " R"],
-        outside: Bool[np.ndarray, " S"],
-    ) -> _Relations:
-        """Sort the relations, without those of a sphere to itself."""
-        order = torch.from_numpy(cosine).argsort(descending=True, stable=True).numpy()
-        order = order[i[order] != j[order]]
-        weight = np.exp(SHARP * (cosine[order] - 1))
-        return cls(i[order], j[order], against[order], weight, outside)
-
-    def tree(self) -> Float[np.ndarray, " S"]:
-        """Sides, 1 or −1, along a spanning forest of the surest pairs."""
-        return np.where(tree_sides(self.i, self.j, self.against, len(self.outside)), 1.0, -1.0)
-
-    def vote(self) -> Float[np.ndarray, " S"]:
-        """Sides, 1 or −1: signs of the minimiser x of Σ w (x_i ∓ x_j)² over all pairs, x = 1 outside; in float32."""
-        count, free = len(self.outside), np.flatnonzero(~self.outside)
-        signed = np.where(self.against, -self.weight, self.weight).astype(np.float32)
-        ends = self.i.astype(np.int32), self.j.astype(np.int32)
-        one: Any = sparse.coo_array((signed, ends), shape=(count, count))
-        total = np.bincount(np.concatenate(ends), np.tile(self.weight, 2), count)
-        around = total.astype(np.float32)
-        rows = sparse.csr_array(one + one.T)[free]
-        matrix = sparse.csr_array(sparse.diags_array(around[free]) - rows[:, free])
-        scale = sparse.diags_array(1 / np.maximum(around[free], np.finfo(np.float32).tiny))
-        x, _ = cg(matrix, rows @ self.outside, rtol=RESIDUAL, maxiter=STEPS, M=scale)
-        side = np.ones(count)
-        side[free] = np.where(x > 0, 1.0, -1.0)
-        return side
-
-    def contradicted(self, side: Float[np.ndarray, " S"]) -> float:
-        """Weight of all pairs that contradict these sides."""
-        return float(self.weight @ (self.against ^ (side[self.i] != side[self.j])))
+def _vote(
+    i: Int[np.ndarray, " P"],
+    j: Int[np.ndarray, " P"],
+    weight: Float[np.ndarray, " P"],
+    outside: Bool[np.ndarray, " S"],
+) -> Float[np.ndarray, " S"]:
+    """Signs of the minimiser x of Σ |w| (x_i − sign(w) x_j)² over all pairs, x = 1 outside; in float32."""
+    count, free = len(outside), np.flatnonzero(~outside)
+    ends = i.astype(np.int32), j.astype(np.int32)
+    one: Any = sparse.coo_array((weight.astype(np.float32), ends), shape=(count, count))
+    total = np.bincount(np.concatenate(ends), np.tile(np.abs(weight), 2), count)
+    around = total.astype(np.float32)
+    rows = sparse.csr_array(one + one.T)[free]
+    matrix = sparse.csr_array(sparse.diags_array(around[free]) - rows[:, free])
+    scale = sparse.diags_array(1 / np.maximum(around[free], np.finfo(np.float32).tiny))
+    x, _ = cg(matrix, rows @ outside, rtol=RESIDUAL, maxiter=STEPS, M=scale)
+    side = np.ones(count)
+    side[free] = np.where(x > 0, 1.0, -1.0)
+    return side
 
 
 def _cosine(a: Float[Tensor, "B 3"], b: Float[Tensor, "B 3"]) -> Float[Tensor, " B"]:
@@ -214,16 +149,28 @@ def corrected_normals(
     normals: Float[Tensor, "N 3"],
     candidates: Int[Tensor, "N K"],
     poles: Poles,
-    rounds: int = 3,
 ) -> Float[Tensor, "N 3"]:
-    """Normals corrected by the Voronoi cells, and refined around each correction.
+    """Normals replaced by the longest ray where the Voronoi cell is short along them, and refined around that.
 
     Where points lie on rings or other curves far apart, the planes through the nearest of them are those of the curves,
     which shows neither in their extent nor in their fit.
     """
-    where = None
-    for _ in range(rounds):
-        before, normals = normals, poles.corrected(normals, where)
+    length = dot(poles.ray, poles.ray).sqrt()
+    first = poles.farthest(length)
+    longest, length = poles.ray[first] / length[first, None], length[first]
+
+    def corrected(normals: Tensor, where: Tensor) -> Tensor:
+        seen = at(where, poles.point).nonzero()[:, 0]
+        point = poles.point[seen]
+        along = dot(poles.ray[seen], at(normals, point)).abs()
+        most = torch.full_like(length, torch.inf).scatter_reduce(
+            0, point, along, "amax", include_self=False
+        )
+        return torch.where((most * LONG < length)[:, None], longest, normals)
+
+    where = torch.ones(len(points), dtype=torch.bool)
+    for _ in range(3):
+        before, normals = normals, corrected(normals, where)
         where = (normals != before).any(1)[candidates].any(1)
         normals = refined_normals(points, normals, candidates, where.nonzero()[:, 0])
-    return poles.corrected(normals, where)
+    return corrected(normals, where)

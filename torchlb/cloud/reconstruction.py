@@ -11,7 +11,7 @@ from torch.nn.functional import pad
 from torchlb.cloud.complexes import Complex
 from torchlb.cloud.curve import cloud_curve
 from torchlb.cloud.solid import cloud_solid
-from torchlb.cloud.surface import check_spread, cloud_surface
+from torchlb.cloud.surface import cloud_surface
 from torchlb.cloud.tangential import cloud_stars
 from torchlb.errors import InputError, first_few
 
@@ -72,5 +72,4 @@ def reconstruct(
         return cloud_solid(space)
     if dim == 3 or ambient > 3:
         return cloud_stars(space, dim)
-    check_spread(space)
     return cloud_surface(pad(space, (0, 3 - ambient)), normals=given, boundary=mask)

@@ -11,7 +11,7 @@ from itertools import combinations
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float
 from torch import Tensor
 
 from torchlb.cloud.complexes import Complex
@@ -31,13 +31,7 @@ SHEAR = np.eye(3) + 1e-3 * np.array([[0, 0.9, 0.7], [0, 0, 0.8], [0, 0, 0]])
 
 
 def cloud_solid(points: Float[Tensor, "N 3"]) -> Complex:
-    """The solid filled by the points.
-
-    Raises
-    ------
-    InputError
-        If the points lie in a plane, or some are far from all others.
-    """
+    """The solid filled by the points; they must not lie in a plane, nor some of them far from all others."""
     places = points.numpy()
     spread = np.linalg.svd(places - places.mean(0), compute_uv=False)
     if spread[2] <= NEGLIGIBLE * spread[0]:
@@ -48,12 +42,20 @@ def cloud_solid(points: Float[Tensor, "N 3"]) -> Complex:
     reach = lengths(places[near[:, -1]] - places)
     found = delaunay(places @ SHEAR)
     cells, beside = (x.astype(np.int64) for x in (found.simplices, found.neighbors))
-    radius, flat = _spheres(places, cells)
+    center, six = circumcenters(places, cells)
+    radius = lengths(center) / np.maximum(np.abs(six), TINY)
+    ends = [places[cells[:, k]] for k in range(4)]
+    longest = np.max([lengths(a - b) for a, b in combinations(ends, 2)], axis=0)
+    flat = np.abs(six) / 6 <= NEGLIGIBLE * longest**3
     count = near.shape[1] - 1
     even = count * np.mean((lengths(places[near[:, 1]] - places) / reach) ** 3)
     # random points have 24π²/35 Delaunay tetrahedra each (Meijering 1953)
     chance = (np.log(24 / 35 * np.pi**2 * len(points)) + SURE) / count / max(1.0, even / WIDER)
-    kept = ~_outside(flat | (radius <= chance ** (1 / 3) * np.sort(reach[cells], 1)[:, 2]), beside)
+    kept = flat | (radius <= chance ** (1 / 3) * np.sort(reach[cells], 1)[:, 2])
+    i, j = np.arange(len(kept)).repeat(4), beside.ravel()
+    both = (j >= 0) & ~kept[i] & ~kept[j]
+    piece = components(i[both], j[both], len(kept))
+    kept |= np.bincount(piece)[piece] < RING  # a dent of few cells is none
     beyond = np.append(kept, False)  # index −1 is beyond the hull, where nothing is kept
     while (peeled := kept & flat & ~beyond[beside].all(1)).any():
         kept &= ~peeled
@@ -65,25 +67,3 @@ def cloud_solid(points: Float[Tensor, "N 3"]) -> Complex:
             "a solid are apart, and no tetrahedron reaches them; leave them out, or add points between"
         )
     return Complex(points=points, cells=torch.from_numpy(cells[kept]))
-
-
-def _spheres(
-    points: Float[np.ndarray, "N 3"], cells: Int[np.ndarray, "T 4"]
-) -> tuple[Float[np.ndarray, " T"], Bool[np.ndarray, " T"]]:
-    """Circumradii, ℓ, and which tetrahedra have no volume."""
-    center, six = circumcenters(points, cells)
-    radius = lengths(center) / np.maximum(np.abs(six), TINY)
-    edges = [
-        lengths(points[cells[:, i]] - points[cells[:, j]]) for i, j in combinations(range(4), 2)
-    ]
-    return radius, np.abs(six) / 6 <= NEGLIGIBLE * np.max(edges, axis=0) ** 3
-
-
-def _outside(
-    kept: Bool[np.ndarray, " T"], beside: Int[np.ndarray, "T 4"]
-) -> Bool[np.ndarray, " T"]:
-    """Rejected tetrahedra in components too large for a dent."""
-    i, j = np.arange(len(kept)).repeat(4), beside.ravel()
-    both = (j >= 0) & ~kept[i] & ~kept[j]
-    piece = components(i[both], j[both], len(kept))
-    return ~kept & (np.bincount(piece)[piece] >= RING)

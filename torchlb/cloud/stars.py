@@ -7,13 +7,16 @@ from __future__ import annotations
 
 import numpy as np
 import torch
-from jaxtyping import Int
+from jaxtyping import Bool, Int
 
 from torchlb.cloud.cocone import Cloud
 from torchlb.cloud.gaps import overlapping
-from torchlb.cloud.voronoi import natural_neighbors, star_of, unrolled
+from torchlb.cloud.voronoi import natural_neighbors, unrolled
 from torchlb.geometry.complex import Faces, edges_of, pieces_of, spanning_pairs
 from torchlb.geometry.thresholds import ROUGH
+
+Pairs = tuple[Int[np.ndarray, " P"], Int[np.ndarray, " P"]]
+"""Edges of the neighbour graph."""
 
 
 def local_stars(cloud: Cloud, centers: Int[np.ndarray, " B"]) -> Faces:
@@ -27,44 +30,41 @@ def local_stars(cloud: Cloud, centers: Int[np.ndarray, " B"]) -> Faces:
     valid = (normals[near[:, 1:]] * normal).sum(-1).abs() > ROUGH
     frame = torch.linalg.qr(normal.mT, mode="complete")[0][..., 1:]
     coords = unrolled(offset, frame)
-    angle, order, following, real = star_of(coords, natural_neighbors(coords, valid))
+    natural = natural_neighbors(coords, valid)
+    angle = torch.atan2(coords[..., 1], coords[..., 0]).masked_fill(~natural, torch.inf)
+    angle, order = angle.sort(dim=1)
+    place, number = torch.arange(angle.shape[1]), natural.sum(1, keepdim=True)
+    following = torch.where(place + 1 < number, place + 1, 0)
     turn = (angle.take_along_dim(following, 1) - angle) % (2 * torch.pi)
-    use = real & (turn > 0) & (turn < torch.pi)
+    use = (place < number) & (turn > 0) & (turn < torch.pi)
     ends = near[:, 1:].take_along_dim(order, 1)
     after = ends.take_along_dim(following, 1)
     found = torch.stack([near[:, :1].expand_as(ends)[use], ends[use], after[use]], 1)
     return cloud.small(found.numpy())
 
 
-def gaps_between(
-    faces: Faces, pairs: tuple[np.ndarray, np.ndarray], count: int
-) -> tuple[Int[np.ndarray, " P"], Int[np.ndarray, " P"]]:
-    """Pairs of points in different components, one without a closed fan of faces: sheets do not grow together."""
+def at_gaps(faces: Faces, pairs: Pairs, count: int) -> Bool[np.ndarray, " N"]:
+    """Points of pairs in different components, one without a closed fan of faces: sheets do not grow together."""
     i, j = pairs
-    piece = pieces_of(faces, count)
-    outer = edges_of(faces, count).outer
+    piece, outer = pieces_of(faces, count), edges_of(faces, count).outer
     across = (piece[i] != piece[j]) & (outer[i] | outer[j])
-    return i[across], j[across]
+    result = np.zeros(count, dtype=bool)
+    result[i[across]] = result[j[across]] = True
+    return result
 
 
-def stars_in_gaps(cloud: Cloud, faces: Faces, pairs: tuple[np.ndarray, np.ndarray]) -> Faces:
-    """Stars of points in no face or at a gap between components, unless they overlap faces; then bridges.
-
-    `pairs` are edges of the neighbour graph; components still apart are joined along the shortest of them.
-    """
+def stars_in_gaps(cloud: Cloud, faces: Faces, pairs: Pairs) -> Faces:
+    """Stars of points in no face or at a gap between components, unless they overlap faces; then bridges."""
     count = len(cloud.points)
-    at_gap = np.zeros(count, dtype=bool)
-    for end in gaps_between(faces, pairs, count):
-        at_gap[end] = True
-    at_gap &= edges_of(faces, count).outer
-    at_gap |= np.bincount(faces.ravel(), minlength=count) == 0
-    stars = local_stars(cloud, np.flatnonzero(at_gap))
+    centers = at_gaps(faces, pairs, count) & edges_of(faces, count).outer
+    centers |= np.bincount(faces.ravel(), minlength=count) == 0
+    stars = local_stars(cloud, np.flatnonzero(centers))
     around = faces[np.isin(faces, stars[:, 0]).any(1)]
     stars = stars[~overlapping(cloud, stars, around, corners=1)]
     return np.concatenate([stars, bridges(cloud, np.concatenate([faces, stars]), pairs)])
 
 
-def bridges(cloud: Cloud, faces: Faces, pairs: tuple[np.ndarray, np.ndarray]) -> Faces:
+def bridges(cloud: Cloud, faces: Faces, pairs: Pairs) -> Faces:
     """Two triangles, one from either side, at the shortest pairs that connect the components still apart."""
     count = len(cloud.points)
     piece = pieces_of(faces, count)

@@ -12,22 +12,17 @@ from scipy import sparse
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from torchlb.cloud.cocone import REACH, Candidates, Cloud, Tetrahedra
+from torchlb.cloud.cocone import REACH, Candidates, Cloud, Tetrahedra, best_manifold
 from torchlb.cloud.complexes import Complex
 from torchlb.cloud.frames import cloud_frames, refined_normals
 from torchlb.cloud.gaps import closed, filled, with_left_points
-from torchlb.cloud.manifold import (
-    boundary_loops,
-    facing_out,
-    with_single_fans,
-    wound_alike,
-)
+from torchlb.cloud.manifold import boundary_loops, facing_out, with_single_fans, wound_alike
 from torchlb.cloud.noise import denoised
 from torchlb.cloud.orientation import settled_normals
 from torchlb.cloud.outliers import lone_points, put_beside
 from torchlb.cloud.places import Places, in_words, places_of
 from torchlb.cloud.poles import Poles, corrected_normals
-from torchlb.cloud.stars import gaps_between, stars_in_gaps
+from torchlb.cloud.stars import Pairs, at_gaps, stars_in_gaps
 from torchlb.errors import InputError
 from torchlb.geometry.compatibility import mutually_admissible
 from torchlb.geometry.complex import Faces, components, delaunay, pieces_of
@@ -131,21 +126,25 @@ def cloud_surface(
 
     `normals` tell the outward side where most of them agree; `boundary` marks points of a true boundary.
     """
+    spread = torch.linalg.svdvals(points - points.mean(0))
+    if spread[1] <= ROOT_EPS * spread[0]:
+        raise InputError(
+            f"points: all {len(points)} lie on a line, and no surface goes through them; a curve has dim=1"
+        )
     candidates, oriented = nearest_neighbors(points, min(NEAREST, len(points))), False
     if normals is not None:
         normals, oriented = settled_normals(points, normals, candidates)
     start = _start(points, candidates, normals, boundary)
     cloud, found, given, count = start.cloud, start.found, normals, len(points)
-    places = cloud.points
+    places, pairs = cloud.points, _kin(cloud)
     outward = given.numpy() if given is not None and oriented else found.outward
-    pairs = _kin(cloud)
     every, seam = wound_alike(places, _chosen(cloud, found, start.two_sided, pairs))
     faces = with_single_fans(every[~seam], count) if seam.any() else every
     faces, done = _completed(cloud, faces, found.small, pairs, outward)
     if _single_seams(every, seam, count) and wound_alike(places, faces)[1].any():
         faces, done = _completed(cloud, every, found.small, pairs, outward)
     # not by the faces, which may lead into a mouth from outside
-    cloud = _along(_oriented(cloud, faces), outward)
+    cloud = _along(_along(cloud, _of_faces(cloud, faces)), outward)
     if given is None:
         cloud = _righted(cloud, faces)
     stars = stars_in_gaps(cloud, faces, pairs)
@@ -153,14 +152,13 @@ def cloud_surface(
     pieces = pieces_of(np.concatenate([faces, stars]), count)
     figures = len(np.unique(faces)), len(stars), len(done), len(loops), int(pieces.max()) + 1
     touched = _contacts(cloud, faces)
-    where = places_of(places, cloud.neighbors, touched)
-    found_of_it = *figures, start.noise, int(touched.sum()), where, int(start.lone.sum())
-    summary = SurfaceSummary(count, *found_of_it)
-    parts = (places, faces, stars, cloud.normals, cloud.neighbors, start.lone)
-    names = "points", "cells", "stars", "normals", "neighbors", "lone"
-    found: Any = {name: torch.from_numpy(part) for name, part in zip(names, parts, strict=True)}
-    frames = _upright(start.frames, found["normals"])
-    return CloudSurface(**found, frames=frames, summary=summary)
+    contacts = int(touched.sum()), places_of(places, cloud.neighbors, touched)
+    summary = SurfaceSummary(count, *figures, start.noise, *contacts, int(start.lone.sum()))
+    parts = {"points": places, "cells": faces, "stars": stars, "normals": cloud.normals}
+    parts |= {"neighbors": cloud.neighbors, "lone": start.lone}
+    tensors: Any = {name: torch.from_numpy(part) for name, part in parts.items()}
+    frames = _upright(start.frames, tensors["normals"])
+    return CloudSurface(**tensors, frames=frames, summary=summary)
 
 
 class _Start(NamedTuple):
@@ -187,18 +185,20 @@ def _start(
         candidates = nearest_neighbors(points, candidates.shape[1])
     frames, near = cloud_frames(points, candidates, 2, rounds=1), candidates.numpy()
     on_boundary = np.zeros(len(points), dtype=bool) if boundary is None else boundary.numpy()
-    planar = _planar_triangles(points.numpy())
+
+    def cloud_of(points: Tensor, normals: Tensor) -> Cloud:
+        places = points.numpy()
+        return Cloud(places, normals.numpy(), near, _reaches(places, near), on_boundary)
+
+    planar, normals = _planar_triangles(points.numpy()), given
     if planar is not None:
         faces, normal = planar
         up = torch.from_numpy(normal if normal[2] >= 0 else -normal).expand_as(points)
-        normals, places = up if given is None else given, points.numpy()
-        cloud = Cloud(places, normals.numpy(), near, _reaches(places, near), on_boundary)
+        cloud = cloud_of(points, up if given is None else given)
         small = cloud.small(faces)
         every = np.ones(len(small), dtype=bool)
-        return _Start(
-            cloud, Candidates(small, small, every, every, up.numpy()), True, frames, 0.0, lone
-        )
-    normals = given
+        found = Candidates(small, small, every, every, up.numpy())
+        return _Start(cloud, found, True, frames, 0.0, lone)
     if normals is None:
         first = torch.linalg.cross(*frames.unbind(-1))
         normals = refined_normals(points, first, candidates, rounds=2)
@@ -212,7 +212,7 @@ def _start(
     if given is None:
         normals = corrected_normals(points, normals, candidates, poles)
     side, two_sided = poles.sides(normals)
-    cloud = Cloud(places, normals.numpy(), near, _reaches(places, near), on_boundary)
+    cloud = cloud_of(points, normals)
     return _Start(cloud, tetrahedra.candidates(cloud, side), two_sided, frames, noise, lone)
 
 
@@ -240,16 +240,18 @@ def _upright(
     return torch.stack([first, torch.linalg.cross(normals, first)], -1)
 
 
-def _chosen(
-    cloud: Cloud, found: Candidates, two_sided: bool, pairs: tuple[np.ndarray, np.ndarray]
-) -> Faces:
+def _chosen(cloud: Cloud, found: Candidates, two_sided: bool, pairs: Pairs) -> Faces:
     """Choose faces with single fans, first those that part the outside from the inside if there are two sides.
 
     Tangent faces come first where a cavity would be cut off from points that belong to it, as where lips touch.
     """
     points, (i, j) = cloud.points, pairs
+
+    def best_of(first: Bool[np.ndarray, " F"]) -> Faces:
+        return best_manifold(points, found.triangles[np.argsort(~first, kind="stable")])
+
     first = found.parting if two_sided else found.tangent
-    faces = with_single_fans(found.best(points, first), len(points))
+    faces = with_single_fans(best_of(first), len(points))
     piece = pieces_of(faces, len(points))
     across = piece[i] != piece[j]
     if not across.any():
@@ -261,22 +263,25 @@ def _chosen(
     torn = np.zeros(len(points), dtype=bool)
     torn[i[across]] = torn[j[across]] = True
     first = np.where(torn[found.triangles].any(1), found.tangent, first)
-    return with_single_fans(found.best(points, first), len(points)) if torn.any() else faces
+    return with_single_fans(best_of(first), len(points)) if torn.any() else faces
 
 
 def _completed(
     cloud: Cloud,
     bare: Faces,
     pool: Faces,
-    pairs: tuple[np.ndarray, np.ndarray],
+    pairs: Pairs,
     outward: Float[np.ndarray, "N 3"],
 ) -> tuple[Faces, list[list[int]]]:
     """(faces turned outward, with gaps filled from the pool or closed, and all points; the loops closed)."""
     places, count = cloud.points, len(cloud.points)
     bare = facing_out(places, bare, outward)
-    cloud = _oriented(cloud, bare)
+    cloud = _along(cloud, _of_faces(cloud, bare))
     faces = _without_gaps(cloud, bare, pool)
-    faces, done = closed(cloud, faces, _at_gaps(faces, pairs, count))
+    # the loop of a point with a neighbour in another component is no hole
+    within = np.isin(pairs, faces).all(0)
+    kept = at_gaps(faces, (pairs[0][within], pairs[1][within]), count)
+    faces, done = closed(cloud, faces, kept)
     faces = with_left_points(cloud, faces)
     if faces is not bare:
         faces = facing_out(places, wound_alike(places, faces)[0], outward)
@@ -300,22 +305,9 @@ def _without_gaps(cloud: Cloud, faces: Faces, pool: Faces) -> Faces:
     return faces if more is faces else with_single_fans(more, count)
 
 
-def _at_gaps(
-    faces: Faces, pairs: tuple[np.ndarray, np.ndarray], count: int
-) -> Bool[np.ndarray, " N"]:
-    """Points with a neighbour in another component of the faces, so that the loop they are on is no hole."""
-    used, result = np.zeros(count, dtype=bool), np.zeros(count, dtype=bool)
-    used[faces.ravel()] = True
-    both = used[pairs[0]] & used[pairs[1]]
-    for end in gaps_between(faces, (pairs[0][both], pairs[1][both]), count):
-        result[end] = True
-    return result
-
-
-def _oriented(cloud: Cloud, faces: Faces) -> Cloud:
-    """Cloud with its normals on the side of the faces, where there are any."""
-    points, triangles = torch.from_numpy(cloud.points), torch.from_numpy(faces)
-    return _along(cloud, vertex_normals(points, triangles).numpy())
+def _of_faces(cloud: Cloud, faces: Faces) -> Float[np.ndarray, "N 3"]:
+    """Unit normals of the faces at every point, zero where there are none."""
+    return vertex_normals(torch.from_numpy(cloud.points), torch.from_numpy(faces)).numpy()
 
 
 def _along(cloud: Cloud, vectors: Float[np.ndarray, "N 3"]) -> Cloud:
@@ -326,8 +318,7 @@ def _along(cloud: Cloud, vectors: Float[np.ndarray, "N 3"]) -> Cloud:
 
 def _righted(cloud: Cloud, faces: Faces) -> Cloud:
     """Cloud with normals realigned to those of its faces where they are misaligned, on their previous side."""
-    points, triangles = torch.from_numpy(cloud.points), torch.from_numpy(faces)
-    of_faces = vertex_normals(points, triangles).numpy()
+    of_faces = _of_faces(cloud, faces)
     cosine = (cloud.normals * of_faces).sum(1)
     misaligned = (np.abs(cosine) < LEVEL) & of_faces.any(1)
     realigned = of_faces * np.where(cosine < 0, -1.0, 1.0)[:, None]
@@ -359,7 +350,7 @@ def _contacts(cloud: Cloud, faces: Faces) -> Bool[np.ndarray, " N"]:
     return touched
 
 
-def _kin(cloud: Cloud) -> tuple[np.ndarray, np.ndarray]:
+def _kin(cloud: Cloud) -> Pairs:
     """Edges of the graph of the `RING` nearest compatible neighbours, or of all nearest ones in small components."""
     points, normals = torch.from_numpy(cloud.points), torch.from_numpy(cloud.normals)
     i, j, good = mutually_admissible(points, normals, torch.from_numpy(cloud.neighbors))
@@ -369,12 +360,3 @@ def _kin(cloud: Cloud) -> tuple[np.ndarray, np.ndarray]:
     lone = (np.bincount(piece) < NEAREST)[piece]
     near |= (lone[:, None] & (np.arange(good.shape[1]) < RING)).ravel()
     return i[near], j[near]
-
-
-def check_spread(points: Float[Tensor, "N n"]) -> None:
-    """Raise InputError if the points of a surface lie on a line."""
-    spread = torch.linalg.svdvals(points - points.mean(0))
-    if spread[1] <= ROOT_EPS * spread[0]:
-        raise InputError(
-            f"points: all {len(points)} lie on a line, and no surface goes through them; a curve has dim=1"
-        )

@@ -10,7 +10,7 @@ a star has.
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from functools import partial
 from itertools import permutations
 
 import numpy as np
@@ -21,7 +21,7 @@ from torch import Tensor
 
 from torchlb.cloud.complexes import Complex
 from torchlb.cloud.frames import cloud_frames
-from torchlb.cloud.manifold import boundary_loops
+from torchlb.cloud.manifold import boundary_loops, ears_of
 from torchlb.errors import InputError, first_few
 from torchlb.geometry.compatibility import mutually_admissible, planes_of
 from torchlb.geometry.complex import Faces, delaunay, edges_of
@@ -37,13 +37,7 @@ LOOP = 12
 
 
 def cloud_stars(points: Float[Tensor, "N n"], dim: int) -> Complex:
-    """Complex of dimension d ≥ 2 through a cloud in Rⁿ, n > d: a surface of triangles, or all simplices of the stars.
-
-    Raises
-    ------
-    InputError
-        If points are in no cell.
-    """
+    """Complex of dimension d ≥ 2 through a cloud in Rⁿ, n > d: a surface of triangles, or all simplices of stars."""
     near = nearest_neighbors(points, min(CANDIDATES[dim], len(points)))
     frames = cloud_frames(points, near, dim)
     stars, places, shares = delaunay_stars(points, frames, near), points.numpy(), None
@@ -124,12 +118,10 @@ def voronoi_shares(corners: Float[np.ndarray, "S corners n"]) -> Float[np.ndarra
         chain = places[:, list(order)]
         square = (chain**2).sum(2)[..., None] / 2
         gram = chain @ chain.transpose(0, 2, 1)
-        centers = [
-            (np.linalg.solve(gram[:, :k, :k], square[:, :k]).transpose(0, 2, 1) @ chain[:, :k])[
-                :, 0
-            ]
-            for k in range(1, dim + 1)
-        ]
+        centers = []
+        for k in range(1, dim + 1):
+            shares = np.linalg.solve(gram[:, :k, :k], square[:, :k])
+            centers.append((shares.transpose(0, 2, 1) @ chain[:, :k])[:, 0])
         side = np.sign(np.linalg.det(chain))
         total[sound] += side * np.linalg.det(np.stack(centers, 1)) / np.abs(whole)
     return total
@@ -138,65 +130,61 @@ def voronoi_shares(corners: Float[np.ndarray, "S corners n"]) -> Float[np.ndarra
 def glued(
     points: Float[np.ndarray, "N n"], frames: Float[np.ndarray, "N n 2"], stars: Faces
 ) -> Faces:
-    """Triangles of the stars that form a surface: at most two at an edge, none that overlap around a point."""
+    """Triangles of the stars that form a surface: at most two at an edge, none that overlap around a point.
+
+    Those of three stars come first; short boundary loops are closed, the smallest circumradius first.
+    """
     triangles, votes = np.unique(np.sort(stars, 1), axis=0, return_counts=True)
     order = np.lexsort((circumradii(points, triangles), -votes))
-    triangles, votes = triangles[order], votes[order]
-    edges = edges_of(triangles[votes == 3], len(points))
-    crowded = (edges.uses[edges.of] > 2).reshape(-1, 3).any(1)
-    sure = np.flatnonzero(votes == 3)[~crowded]
-    fans = _Fans(points, frames, triangles[sure])
-    rest = np.delete(triangles, sure, 0)
-    added = [face for face in rest.tolist() if fans.take(face)]
-    faces = np.concatenate([triangles[sure], np.array(added, dtype=np.int64).reshape(-1, 3)])
-    return _closed(points, faces)
+    triangles, agreed = triangles[order], votes[order] == 3
+    every = edges_of(triangles, len(points))
+    sides = every.of.reshape(-1, 3)
+    crowded = np.bincount(sides[agreed].ravel(), minlength=len(every.keys)) > 2
+    sure = agreed & ~crowded[sides].any(1)
+    uses = np.bincount(sides[sure].ravel(), minlength=len(every.keys)).tolist()
+    free = edges_of(triangles[sure], len(points)).outer
+    wedges: list[list[tuple[float, float]]] = [[] for _ in points]
+    chosen = []
+    arrays = (triangles, sides, *_wedges(points, frames, triangles))
+    corners, edges, starts, widths = (x.tolist() for x in arrays)
+    for k in np.argsort(~sure, kind="stable").tolist():
+        own = list(zip(corners[k], starts[k], widths[k], strict=True))
+        if not sure[k]:
+            if not free[triangles[k]].all() or any(uses[edge] >= 2 for edge in edges[k]):
+                continue
+            if any(_overlaps(start, width, wedges[point]) for point, start, width in own):
+                continue
+            for edge in edges[k]:
+                uses[edge] += 1
+        chosen.append(k)
+        for point, start, width in own:
+            wedges[point].append((start, width))
+    faces, count = triangles[chosen], len(points)
+    known = set(edges_of(faces, count).keys.tolist())
+    loops = [loop for loop in boundary_loops(faces, count) if len(loop) <= LOOP]
+    found = [ears_of(loop, known, count, partial(circumradii, points)) for loop in loops]
+    return np.concatenate([faces, *(np.array(ears) for ears in found if ears)])
 
 
-class _Fans:
-    """Triangles around every point, as wedges in its tangent plane."""
-
-    def __init__(
-        self, points: Float[np.ndarray, "N n"], frames: Float[np.ndarray, "N n 2"], faces: Faces
-    ) -> None:
-        self.points, self.frames = points, frames
-        edges = edges_of(faces, len(points))
-        self.uses = dict(zip(edges.keys.tolist(), edges.uses.tolist(), strict=True))
-        self.open = edges.outer
-        self.wedges: dict[int, list[tuple[float, float]]] = {}
-        for face in faces[self.open[faces].any(1)].tolist():
-            self._put(face)
-
-    def take(self, face: list[int]) -> bool:
-        """Add a triangle if it fits; return whether it does."""
-        keys = [min(a, b) * len(self.points) + max(a, b) for a, b in _sides(face)]
-        if not self.open[face].all() or any(self.uses.get(key, 0) >= 2 for key in keys):
-            return False
-        for point, start, width in self._wedges_of(face):
-            for other, theirs in self.wedges.get(point, ()):
-                ahead, behind = (start - other) % (2 * np.pi), (other - start) % (2 * np.pi)
-                if ahead < theirs - SLIGHT or behind < width - SLIGHT:
-                    return False
-        for key in keys:
-            self.uses[key] = self.uses.get(key, 0) + 1
-        self._put(face)
-        return True
-
-    def _put(self, face: list[int]) -> None:
-        for point, start, width in self._wedges_of(face):
-            self.wedges.setdefault(point, []).append((start, width))
-
-    def _wedges_of(self, face: list[int]) -> Iterable[tuple[int, float, float]]:
-        """(point, first angle, width) at each corner."""
-        for k, point in enumerate(face):
-            ends = [face[k - 1], face[k - 2]]
-            x, y = ((self.points[ends] - self.points[point]) @ self.frames[point]).T
-            one, two = np.arctan2(y, x).tolist()
-            width = (two - one) % (2 * np.pi)
-            yield (point, one, width) if width <= np.pi else (point, two, 2 * np.pi - width)
+def _wedges(
+    points: Float[np.ndarray, "N n"], frames: Float[np.ndarray, "N n 2"], faces: Faces
+) -> tuple[Float[np.ndarray, "F 3"], Float[np.ndarray, "F 3"]]:
+    """First angle and width of every triangle at its corners, in the tangent planes there."""
+    ends = faces[:, [[2, 1], [0, 2], [1, 0]]]
+    x, y = np.moveaxis((points[ends] - points[faces][:, :, None]) @ frames[faces], -1, 0)
+    one, two = np.moveaxis(np.arctan2(y, x), -1, 0)
+    width = (two - one) % (2 * np.pi)
+    turned = width > np.pi
+    return np.where(turned, two, one), np.where(turned, 2 * np.pi - width, width)
 
 
-def _sides(face: list[int]) -> list[tuple[int, int]]:
-    return [(face[k - 1], face[k]) for k in range(len(face))]
+def _overlaps(start: float, width: float, others: list[tuple[float, float]]) -> bool:
+    """Whether a wedge, by its first angle and width, overlaps one of the others."""
+    for other, theirs in others:
+        ahead, behind = (start - other) % (2 * np.pi), (other - start) % (2 * np.pi)
+        if ahead < theirs - SLIGHT or behind < width - SLIGHT:
+            return True
+    return False
 
 
 def circumradii(points: Float[np.ndarray, "N n"], faces: Faces) -> Float[np.ndarray, " F"]:
@@ -207,29 +195,3 @@ def circumradii(points: Float[np.ndarray, "N n"], faces: Faces) -> Float[np.ndar
     square = np.maximum((a + b + c) * (b + c - a) * (c + a - b) * (a + b - c), 0.0)
     with np.errstate(divide="ignore"):
         return a * b * c / np.sqrt(square)
-
-
-def _closed(points: Float[np.ndarray, "N n"], faces: Faces) -> Faces:
-    """Faces with short boundary loops closed by ear clipping, the smallest circumradius first."""
-    count, new = len(points), [faces]
-    known = set(edges_of(faces, count).keys.tolist())
-    for loop in boundary_loops(faces, count):
-        if len(loop) > LOOP:
-            continue
-        ears, own = [], set()
-        while len(loop) > 3:
-            turn = np.stack([np.roll(loop, 1), loop, np.roll(loop, -1)], 1)
-            a, c = turn[:, 0], turn[:, 2]
-            keys = (np.minimum(a, c) * count + np.maximum(a, c)).tolist()
-            cost = circumradii(points, turn)
-            cost[[key in known or key in own for key in keys]] = np.inf
-            best = int(cost.argmin())
-            if not np.isfinite(cost[best]):
-                break
-            ears.append(turn[best])
-            own.add(keys[best])
-            loop = [*loop[:best], *loop[best + 1 :]]
-        if len(loop) == 3:
-            known |= own
-            new.append(np.array([*ears, loop]))
-    return np.concatenate(new)

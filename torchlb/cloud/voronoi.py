@@ -76,10 +76,7 @@ def natural_neighbors(
     return natural & valid
 
 
-def cell_volume(
-    coords: Float[Tensor, "B K d"],
-    valid: Bool[Tensor, "B K"],
-) -> Float[Tensor, " B"]:
+def cell_volume(coords: Float[Tensor, "B K d"], valid: Bool[Tensor, "B K"]) -> Float[Tensor, " B"]:
     """Volume of the cell, ℓ^d: that of the unit ball times the mean of r^d.
 
     An open cell ends half-way to the farthest valid neighbour; in directions without one within 60° it ends at the
@@ -101,27 +98,6 @@ def cell_volume(
     volume = inverse.amax(1).maximum(2 / farthest).pow(-dim) * ahead
     unit_ball = pi ** (dim / 2) / gamma(dim / 2 + 1)
     return unit_ball * volume.mean(1)
-
-
-def star_of(
-    coords: Float[Tensor, "B K 2"], natural: Bool[Tensor, "B K"]
-) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Natural neighbours in angular order around the point.
-
-    Returns
-    -------
-    angle, order
-        (B, K), ascending angles, infinite after the last, and the numbers of the neighbours.
-    following
-        (B, K), position of the next one in this order.
-    real
-        (B, K), which positions are taken.
-    """
-    angle = torch.atan2(coords[..., 1], coords[..., 0]).masked_fill(~natural, torch.inf)
-    angle, order = angle.sort(dim=1)
-    count = natural.sum(1, keepdim=True)
-    place = torch.arange(coords.shape[1]).expand_as(order)
-    return angle, order, torch.where(place + 1 < count, place + 1, 0), place < count
 
 
 def unrolled(

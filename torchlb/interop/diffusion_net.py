@@ -140,12 +140,11 @@ def get_all_operators(
     if len(verts_list) != len(faces_list):
         raise InputError(f"{len(verts_list)} verts, but {len(faces_list)} faces")
     given = [None] * len(verts_list) if normals is None else normals
-    columns: tuple[list[Tensor], ...] = tuple([] for _ in range(7))
-    for verts, faces, direction in zip(verts_list, faces_list, given, strict=True):
-        found = get_operators(verts, faces, k_eig, op_cache_dir, direction, **options)
-        for column, value in zip(columns, found, strict=True):
-            column.append(value)
-    return columns
+    found = [
+        get_operators(verts, faces, k_eig, op_cache_dir, direction, **options)
+        for verts, faces, direction in zip(verts_list, faces_list, given, strict=True)
+    ]
+    return tuple([operators[i] for operators in found] for i in range(7))
 
 
 def _tuple(

@@ -247,9 +247,8 @@ def _parts(data: Any, sizes: Int[Tensor, " S"]) -> dict[str, Any]:
 def _check_unchanged(data: Any, sizes: Int[Tensor, " S"]) -> None:
     """Raise ValueError unless `pos` is that of the operator, in its order, up to a translation of each shape."""
     built, pos = data.lb_pos, data.pos.detach()
-    count = max(
-        len(built), int(data.lb_stencil_index.max()) + 1
-    )  # some transforms sample every key
+    # some transforms sample every key
+    count = max(len(built), int(data.lb_stencil_index.max()) + 1)
     if not len(pos) == int(sizes.sum()) == count:
         raise InputError(
             f"{len(pos)} points, but an operator of {count}: nodes were added or taken away after "
@@ -276,13 +275,12 @@ def _check_unchanged(data: Any, sizes: Int[Tensor, " S"]) -> None:
 
 def _bases(data: Any, sizes: list[int]) -> list[Eigenbasis]:
     """The eigenbasis of each shape, from the concatenated vector."""
-    shapes = []
-    for n, k in zip(sizes, data.lb_basis_size.tolist(), strict=True):
-        parts = [(k,), (n, k), (n, k), (k,)]
-        shapes.append([torch.Size(part) for part in parts])
-    pieces = iter(data.lb_basis.split([part.numel() for parts in shapes for part in parts]))
-    bases = []
-    for parts, mass in zip(shapes, data.lb_mass.split(sizes), strict=True):
-        values, vectors, left, errors = (next(pieces).view(part) for part in parts)
+    numbers, bases = data.lb_basis_size.tolist(), []
+    pieces = data.lb_basis.split([2 * k * (1 + n) for n, k in zip(sizes, numbers, strict=True)])
+    masses = data.lb_mass.split(sizes)
+    for piece, mass, k in zip(pieces, masses, numbers, strict=True):
+        size = k * len(mass)
+        values, vectors, left, errors = piece.split([k, size, size, k])
+        vectors, left = vectors.view(-1, k), left.view(-1, k)
         bases.append(Eigenbasis(values, vectors, mass, left, relative_errors=errors))
     return bases

@@ -141,7 +141,7 @@ def _key(operator: str, points: Tensor, faces: Tensor | None, options: dict[str,
 def _cached(path: Path, key: str) -> LaplaceBeltrami | None:
     """The operator in a file; None without a file, or with a warning for a damaged one."""
     try:
-        lb, header = _read(path)
+        lb, header = load_with_header(path)
         if header["key"] != key:
             raise OperatorFileError(f"{path}: holds another operator than its name says")
         return lb
@@ -230,18 +230,12 @@ def load_operator(path: str | Path) -> LaplaceBeltrami:
     OperatorFileError
         If it is something else, damaged, or of a version with another format.
     """
-    return _read(Path(path))[0]
+    return load_with_header(path)[0]
 
 
-def describe_file(path: str | Path) -> dict[str, Any]:
-    """Contents of a file of `save_operator`: "version" of torchlb, "key", and "operator"; errors of `load_operator`."""
-    lb, header = _read(Path(path))
-    return {"version": header["version"], "key": header["key"], "operator": lb}
-
-
-def _read(path: Path) -> tuple[LaplaceBeltrami, dict[str, Any]]:
-    """Operator and header of a file, read in full, so that every checksum is verified."""
-    path = path.expanduser()
+def load_with_header(path: str | Path) -> tuple[LaplaceBeltrami, dict[str, Any]]:
+    """As `load_operator`, with the header: version, key, …; read in full, so that every checksum is verified."""
+    path = Path(path).expanduser()
     try:
         with np.load(path, allow_pickle=False) as archive:
             header = json.loads(str(archive["header"]))

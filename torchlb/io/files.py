@@ -12,7 +12,7 @@ from torch import Tensor
 
 from torchlb.errors import InputError
 from torchlb.geometry.complex import edges_of
-from torchlb.io.formats import READERS, begins_with_points
+from torchlb.io.formats import READERS, numbers_of
 from torchlb.operator.cleaning import merged, proper_faces, triangles_of
 from torchlb.operator.inputs import as_tensor
 
@@ -83,9 +83,13 @@ def read_shape(path: str | Path) -> Shape:
 
 
 def may_be_shape(path: Path) -> bool:
-    """Whether a file is taken for a shape, by its ending; .txt and .csv by the numbers in their first row."""
-    suffix = path.suffix.lower()
-    return begins_with_points(path) if suffix in (".csv", ".txt") else suffix in SUFFIXES
+    """Whether a file is taken for a shape, by its ending; .txt and .csv by three numbers in their first row."""
+    if path.suffix.lower() not in (".csv", ".txt"):
+        return path.suffix.lower() in SUFFIXES
+    try:
+        return len(next(numbers_of(path), ([], []))[1]) > 2
+    except InputError:
+        return False
 
 
 def _triangulated(
@@ -116,19 +120,14 @@ def _sewn(vertices: Float[Tensor, "N 3"], faces: Int[Tensor, "F 3"]) -> tuple[Te
     vertices, number = torch.unique(vertices, dim=0, return_inverse=True)
     faces = number[faces]
     found = edges_of(proper_faces(faces).numpy(), len(vertices))
-    edges = torch.from_numpy(np.stack(np.divmod(found.keys, len(vertices)), 1))
-    open_vertices = torch.unique(edges[found.uses == 1])
-    if len(open_vertices) == 0:
+    edges = np.stack(np.divmod(found.keys, len(vertices)), 1)
+    rim = np.unique(edges[found.uses == 1])
+    if len(rim) == 0:
         return vertices, faces
-    place = torch.full((len(vertices),), -1).index_put(
-        (open_vertices,), torch.arange(len(open_vertices))
-    )
-    between = place[edges]
+    between = torch.from_numpy(np.searchsorted(rim, edges[np.isin(edges, rim).all(1)]))
     reach = STEPS * torch.finfo(torch.float32).eps * float(vertices.abs().max())
-    one = torch.arange(len(vertices))
-    one[open_vertices] = open_vertices[
-        merged(vertices[open_vertices], reach, between[(between >= 0).all(1)])
-    ]
+    one, rim = torch.arange(len(vertices)), torch.from_numpy(rim)
+    one[rim] = rim[merged(vertices[rim], reach, between)]
     kept, number = torch.unique(one, return_inverse=True)
     return vertices[kept], number[faces]
 

@@ -99,9 +99,8 @@ def read_ply(path: Path) -> Polygons:
             lists = [title for title, _, size in properties if size]
             corners = columns[next((n for n in lists if n.startswith("vertex_ind")), lists[0])]
             if name == "tristrips":
-                corners = [
-                    triangle for strip in corners for triangle in _strip(strip.astype(np.int32))
-                ]
+                strips = (_strip(strip.astype(np.int32)) for strip in corners)
+                corners = list(chain.from_iterable(strips))
             faces = corners if faces is None else [*faces, *corners]
     return _polygons(vertices, [] if faces is None else faces)
 
@@ -199,7 +198,7 @@ def read_table(path: Path) -> Polygons:
     Columns are separated by commas, semicolons or blanks. Lines before the numbers, such as names of the columns or the
     number of points, and comments by # or // are left out.
     """
-    lines = _numbers(path)
+    lines = numbers_of(path)
     names, first = next(lines, ([], []))
     width = len(first)
     if width < 2:
@@ -212,15 +211,7 @@ def read_table(path: Path) -> Polygons:
     return _polygons(np.array(rows)[:, chosen], [])
 
 
-def begins_with_points(path: Path) -> bool:
-    """Whether the first row of a table has three numbers or more."""
-    try:
-        return len(next(_numbers(path), ([], []))[1]) > 2
-    except InputError:
-        return False
-
-
-def _numbers(path: Path) -> Iterator[tuple[list[str], list[float]]]:
+def numbers_of(path: Path) -> Iterator[tuple[list[str], list[float]]]:
     """Rows of a table, each with the lower-case words of the line before the first row."""
     names: list[str] = []
     begun = False
@@ -228,10 +219,8 @@ def _numbers(path: Path) -> Iterator[tuple[list[str], list[float]]]:
         for number, line in enumerate(file, 1):
             text, _, comment = line.replace("//", "#").partition("#")
             text = comment if not (begun or text.strip()) else text
-            text = (
-                text.replace(",", ".").replace(";", " ") if ";" in text else text.replace(",", " ")
-            )
-            words = text.split()
+            text = text.replace(",", ".") if ";" in text else text  # decimal commas
+            words = text.replace(";", " ").replace(",", " ").split()
             try:
                 row = [float(word) for word in words]
             except ValueError:

@@ -11,8 +11,9 @@ import csv
 import time
 import warnings
 from collections import Counter
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import asdict, dataclass, fields
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -103,19 +104,6 @@ class PrecomputeReport:
         return "\n".join(lines)
 
 
-@dataclass(frozen=True)
-class _Task:
-    """One shape, and all that a worker has to know."""
-
-    name: str
-    source: Any
-    cache: str
-    operator: Operator
-    k: int
-    clean: bool
-    options: dict[str, Any]
-
-
 def precompute_operators(
     shapes: str | Path | Iterable[Any],
     out: str | Path,
@@ -154,22 +142,23 @@ def precompute_operators(
     check_options_of(operator, options)
     cache = Path(out).expanduser()
     sources, skipped = _sources(shapes, cache)
-    tasks = [
-        _Task(name, source, str(cache.resolve()), operator, k, clean, options)
-        for name, source in sources
-    ]
+    settings: dict[str, Any] = {"operator": operator, "k": k, "options": options}
+    work = partial(_solve, cache=str(cache.resolve()), clean=clean, **settings)
     cache.mkdir(parents=True, exist_ok=True)
     _remove_stale(cache)
     results: dict[int, ShapeResult] = {}
     try:
-        with tqdm(total=len(tasks), unit="shape", disable=None if progress else True) as bar:
-            for index, result in _run(tasks, workers):
+        with tqdm(total=len(sources), unit="shape", disable=None if progress else True) as bar:
+            for index, result in _run(work, sources, workers):
                 results[index] = result
                 bar.set_postfix(failed=sum(r.status == "failed" for r in results.values()))
                 bar.update()
     finally:
         report = PrecomputeReport(tuple(results[i] for i in sorted(results)), skipped)
-        _write_table(report, cache / TABLE)
+        with written_whole(cache / TABLE, "x", encoding="utf-8", newline="") as file:
+            writer = csv.DictWriter(file, [field.name for field in fields(ShapeResult)])
+            writer.writeheader()
+            writer.writerows(asdict(result) for result in report.results)
     return report
 
 
@@ -207,55 +196,61 @@ def _sources(
     return named, ()
 
 
-def _run(tasks: Sequence[_Task], workers: int) -> Iterator[tuple[int, ShapeResult]]:
+def _run(
+    work: Callable[..., Any], sources: Sequence[tuple[str, Any]], workers: int
+) -> Iterator[tuple[int, ShapeResult]]:
     """Yield results as they come. Where a worker dies, the tasks that may have killed it run again, each by itself."""
     import joblib
 
-    pending = dict(enumerate(tasks))
+    pending = dict(enumerate(sources))
     while pending:
         try:
-            for index, result in _parallel(workers, pending):
+            for index, result in _parallel(work, workers, pending):
                 del pending[index]
                 yield index, result
         except Exception:  # the worker catches errors of a shape: here the worker itself died
-            in_flight = 2 * joblib.effective_n_jobs(workers)
-            for index in list(pending)[:in_flight]:
-                task = pending.pop(index)
+            number = joblib.effective_n_jobs(workers)
+            for index in list(pending)[: 2 * number]:
+                task = {index: pending.pop(index)}
                 try:
-                    [(_, result)] = _parallel(max(2, joblib.effective_n_jobs(workers)), {0: task})
+                    [(_, result)] = _parallel(work, max(2, number), task)
                 except Exception as error:
                     reason = f"its process died: {type(error).__name__}: {error}".partition("\n")[0]
-                    result = ShapeResult(task.name, "failed", 0, 0.0, "", reason)
+                    result = ShapeResult(task[index][0], "failed", 0, 0.0, "", reason)
                 yield index, result
 
 
-def _parallel(workers: int, tasks: dict[int, _Task]) -> Iterable[tuple[int, ShapeResult]]:
+def _parallel(
+    work: Callable[..., Any], workers: int, tasks: dict[int, tuple[str, Any]]
+) -> Iterable[tuple[int, ShapeResult]]:
     import joblib
 
     backend, _ = joblib.parallel.get_active_backend()
     lazy = getattr(backend, "supports_return_generator", False)
     way = "generator_unordered" if lazy else "list"
     settings: dict[str, Any] = {"n_jobs": workers, "batch_size": 1, "return_as": way}
-    calls = [joblib.delayed(_solve)(index, task) for index, task in tasks.items()]
-    found: Any = joblib.Parallel(**settings)(calls)
-    return found
+    parallel: Any = joblib.Parallel(**settings)
+    return parallel([joblib.delayed(work)(index, *task) for index, task in tasks.items()])
 
 
-def _solve(index: int, task: _Task) -> tuple[int, ShapeResult]:
+def _solve(
+    index: int, name: str, source: Any, *, clean: bool, **settings: Any
+) -> tuple[int, ShapeResult]:
     """Compute one shape on one thread; any exception becomes its result."""
     start = time.perf_counter()
     try:
         with threads_for(0), warnings.catch_warnings(record=True) as caught:
             warnings.simplefilter("always", UserWarning)
-            shape = read_shape(task.source) if isinstance(task.source, Path) else task.source
-            status, points, file = _stored(task, *shape)
+            vertices, faces = read_shape(source) if isinstance(source, Path) else source
+            if clean:
+                vertices, faces = cleaned(vertices, faces)
+            status, points, file = _stored(vertices, faces, **settings)
         notes = {str(w.message) for w in caught if concerns_the_shape(w.message)}
-        found = status, points, file, "; ".join(sorted(notes))
+        message = "; ".join(sorted(notes))
     except Exception as error:
-        found = "failed", 0, "", f"{type(error).__name__}: {error}"
-    status, points, file, message = found
+        status, points, file, message = "failed", 0, "", f"{type(error).__name__}: {error}"
     seconds = time.perf_counter() - start
-    return index, ShapeResult(task.name, status, points, seconds, file, message)
+    return index, ShapeResult(name, status, points, seconds, file, message)
 
 
 def concerns_the_shape(warning: Warning | str) -> bool:
@@ -263,15 +258,14 @@ def concerns_the_shape(warning: Warning | str) -> bool:
     return isinstance(warning, UserWarning) and not str(warning).startswith("Sparse ")
 
 
-def _stored(task: _Task, vertices: Any, faces: Any) -> tuple[str, int, str]:
+def _stored(
+    vertices: Any, faces: Any, cache: str, operator: Operator, k: int, options: dict[str, Any]
+) -> tuple[str, int, str]:
     """Store the operator of one shape; return its status, number of points and file."""
-    if task.clean:
-        vertices, faces = cleaned(vertices, faces)
-    key = operator_key(vertices, faces, operator=task.operator, **task.options)
-    path = Path(task.cache) / f"{key}.npz"
+    path = Path(cache) / f"{operator_key(vertices, faces, operator=operator, **options)}.npz"
     before = _identity(path)
-    settings: dict[str, Any] = {"cache": task.cache, "operator": task.operator, "k": task.k}
-    lb = load_or_build(vertices, faces, progress=False, **settings, **task.options)
+    settings: dict[str, Any] = {"cache": cache, "operator": operator, "k": k, **options}
+    lb = load_or_build(vertices, faces, progress=False, **settings)
     after = _identity(path)
     if after is None:
         raise OSError("its operator was built and could not be written")
@@ -295,10 +289,3 @@ def _remove_stale(cache: Path) -> None:
                 path.unlink()
         except FileNotFoundError:
             continue  # another run was faster
-
-
-def _write_table(report: PrecomputeReport, path: Path) -> None:
-    with written_whole(path, "x", encoding="utf-8", newline="") as file:
-        writer = csv.DictWriter(file, [field.name for field in fields(ShapeResult)])
-        writer.writeheader()
-        writer.writerows(asdict(result) for result in report.results)

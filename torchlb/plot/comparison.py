@@ -55,12 +55,8 @@ def plot_spectrum(values: Mapping[str, Float[Tensor, " k"]], ax: Any) -> Any:
     ax.xaxis.set_major_locator(MaxNLocator(integer=True))
     ax.spines[["top", "right"]].set_visible(False)
     for name, line in others:
-        right = ax.twinx()
-        right.plot(
-            100 * (line / first.where(first > 0, torch.nan) - 1).numpy(),
-            color=LINE_COLORS[0],
-            **style,
-        )
+        right, change = ax.twinx(), 100 * (line / first.where(first > 0, torch.nan) - 1)
+        right.plot(change.numpy(), color=LINE_COLORS[0], **style)
         right.set_ylabel(f"{name}, difference in %", color=LINE_COLORS[0])
         right.spines[["top", "left"]].set_visible(False)
     return ax

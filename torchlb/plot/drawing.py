@@ -5,7 +5,7 @@ The functions take checked input, as `cloud_of`, `mesh_of` and `values_of` retur
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 import numpy as np
@@ -124,20 +124,19 @@ def _project(points: np.ndarray, view: Eye) -> np.ndarray:
     return points @ np.stack([right, np.cross(eye, right), eye], axis=1)
 
 
-def _stacked(points: np.ndarray, view: Views) -> list[tuple[np.ndarray, Eye]]:
+def _stacked(points: np.ndarray, view: Views) -> Iterator[tuple[np.ndarray, Eye]]:
     """The projections for all eyes, one below the other. A shape in the plane z = 0 is seen from above."""
     if not points[:, 2].any():
         view = (90.0, -90.0)
-    views = [view] if isinstance(view[0], int | float) else view
-    seen, floor = [], 0.0
+    views: Any = [view] if isinstance(view[0], int | float) else view
+    floor = 0.0
     for eye in views:
-        flat = _project(points - points.mean(axis=0), eye)  # type: ignore[arg-type]
+        flat = _project(points - points.mean(axis=0), eye)
         height = np.ptp(flat[:, 1])
         flat[:, 1] += floor - flat[:, 1].max()
         flat[:, 0] -= (flat[:, 0].max() + flat[:, 0].min()) / 2
         floor -= 1.08 * height
-        seen.append((flat, eye))
-    return seen
+        yield flat, eye
 
 
 def paint(
@@ -164,11 +163,9 @@ def paint(
         if isolines is not None:
             edges, share = isolines
             ends = flat[edges[..., 0]] * (1 - share) + flat[edges[..., 1]] * share  # (S, 2, 3)
-            above = np.linalg.norm(
-                corners[:, 1] - corners[:, 0], axis=1
-            ).mean()  # in front of the triangles beside
             polygons += list(ends[..., :2])
-            depth = np.append(depth, ends[..., 2].mean(axis=1) + above)
+            above = np.linalg.norm(corners[:, 1] - corners[:, 0], axis=1).mean()
+            depth = np.append(depth, ends[..., 2].mean(axis=1) + above)  # before triangles beside
             shaded = np.append(shaded, plain(INK, len(ends)), axis=0)
             width = np.append(width, np.full(len(ends), 0.8))
         order = depth.argsort()

@@ -36,7 +36,6 @@ Vertices = Float[Tensor, "N 3"] | Float[np.ndarray, "N 3"]
 Faces = Int[Tensor, "F 3"] | Int[np.ndarray, "F 3"]
 Cloud = Float[Tensor, "N n"] | Float[np.ndarray, "N n"]
 Scalar = Num[Tensor, " N"] | Num[np.ndarray, " N"]
-Vectors = Float[Tensor, "N n"] | Float[np.ndarray, "N n"]
 ORDER_COLORS = ("#ece7dc", "#cfd6cf", "#abc1c4", "#7fa5b5", "#5485a0", "#33648a", "#1b446d")
 """Colours by order reached, low-order rows first, the last for all beyond: darker is higher, also in grey."""
 LINE_COLORS = ("#d55e00", "#56b4e9", "#0072b2", "#000000", "#e69f00", "#009e73", "#cc79a7")
@@ -139,7 +138,7 @@ def plot_points(
 def plot_vectors(
     vertices: Cloud,
     faces: Faces | None,
-    vectors: Vectors,
+    vectors: Cloud,
     values: Scalar | None = None,
     *,
     ax: Any = None,

@@ -13,7 +13,7 @@ Everything is float64, and derivatives are exact to rounding: forward-mode diffe
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from functools import lru_cache
 from typing import ClassVar
 
@@ -64,12 +64,9 @@ class Surface:
     def _faces(self, points: np.ndarray) -> np.ndarray:
         raise NotImplementedError
 
-    def _spectrum(self, k: int) -> np.ndarray:
+    def _spectrum(self, k: int, condition: str) -> np.ndarray:
+        """The k least eigenvalues, or more of them in any order."""
         raise InputError(f"{type(self).__name__}: no exact eigenvalues are known")
-
-    def _spectra(self) -> Mapping[str, Callable[[int], np.ndarray]]:
-        """Functions that return the k least eigenvalues, or more of them in any order, by boundary condition."""
-        return {"neumann": self._spectrum}
 
     def retract(self, x: Places) -> Places:
         """Smooth map R of a neighbourhood onto the surface, the identity on it."""
@@ -77,10 +74,10 @@ class Surface:
 
     def eigenvalues(self, k: int, condition: str = "neumann") -> Float[Tensor, " k"]:
         """The first k exact eigenvalues of −Δ with multiplicity, ascending, 1/ℓ²; ValueError if unknown."""
-        spectra = self._spectra()
-        require(condition in spectra, "condition", " or ".join(spectra), condition)
+        known = ["neumann", "dirichlet"] if self.perimeter else ["neumann"]
+        require(condition in known, "condition", " or ".join(known), condition)
         require(k >= 1, "k", "a positive number", k)
-        return torch.from_numpy(np.sort(spectra[condition](k))[:k])
+        return torch.from_numpy(np.sort(self._spectrum(k, condition))[:k])
 
     @property
     def area(self) -> float:
@@ -136,9 +133,9 @@ class Surface:
 
     def _stratified(self, shares: Float[Tensor, "N 1"]) -> Points:
         """Points of a curve, by fractions of its length."""
-        grid = torch.linspace(0, 1, 4097, dtype=torch.float64)[:, None]
         from scipy.integrate import cumulative_trapezoid
 
+        grid = torch.linspace(0, 1, 4097, dtype=torch.float64)[:, None]
         length = cumulative_trapezoid(self._density(grid).numpy(), initial=0)
         cube = np.interp(shares[:, 0].numpy() * length[-1], length, grid[:, 0].numpy())
         return self._chart(torch.from_numpy(cube)[:, None])

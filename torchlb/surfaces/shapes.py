@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import ClassVar
 
@@ -43,7 +43,7 @@ class _Round(_Radial):
     def _retract(self, x: Places) -> Places:
         return self.radius * _unit(x)
 
-    def _spectrum(self, k: int) -> np.ndarray:
+    def _spectrum(self, k: int, condition: str) -> np.ndarray:
         d, degree = self.dim, np.arange(k)  # as often as there are harmonic polynomials
         times = [math.comb(j + d, d) - math.comb(max(j + d - 2, 0), d) for j in degree]
         return np.repeat(degree * (degree + d - 1) / self.radius**2, times)
@@ -135,7 +135,7 @@ class Torus(Surface):
         tube = 2 * scale * np.arctan2(ratio * np.sin(half), np.cos(half))
         return _periodic_delaunay(np.stack([np.arctan2(y, x), tube], 1), np.array([1, scale]))
 
-    def _spectrum(self, k: int) -> np.ndarray:
+    def _spectrum(self, k: int, condition: str) -> np.ndarray:
         """Fourier collocation for f = g(v) w^{−1/2} e^{imu}, w = major + minor cos v; error about 1e-11 λ_k.
 
         −g″/minor² + (w″/2w − w′²/4w²) g/minor² + m² g/w² = λ g, analytic in a strip around the real v.
@@ -173,7 +173,7 @@ class CliffordTorus(Surface):
     def _faces(self, points: np.ndarray) -> np.ndarray:
         return _periodic_delaunay(np.arctan2(points[:, 1::2], points[:, ::2]), np.ones(2))
 
-    def _spectrum(self, k: int) -> np.ndarray:
+    def _spectrum(self, k: int, condition: str) -> np.ndarray:
         square = np.arange(-math.isqrt(k) - 2, math.isqrt(k) + 3) ** 2
         return np.add.outer(square, square).ravel() / self.radius**2
 
@@ -196,7 +196,7 @@ class SpaceCurve(Surface):
         a, b, c = x.split(1, dim=-1)
         return self._at(torch.atan2(c, torch.hypot(a, b) - 1) - torch.atan2(b, a))
 
-    def _spectrum(self, k: int) -> np.ndarray:
+    def _spectrum(self, k: int, condition: str) -> np.ndarray:
         return (2 * math.pi / self.area * np.arange(-k, k + 1)) ** 2
 
 
@@ -221,15 +221,11 @@ class UnitDisk(Surface):
     def _faces(self, points: np.ndarray) -> np.ndarray:
         return Delaunay(points[:, :2]).simplices
 
-    def _spectra(self) -> Mapping[str, Callable[[int], np.ndarray]]:
-        def squares_of(zeros: Callable[[int, int], np.ndarray]) -> Callable[[int], np.ndarray]:
-            # Zeros are about π apart, and the k-th eigenvalue is about 4k.
-            return lambda k: _by_angle(k, lambda m: zeros(m, math.isqrt(k) + 8) ** 2)
-
-        def of_derivative(m: int, count: int) -> np.ndarray:
-            return np.append([0.0] * (m == 0), jnp_zeros(m, count))
-
-        return {"neumann": squares_of(of_derivative), "dirichlet": squares_of(jn_zeros)}
+    def _spectrum(self, k: int, condition: str) -> np.ndarray:
+        count = math.isqrt(k) + 8  # zeros are about π apart, and the k-th eigenvalue is about 4k
+        if condition == "dirichlet":
+            return _by_angle(k, lambda m: jn_zeros(m, count) ** 2)
+        return _by_angle(k, lambda m: np.append([0.0] * (m == 0), jnp_zeros(m, count)) ** 2)
 
 
 @dataclass(frozen=True)
@@ -252,12 +248,9 @@ class Hemisphere(Surface):
     def _faces(self, points: np.ndarray) -> np.ndarray:
         return Delaunay(points[:, :2] / (1 + points[:, 2:])).simplices  # stereographic: conformal
 
-    def _spectra(self) -> Mapping[str, Callable[[int], np.ndarray]]:
-        def harmonics(k: int, more: int) -> np.ndarray:
-            degree = np.arange(k + 1)
-            return np.repeat(degree * (degree + 1.0), degree + more)
-
-        return {"neumann": lambda k: harmonics(k, 1), "dirichlet": lambda k: harmonics(k, 0)}
+    def _spectrum(self, k: int, condition: str) -> np.ndarray:
+        degree = np.arange(k + 1)
+        return np.repeat(degree * (degree + 1.0), degree + (condition == "neumann"))
 
 
 def deserno_points(n: int) -> Float[Tensor, "N 3"]:
