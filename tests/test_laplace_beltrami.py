@@ -217,7 +217,6 @@ def test_the_hessian_is_symmetric_and_its_trace_is_div_grad(lb):
 def test_it_knows_its_shape_type_and_options(lb):
     assert lb.shape == lb.matrix.shape
     assert (lb.dtype, lb.device) == (torch.float64, torch.device("cpu"))
-    assert lb.order == lb.options.get("order")
     assert lb.boundary is None
 
 

@@ -67,12 +67,12 @@ class Tensors(nn.Module):
                 return held[name]
         return super().__getattr__(name)
 
-    def alias(self: Held) -> Held:
+    def _alias(self: Held) -> Held:
         """A module of the same tensors, which is moved and cast by itself."""
         other = copy(self)
         other._buffers = dict(self._buffers)
         other._modules = {
-            name: module.alias() if isinstance(module, Tensors) else module
+            name: module._alias() if isinstance(module, Tensors) else module
             for name, module in self._modules.items()
         }
         return other

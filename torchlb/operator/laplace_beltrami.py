@@ -334,7 +334,7 @@ class LaplaceBeltrami(StencilMethods, PairMethods):
             parts = zip(shapes, split_fields(self, shapes, given), strict=True)
             return self.batch([shape.with_medium(**own) for shape, own in parts])
         with torch.inference_mode(False):
-            medium, lb = checked_fields(self, given), self.alias()
+            medium, lb = checked_fields(self, given), self._alias()
             lb.weak = pair_in(self, medium.fields(self.num_points))
             lb.modes, lb._medium, lb._in_medium = Modes(None, self.mass), medium, True
         lb._plan, lb.cache.elements = self._plan, self.cache.elements

@@ -121,11 +121,6 @@ class OperatorStorage(Tensors):
         return self.frames.shape[-1]
 
     @property
-    def order(self) -> int | None:
-        """Order p that was asked for; None where there is none, as for the cotangent operator."""
-        return self.options.get("order")
-
-    @property
     def condition(self) -> str | Condition | None:
         """Boundary condition, "neumann", "dirichlet" or a `Robin`; None if no boundary data are used."""
         plain = self.options.get("condition")
