@@ -1,4 +1,4 @@
-"""Derivatives in the points, at frozen decisions, of all that follows from the weak pair."""
+"""Derivatives in the points, at frozen decisions, of what follows from the weak pair, and of rows of Δ and ∇."""
 
 import functools
 
@@ -111,6 +111,32 @@ def test_the_gradient_is_that_of_differences(name):
         assert abs(ours - theirs) < 2e-4 * abs(theirs) + 1e-6, (ours, theirs)
 
 
+@pytest.mark.parametrize("name", SHAPES)
+def test_rows_have_the_gradient_of_differences(name):
+    """Of Δf, ∇f, ∇²f, the mean-curvature vector, normals and projectors, with low-order rows among them."""
+    lb = built(name)
+    n = lb.points.shape[1]
+    w, u = noise(2, lb.num_points, 2, seed=1)
+    v = noise(n, seed=2)
+
+    def projected(moved):
+        return (v @ moved.frames).square().sum(1)
+
+    for value in (
+        lambda moved: (w * moved(u)).sum(),
+        lambda moved: (w[:, 0] * (moved.matrix @ u)[:, 0]).sum(),
+        lambda moved: (w * (v @ moved.gradient(u))).sum(),
+        lambda moved: (w * moved.hessian(u).diagonal(dim1=1, dim2=2).sum(-1)).sum(),
+        lambda moved: moved.mean_curvature_normal().square().sum(),
+        lambda moved: (w[:, 0] * moved.divergence(moved.points)).sum(),
+        lambda moved: (w[:, 0] * projected(moved)).sum(),
+        lambda moved: (moved.normals @ v * w[: len(moved.normals), 0]).sum(),
+    ):
+        if value(lb) != 0:
+            ours, theirs = slope(lb, value)
+            assert abs(ours - theirs) < 2e-4 * abs(theirs) + 1e-6, (ours, theirs)
+
+
 @pytest.mark.parametrize("name", ["closed", "cloud", "curve"])
 def test_scaling_turning_and_moving(name):
     """λ falls as size^−2, so gradient · x = −2 Σ 1 of Σ log λ; no force, no torque."""
@@ -159,14 +185,7 @@ def test_what_has_no_derivative_raises_and_nothing_is_zero_in_silence(unchecked)
     moved, f = lb.at(x), noise(lb.num_points, 2)
     layer = Diffusion(2, k=6).double()
     for value in (
-        moved(f),
-        moved.gradient(f),
-        moved.hessian(f),
-        moved.mean_curvature_normal(),
-        moved.frames,
-        moved.matrix @ f,
         moved.stiffness @ f,
-        moved.normals,
         geodesic_distance(moved, 0),
         heat_flow(moved, f, 0.1, method="deflated", k=6),
         layer(f, moved),

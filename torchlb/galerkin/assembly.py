@@ -178,7 +178,19 @@ def linear_elements(
     shares: Float[Tensor, " T"] | None = None,
     lumped: Float[Tensor, " N"] | None = None,
 ) -> sparse.csr_array:
-    """K + iM of P1 elements on flat simplices with these edge lengths, weighted by `shares`.
+    """K + iM of P1 elements on flat simplices, assembled; arguments as for `linear_blocks`, and weights `shares`."""
+    blocks = linear_blocks(lengths, cells, conductivity, density, lumped)
+    return summed(blocks if shares is None else shares[:, None] * blocks, cells, num_points)
+
+
+def linear_blocks(
+    lengths: Float[Tensor, "T e"],
+    cells: Int[Tensor, "T corners"],
+    conductivity: Tensor | None = None,
+    density: Float[Tensor, " T"] | None = None,
+    lumped: Float[Tensor, " N"] | None = None,
+) -> Complex[Tensor, "T n_times_n"]:
+    """Element matrices K + iM of P1 elements on flat simplices with these edge lengths.
 
     The conductivity, a number (T,) or a tensor as `in_cells` has it, (T, S), and the density are constant in each. With
     factors `lumped` for the points, M is lumped in equal shares to the corners, times these.
@@ -190,7 +202,7 @@ def linear_elements(
         corners, total = cells.shape[1], blocks.imag.sum(1, keepdim=True)
         blocks.imag.zero_()
         blocks.imag[:, :: corners + 1] = lumped[cells] * total / corners
-    return summed(blocks if shares is None else shares[:, None] * blocks, cells, num_points)
+    return blocks
 
 
 def spread(x: Tensor, shape: Element) -> Tensor:

@@ -124,12 +124,11 @@ def complete_frames(normals: Float[Tensor, "N n"]) -> Float[Tensor, "N n d"]:
 
 def normals_of_frames(frames: Float[Tensor, "N n d"]) -> Float[Tensor, "N n"]:
     """Unit normal of each frame with d = n − 1, such that [frame, normal] is right-handed."""
-    if frames.shape[1] == 3:
+    n = frames.shape[1]
+    if n == 3:
         return torch.linalg.cross(*frames.unbind(-1))
-    basis, _ = torch.linalg.qr(frames, mode="complete")
-    normal = basis[..., -1:]
-    hand = torch.linalg.det(torch.cat([frames, normal], -1)).sign()
-    return hand[:, None] * normal[..., 0]
+    minors = [frames[:, [row for row in range(n) if row != i]].det() for i in range(n)]
+    return torch.stack([(-1) ** (n - 1 + i) * minor for i, minor in enumerate(minors)], 1)
 
 
 def _edges(vertices: Float[Tensor, "N n"], faces: Int[Tensor, "F v"]) -> Float[Tensor, "F edges n"]:

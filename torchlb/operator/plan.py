@@ -11,6 +11,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache
 
+import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
@@ -25,8 +26,9 @@ from torchlb.operator.options import Options
 from torchlb.stencils.assemble import Stencils
 from torchlb.stencils.conditions import Condition
 from torchlb.stencils.low_order import MeshLowOrder
-from torchlb.stencils.rows import RowsPlan
-from torchlb.stencils.shape import Shape, ShapePlan
+from torchlb.stencils.placed import Placed, ShapePlan
+from torchlb.stencils.rows import Rows, RowsPlan
+from torchlb.stencils.shape import Shape
 
 
 @dataclass(frozen=True)
@@ -95,6 +97,38 @@ class Plan:
         _, fits = self.shape.at(self._sorted(points))
         return self.pair.bilinear(fits, forms, medium)
 
+    def rows_at(self, points: Float[Tensor, "N n"]) -> list[Tensor]:
+        """Values of Δ and of the derivatives in the frames, (1 + d, nnz), frames and normals, if there are any.
+
+        Differentiable in the points, but for a turn of each frame in its plane; of conditions with a share a of the
+        boundary the areas are not those at the points.
+        """
+        placed, _ = self.shape.at(self._sorted(points))
+        rows, _ = self._rows(placed, torch.ones_like(points[:, 0]))
+        rows = rows.restored(self.numbering)
+        found = [placed.frames, *([] if placed.normals is None else [placed.normals])]
+        values = torch.cat([rows.laplacian[None], rows.gradient.T])
+        return [values, *(self.numbering.restored(each) for each in found)]
+
+    def _rows(self, placed: Placed, areas: Float[Tensor, " N"]) -> tuple[Rows, Shape]:
+        """Evaluate the rows of the stencils, and the shape that they are of."""
+        if self.rows is None:
+            raise InputError(
+                "points: an operator with a certificate, which says something of these points alone, has no plan for "
+                "others; build it again"
+            )
+        cells, shares = self.shape.cells, self.shape.shares
+        shape = Shape(
+            **vars(placed),
+            normal_order=self.shape.fits.order,
+            neighborhoods=None,
+            areas=areas,
+            low_order=MeshLowOrder(placed.points, cells, self.flips, shares),
+            condition=self.options.held(self.numbering) or Condition(),
+            on_mesh=self.on_mesh,
+        )
+        return stencils_of(shape, self.options).evaluated(self.rows), shape
+
     def _sorted(self, points: Float[Tensor, "N n"]) -> Float[Tensor, "N n"]:
         if len(self.moved):
             raise InputError(
@@ -107,25 +141,11 @@ class Plan:
 def evaluate(plan: Plan, points: Float[Tensor, "N n"]) -> AssembledOperator:
     """Evaluate a plan at points, float64 on the CPU; InputError with a certificate or moved points of a noisy curve."""
     here, options = plan._sorted(points), plan.options
-    if plan.rows is None:
-        raise InputError(
-            "points: an operator with a certificate, which says something of these points alone, has no plan for "
-            "others; build it again"
-        )
     with renumbered(plan.numbering.given), threads_for(len(points)):
         placed, fits = plan.shape.at(here)
         pair = plan.pair.at(fits, plan.numbering)
         assert pair.mass is not None
-        shape = Shape(
-            **vars(placed),
-            normal_order=plan.shape.fits.order,
-            neighborhoods=None,
-            areas=pair.mass,
-            low_order=MeshLowOrder(fits.points, plan.shape.cells, plan.flips, plan.shape.shares),
-            condition=options.held(plan.numbering) or Condition(),
-            on_mesh=plan.on_mesh,
-        )
-        rows = stencils_of(shape, options).evaluated(plan.rows)
+        rows, shape = plan._rows(placed, pair.mass)
     built = AssembledOperator.of(rows, shape, pair, plan.source, options.plain, plan.pair.counts)
     return built.restored(plan.numbering, points, plan.faces)
 

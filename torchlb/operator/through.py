@@ -1,8 +1,9 @@
 """Through geometry and medium: results of an operator that are differentiable in its points and in its medium.
 
-What follows from the weak pair alone (eigenpairs, flows, solves, products with K and M, the mass) is differentiable in
-both: its gradient is that of a sum of bilinear forms (`PairPlan.bilinear`). All else raises an error where a
-derivative is asked for: no gradient is zero, or lacks a part, in silence.
+What follows from the weak pair (eigenpairs, flows, solves, products with K and M, the mass) is differentiable in both:
+its gradient is that of a sum of bilinear forms (`PairPlan.bilinear`). Rows of Δ and ∇, frames and normals are evaluated
+again for a gradient. All else raises an error where a derivative is asked for: no gradient is zero, or lacks a part, in
+silence.
 """
 
 from __future__ import annotations
@@ -55,14 +56,18 @@ class _Origin(NamedTuple):
             found = [torch.zeros_like(leaf) for leaf in leaves]
             if total.requires_grad:  # M does not depend on the conductivity, for example
                 found = torch.autograd.grad(total, leaves, materialize_grads=True)
-        for g in found:
-            bad = (~g.isfinite()).nonzero()[:, 0].unique()
-            if len(bad):
-                raise DerivativeError(
-                    f"points or medium: the derivative at {len(bad)} points or faces ({first_few(bad)}) is not finite, "
-                    "as where all cells of a point are degenerate; remove these, or merge their corners"
-                )
-        return [g.to(v) for g, v in zip(found, self.variables, strict=True)]
+        return [_finite(g).to(v) for g, v in zip(found, self.variables, strict=True)]
+
+
+def _finite(gradient: Tensor) -> Tensor:
+    """The gradient in points or faces; DerivativeError where it is not finite."""
+    bad = (~gradient.isfinite()).nonzero()[:, 0].unique()
+    if len(bad):
+        raise DerivativeError(
+            f"points or medium: the derivative at {len(bad)} points or faces ({first_few(bad)}) is not finite, as "
+            "where all cells of a point are degenerate; remove these, or merge their corners"
+        )
+    return gradient
 
 
 class Origins(NamedTuple):
@@ -132,6 +137,28 @@ class _Known(torch.autograd.Function):
         return None, None, None, *[None] * ctx.count, *ctx.found.gradient(forms)
 
 
+class _Rows(torch.autograd.Function):
+    """Rows, frames and normals that are known, evaluated again for their derivative in the points."""
+
+    @staticmethod
+    def forward(ctx: Any, points: Tensor, plan: Any, *known: Tensor) -> Any:  # pyright: ignore[reportIncompatibleMethodOverride]
+        ctx.save_for_backward(points)
+        ctx.plan = plan
+        return tuple(each.clone() for each in known)
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, *grads: Tensor) -> tuple[Any, ...]:  # pyright: ignore[reportIncompatibleMethodOverride]
+        (points,) = ctx.saved_tensors
+        with torch.enable_grad():
+            x = points.detach().cpu().double().requires_grad_()
+            found = ctx.plan.rows_at(x)
+            (gradient,) = torch.autograd.grad(
+                found, x, [g.to(f) for g, f in zip(grads, found, strict=True)]
+            )
+        return _finite(gradient).to(points), None, *[None] * len(grads)
+
+
 class _Refused(torch.autograd.Function):
     """A value that depends on points or medium in a way that is not differentiated."""
 
@@ -143,9 +170,8 @@ class _Refused(torch.autograd.Function):
     @staticmethod
     def backward(ctx: Any, *grads: Any) -> Any:
         raise DerivativeError(
-            f"{ctx.what}: no derivative in the points or in the medium; what follows from the weak pair has one: "
-            "eigenpairs, flows, solves, the mass and lb.product(name, f). For derivatives in f, take an operator at "
-            "points.detach()"
+            f"{ctx.what}: no derivative in the points or in the medium; eigenpairs, flows, solves, the mass, "
+            "lb.product(name, f), Δf and ∇f have one. For derivatives in f, take an operator at points.detach()"
         )
 
 
@@ -191,9 +217,9 @@ def carrying(lb: Any, points: Any) -> Any:
 
     lb.points = points.to(lb.points).view_as(lb.points)  # a buffer is no Parameter
     (lb.mass,) = known(lb, [lb.mass], forms)
-    lb.stencil.values = refused(lb.stencil.values, "rows of Δ and ∇", points)
-    lb.frames = refused(lb.frames, "frames", points)
-    lb.normals = refused(lb.normals, "normals", points)
+    known_rows = [lb.stencil.values, lb.frames, *([lb.normals] if len(lb.normals) else [])]
+    lb.stencil.values, lb.frames, *normals = _Rows.apply(lb.points, lb.plan, *known_rows)  # pyright: ignore[reportGeneralTypeIssues]
+    lb.normals = normals[0] if normals else lb.normals
     return lb
 
 

@@ -247,6 +247,9 @@ class Stencils:
         assert self.shape.low_order is not None
         matrix = self.shape.low_order.rows(centers)
         rows = matrix_rows(matrix, *self.placed, centers)
+        if self.shape.points.requires_grad:
+            row = centers.repeat_interleave(rows.length)
+            rows = replace(rows, laplacian=self.shape.low_order.entries(row, rows.col))
         rows = replace(rows, candidate=torch.full_like(centers, len(self.candidates)))
         found = list(gradients)
         if not found:

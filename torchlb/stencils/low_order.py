@@ -7,12 +7,12 @@ from functools import cached_property
 from math import factorial
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Complex, Float, Int
 from scipy import sparse
 from torch import Tensor
 
 from torchlb.errors import first_few, warn
-from torchlb.galerkin.assembly import linear_elements
+from torchlb.galerkin.assembly import linear_blocks, summed
 from torchlb.galerkin.delaunay import delaunay_cover, sound_lengths
 from torchlb.galerkin.nodes import lagrange_nodes
 from torchlb.linalg.precision import ROUNDING
@@ -44,11 +44,13 @@ class MeshLowOrder:
     @property
     def flips(self) -> list[Tensor]:
         """Edge flips to the triangulation; none where it was not needed, or for other cells than triangles."""
-        return self._elements[2] if "_elements" in vars(self) else []
+        return self._blocks[2] if "_blocks" in vars(self) else []
 
     @cached_property
-    def _elements(self) -> tuple[sparse.csr_array, Float[Tensor, " N"], list[Tensor]]:
-        """Stiffness, lumped mass, and flips."""
+    def _blocks(
+        self,
+    ) -> tuple[Int[Tensor, "T corners"], Complex[Tensor, "T entries"], list[Tensor]]:
+        """Cells, their element matrices K + iM, differentiable in the points, and flips."""
         nodes, flips, share = lagrange_nodes(self.cells, len(self.points), 1), [], self.shares
         cells, lengths = nodes.cells, sound_lengths(nodes.lengths(self.points), nodes.cells)
         if nodes.dim == 2:
@@ -56,8 +58,30 @@ class MeshLowOrder:
             cover = delaunay_cover(cells, lengths, nodes.edge, free, self.planned)
             cells, lengths, flips = cover.faces, cover.lengths, cover.flips
             share = torch.full((len(cells),), 0.5).to(lengths)
-        pair = linear_elements(lengths, cells, len(self.points), shares=share)
-        return pair.real, torch.from_numpy(pair.imag.sum(axis=1)), flips
+        blocks = linear_blocks(lengths, cells)
+        return cells, blocks if share is None else share[:, None] * blocks, flips
+
+    @cached_property
+    def _elements(self) -> tuple[sparse.csr_array, Float[Tensor, " N"]]:
+        """Stiffness and lumped mass."""
+        cells, blocks, _ = self._blocks
+        pair = summed(blocks.detach(), cells, len(self.points))
+        return pair.real, torch.from_numpy(pair.imag.sum(axis=1))
+
+    def entries(self, row: Int[Tensor, " e"], col: Int[Tensor, " e"]) -> Float[Tensor, " e"]:
+        """Entries of Δ, 1/ℓ², differentiable in the points."""
+        cells, blocks, _ = self._blocks
+        count, corners = len(self.points), cells.shape[1]
+        first, second = cells.repeat_interleave(corners, 1).flatten(), cells.repeat(1, corners)
+        mass = blocks.imag.new_zeros(count).index_add(0, first, blocks.imag.flatten())
+        mass = mass.clamp_min(ROUNDING * float(mass.detach().mean()))
+        key, place = (row * count + col).unique(return_inverse=True)
+        ours = first * count + second.flatten()
+        where = torch.searchsorted(key, ours).clamp_max(len(key) - 1)
+        asked = key[where] == ours
+        values = blocks.real.flatten()[asked]
+        stiffness = values.new_zeros(len(key)).index_add(0, where[asked], values)
+        return -stiffness[place] / mass[row]
 
     def areas(self) -> Float[Tensor, " N"]:
         """Equal shares of the cells around each vertex, ℓ^d, or lumped masses where some are almost zero."""

@@ -263,7 +263,7 @@ def matrix_rows(
     inverse = to_tangent_vectors(jacobian, frames[centers]) @ inverse
     gradient = torch.einsum("ecd,ed->ec", inverse[local], coords)
     on_diagonal = col == centers[local]
-    gradient[on_diagonal] -= summed(gradient)[local[on_diagonal]]
+    gradient = gradient - on_diagonal[:, None] * summed(gradient)[local]
     total = summed(laplacian.abs())
     center = summed(laplacian.abs() * on_diagonal)
     radius = torch.zeros_like(total).scatter_reduce_(0, local, offset.norm(dim=-1), "amax")
