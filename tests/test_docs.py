@@ -99,9 +99,11 @@ TRIGGERS = {
     "points: they require": lambda: LaplaceBeltrami.from_points(
         VERTICES.clone().requires_grad_(), weak_form=False
     ),
-    "points: the derivative": lambda: derivative_of_a_lone_corner(),
+    "points or medium: the derivative": lambda: derivative_of_a_lone_corner(),
     "…: no derivative in": lambda: (
-        LaplaceBeltrami.from_points(VERTICES.clone().requires_grad_()).frames.sum().backward()
+        (LaplaceBeltrami.from_points(VERTICES.clone().requires_grad_()).stiffness @ VERTICES)
+        .sum()
+        .backward()
     ),
     "normals: the signs": lambda: LaplaceBeltrami.from_points(
         VERTICES, normals=VERTICES * torch.tensor([1.0, -1.0]).repeat(30)[:, None], order=1
