@@ -320,7 +320,7 @@ def test_blocks_of_any_size_make_the_same_pair(monkeypatch):
     """Of a hemisphere of one block, and of many with a rest, in all that is done a few at a time."""
     vertices, faces = Hemisphere().mesh(500)
     whole = LaplaceBeltrami.from_mesh(vertices, faces)
-    rooms = ("assembly", "curving", "forms")
+    rooms = ("assembly", "curving")
     for module in (*(f"galerkin.{room}" for room in rooms), "stencils.shape"):
         monkeypatch.setattr(f"torchlb.{module}.AT_ONCE", 70)
     parts = LaplaceBeltrami.from_mesh(vertices, faces)

@@ -12,7 +12,7 @@ from scipy import sparse
 from torchlb.cloud.cocone import best_manifold, conormals
 from torchlb.fits.least_squares import left_inverse
 from torchlb.fits.weights import scaled_system
-from torchlb.galerkin import forms
+from torchlb.galerkin import assembly
 from torchlb.galerkin.pair import Pattern
 from torchlb.geometry.compatibility import compatible, normal_frames
 from torchlb.geometry.complex import components, edges_of, spanning_pairs, tree_sides
@@ -75,8 +75,8 @@ def test_products_some_rows_at_a_time_are_those_of_the_whole(monkeypatch):
     matrix.data[::5] = 0.0
     shuffled = p[:, ::-1]
     shuffled.indices = 89 - shuffled.indices
-    monkeypatch.setattr(forms, "AT_ONCE", 40)
-    found = forms.upper_congruence(shuffled.copy(), matrix)
+    monkeypatch.setattr(assembly, "AT_ONCE", 40)
+    found = assembly.upper_congruence(shuffled.copy(), matrix)
     expected = sparse.triu(p.T @ matrix @ p)
     assert abs(found - expected).max() < 1e-14 * abs(expected).max()
 

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import math
+from functools import partial
 
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
+from torchlb.linalg.exponential import chebyshev_vectors
 from torchlb.nn.checks import check_features
 from torchlb.operator.laplace_beltrami import LaplaceBeltrami
 
@@ -62,8 +64,9 @@ class SpectralConv(nn.Module):
         basis = lb.eigenbasis(self.k)
         with torch.autocast(x.device.type, enabled=False):
             u = basis.eigenvalues.to(dtype) / (basis.eigenvalues.to(dtype) + self.scale)
-            orders = torch.arange(self.num_filters, dtype=dtype, device=x.device)
-            polynomials = torch.cos(orders * torch.acos((2 * u - 1).clamp(-1, 1))[..., None])
+            shifted = partial(torch.mul, 2 * u - 1)
+            polynomials = chebyshev_vectors(shifted, torch.ones_like(u), self.num_filters)
+            polynomials = torch.stack(list(polynomials), -1)
             filters = torch.einsum("...kf,foi->...koi", polynomials, self.weight.to(dtype))
             coefficients = basis.analyse(basis.left, x.to(dtype))
             y = basis.from_basis((filters @ coefficients[..., None])[..., 0])

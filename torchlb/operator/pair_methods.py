@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any, Literal, get_args
 
 import torch
@@ -146,15 +147,28 @@ class PairMethods(OperatorStorage):
         InputError
             Without a weak pair.
         """
-        count = check_num_pairs(k) + (0 if origins(self) is None else BEYOND)
-        basis = self.invariant_basis(count, tolerance=tolerance, store=store)
-        return through_eigenpairs(self, basis, k)
+        k = check_num_pairs(k)
+        count = k + (0 if origins(self) is None else BEYOND)
+        return through_eigenpairs(self, self._known_basis(count, tolerance, store), k)
 
     def invariant_basis(
         self, k: int, *, tolerance: float | None = None, store: bool = False
     ) -> Eigenbasis:
-        """All eigenpairs known, at least k, so that their span is invariant under Δ; otherwise as `eigenbasis`."""
-        k = check_num_pairs(k)
+        """All eigenpairs known, at least k, so that their span is invariant under Δ; otherwise as `eigenbasis`.
+
+        They have no derivatives in points and medium.
+        """
+        basis = self._known_basis(check_num_pairs(k), tolerance, store)
+        if origins(self) is None:
+            return basis
+        held = {
+            name: without(self, getattr(basis, name), "invariant_basis")
+            for name in ("eigenvalues", "eigenvectors", "left")
+        }
+        return replace(basis, **held)
+
+    def _known_basis(self, k: int, tolerance: float | None, store: bool) -> Eigenbasis:
+        """All eigenpairs known, at least k, solved anew where there are fewer, or where they are less exact."""
         check_tolerance(tolerance)
         errors = self.modes.relative_errors[..., :k]
         if not self.modes.has(k) or (tolerance is not None and (errors > tolerance).any()):
@@ -172,7 +186,7 @@ class PairMethods(OperatorStorage):
         check_pair(self)
         shapes = shapes_of(self)
         if shapes:
-            bases = [shape.invariant_basis(k, tolerance=tolerance) for shape in shapes]
+            bases = [shape._known_basis(k, tolerance, False) for shape in shapes]
             return stack_eigenbases([part for basis in bases for part in unstack_eigenbases(basis)])
         return self._pair_eigenbasis(k, tolerance)
 
