@@ -121,7 +121,7 @@ def boundary_shares(
         offset = points[x, None] - start
         share = ((offset * along).sum(2) / square).clamp(0, 1)
         away = (offset - share[..., None] * along).norm(dim=2)
-        away[(x[:, None, None] == ends).any(2)] = torch.inf
+        away = torch.where((x[:, None, None] == ends).any(2), torch.inf, away)
         nearest = (away - distance[:, None]).abs().argmin(1)
         edge.append(nearest)
         where.append(share.gather(1, nearest[:, None])[:, 0])

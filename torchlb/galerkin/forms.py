@@ -44,10 +44,11 @@ FIELDS = {"stiffness": "conductivity", "mass": "density", "potential": "potentia
 class BilinearForm(NamedTuple):
     """Σ_k c_k w_kᵀA u_k of constant functions w, u (N, C) and numbers c (C,).
 
-    A is K, "stiffness"; M, "mass"; ∫cwu of the potential c, "potential"; or the mass of the vertices, "lumped".
+    A is K, "stiffness"; M, "mass"; ∫cwu of the potential c, "potential"; the sum of K, that, and the term of a
+    condition, "energy"; the boundary mass B, "boundary"; or the mass of the vertices, "lumped".
     """
 
-    name: Literal["stiffness", "mass", "potential", "lumped"]
+    name: Literal["stiffness", "mass", "potential", "energy", "boundary", "lumped"]
     w: Float[Tensor, "N C"]
     u: Float[Tensor, "N C"]
     c: Float[Tensor, " C"]
@@ -271,13 +272,14 @@ class Forms:
         return total
 
     def bilinear(self, forms: Sequence[BilinearForm], medium: Medium) -> Float[Tensor, ""]:
-        """Σ of bilinear forms, differentiable in the medium; those of "lumped", which depend on no medium, are 0."""
-        values, total = {name: self.values(field) for name, field in medium.items()}, []
+        """Σ of bilinear forms, differentiable in the medium; of "lumped" and "boundary", which depend on none, 0."""
+        values = {name: self.values(field) for name, field in medium.items()}
+        total = [torch.zeros((), dtype=torch.float64)]
         prolong = cache(
             partial(_times, self.prolongation)
         )  # a function that stands in two forms is one
         for form in forms:
-            if form.name != "lumped":
+            if form.name in FIELDS:
                 total.append(self.form(form, [prolong(form.w), prolong(form.u)], values))
         return torch.stack(total).sum()
 
@@ -286,15 +288,18 @@ class Forms:
     ) -> Float[Tensor, ""]:
         """The value of a form, from its functions at the nodes and the values of the medium; differentiable in all."""
         stiffness, corners, c = form.name == "stiffness", [form.w, form.u], form.c
-        values, density = medium.get(FIELDS.get(form.name, "")), _slopes if stiffness else _products
+        values, density = (
+            medium.get(FIELDS.get(form.name, "")),
+            _slopes if stiffness else weighted_products,
+        )
         coefficient = None if values is None else values[0]
         coefficient = self._on_curved(coefficient) if stiffness else coefficient
-        own = density(self.metric, self.element, _outer(self.nodes, nodes, c), coefficient)
+        own = density(self.metric, self.element, outer(self.nodes, nodes, c), coefficient)
         total = [own.sum() if self.shares is None else (self.shares[:, None] * own).sum()]
         for number, flat in enumerate(self.flats, 1):
             shape = simplex(self.element.dim, 1)
             metric = spread(flat_metric(flat.lengths), shape)
-            blocks = _outer(flat.cells, corners, c)
+            blocks = outer(flat.cells, corners, c)
             mean = None if values is None else values[number]
             mean = self._on_flat(mean, flat.cells, flat.lengths) if stiffness else mean
             if flat.lumped is not None and not stiffness:
@@ -335,7 +340,7 @@ def _renumbered(matrix: Any, columns: Int[Tensor, " C"], count: int) -> sparse.c
     return sparse.csr_array(parts, shape=(matrix.shape[0], count))
 
 
-def _outer(
+def outer(
     nodes: Int[Tensor, "T n"], values: list[Tensor], c: Float[Tensor, " C"]
 ) -> Float[Tensor, "T n_times_n"]:
     """Σ_k c_k w_k(i) u_k(j) for all pairs of nodes of each element."""
@@ -357,7 +362,7 @@ def _slopes(
     return element.weights * torch.stack(total).sum(0)
 
 
-def _products(
+def weighted_products(
     metric: Float[Tensor, "T Q S"],
     element: Element,
     blocks: Float[Tensor, "T n_times_n"],

@@ -24,7 +24,7 @@ from torchlb.galerkin.boundary import boundary_nodes
 from torchlb.galerkin.coarse import boundary_shares
 from torchlb.galerkin.curving import CurvedMesh, CurvingPlan, curve
 from torchlb.galerkin.elements import simplex
-from torchlb.galerkin.forms import BilinearForm, Forms
+from torchlb.galerkin.forms import BilinearForm, Forms, outer, weighted_products
 from torchlb.galerkin.medium import Medium
 from torchlb.galerkin.nodes import lagrange_nodes
 from torchlb.galerkin.prolongation import prolonged
@@ -199,8 +199,25 @@ class PairPlan:
                 nodes = dict(zip(functions, at_nodes, strict=True))
                 for form in chosen:
                     both = [nodes[id(form.w)], nodes[id(form.u)]]
-                    total.append(elements.form(form, both, values))
+                    if form.name == "boundary":
+                        total.append(self._on_boundary(form, both, fits.points, mesh))
+                    else:
+                        total.append(elements.form(form, both, values))
         return torch.stack(total).sum()
+
+    def _on_boundary(
+        self, form: BilinearForm, nodes: list[Tensor], points: Tensor, mesh: CurvedMesh
+    ) -> Float[Tensor, ""]:
+        """The value of a form of the boundary mass, as `boundary_mass` has it."""
+        cell, elements = self.curving.nodes.boundary()
+        shape = simplex(self.curving.nodes.dim - 1, self.curving.nodes.degree)
+        coarse = self.curving.coarse[cell]
+        g = metric(mesh.places, elements[~coarse], shape)
+        total = weighted_products(g, shape, outer(elements[~coarse], nodes, form.c), None).sum()
+        if mesh.cover is not None:
+            shares = boundary_shares(points, elements[coarse, :2], mesh.cover)
+            total = total + (shares[:, None] * form.w * form.u * form.c).sum()
+        return total
 
     @property
     def counts(self) -> Int[Tensor, "4 N"]:

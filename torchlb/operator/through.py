@@ -27,11 +27,15 @@ Forms = Callable[..., Sequence[BilinearForm]]
 
 
 class _Origin(NamedTuple):
-    """What the weak pair of one shape follows from: a plan at points that require a gradient, or elements; a medium."""
+    """What the weak pair of one shape follows from: a plan at points that require a gradient, or elements; a medium.
+
+    Of a Robin condition it has the square root of a at the vertices, (N, 1).
+    """
 
     points: Tensor
     medium: dict[str, Field]
     evaluated: Any
+    absorption: Tensor | None
 
     @property
     def variables(self) -> list[Tensor]:
@@ -42,7 +46,7 @@ class _Origin(NamedTuple):
     def gradient(self, forms: Sequence[BilinearForm]) -> list[Tensor]:
         """The derivative of a sum of forms in the variables; DerivativeError where it is not finite."""
         medium = plain(self.medium)
-        forms = [form for form in forms if form.name != "potential" or form.name in medium]
+        forms = [part for form in forms for part in self._parts(form)]
         points = self.points.detach().cpu().double()
         if self.points.requires_grad:
             points.requires_grad_()
@@ -57,6 +61,18 @@ class _Origin(NamedTuple):
             if total.requires_grad:  # M does not depend on the conductivity, for example
                 found = torch.autograd.grad(total, leaves, materialize_grads=True)
         return [_finite(g).to(v) for g, v in zip(found, self.variables, strict=True)]
+
+    def _parts(self, form: BilinearForm) -> list[BilinearForm]:
+        """The forms that a form is the sum of."""
+        if form.name != "energy":
+            return [form]
+        parts = [form._replace(name="stiffness")]
+        if "potential" in self.medium:
+            parts.append(form._replace(name="potential"))
+        if self.absorption is not None:
+            w, u = self.absorption * form.w, self.absorption * form.u
+            parts.append(BilinearForm("boundary", w, u, form.c))
+        return parts
 
 
 def _finite(gradient: Tensor) -> Tensor:
@@ -117,8 +133,17 @@ def origins(lb: Any) -> Origins | None:
         moved, medium = shape.points.requires_grad, shape._medium.fields(shape.num_points)
         constant = not moved and not any(f.values.requires_grad for f in medium.values())
         evaluated = None if constant else shape.plan if moved else elements_of(shape)
-        parts.append(_Origin(shape.points, medium, evaluated))
+        root = None if constant else _root_of_absorption(shape)
+        parts.append(_Origin(shape.points, medium, evaluated, root))
     return Origins(parts, [shape.num_points for shape in shapes])
+
+
+def _root_of_absorption(lb: Any) -> Tensor | None:
+    """√a of a Robin condition, from R_ii = a_i B_ii; None for another condition."""
+    values = lb.weak.values[:, lb.weak.row == lb.weak.col].cpu().double()
+    if len(values) < 4 or not values[3].any():
+        return None
+    return torch.where(values[2] != 0, values[3] / values[2], 0.0).clamp_min(0).sqrt()[:, None]
 
 
 class _Known(torch.autograd.Function):
@@ -205,10 +230,10 @@ def carrying(lb: Any, points: Any) -> Any:
     """
     if not (isinstance(points, Tensor) and points.requires_grad and torch.is_grad_enabled()):
         return lb
-    if not lb.has_weak_form or lb.weak.near.values[3:4].any() or len(lb.plan.moved):
+    if not lb.has_weak_form or len(lb.plan.moved):
         raise DerivativeError(
-            "points: they require gradients, which there are none of without a weak pair, with a Robin condition, "
-            "and of noisy curves, whose points are moved; pass points.detach() if results may be constants of them"
+            "points: they require gradients, which there are none of without a weak pair and of noisy curves, whose "
+            "points are moved; pass points.detach() if results may be constants of them"
         )
     one = torch.ones(lb.num_points, 1, dtype=torch.float64)
 
@@ -220,24 +245,21 @@ def carrying(lb: Any, points: Any) -> Any:
     known_rows = [lb.stencil.values, lb.frames, *([lb.normals] if len(lb.normals) else [])]
     lb.stencil.values, lb.frames, *normals = _Rows.apply(lb.points, lb.plan, *known_rows)  # pyright: ignore[reportGeneralTypeIssues]
     lb.normals = normals[0] if normals else lb.normals
+    if lb.weak.near.values[3:4].any():
+        lb.stencil.values = refused(
+            lb.stencil.values, "rows of Δ and ∇ with a Robin condition", points
+        )
     return lb
 
 
 def through_product(lb: Any, name: Any, f: Tensor, result: Tensor) -> Tensor:
     """The product of a matrix and f with its derivative in points and medium."""
-    if name == "boundary_mass":
-        return without(lb, result, name)
-    if name == "laplacian":  # its values say so themselves
+    if name == "laplacian":  # its values have derivatives
         return result
-
+    kind: Any = "boundary" if name == "boundary_mass" else name
     other = side_by_side(f.detach().cpu().double())
 
     def forms(g: Tensor) -> list[BilinearForm]:
-        return [BilinearForm(name, side_by_side(g), other, torch.ones_like(other[0]))]
+        return [BilinearForm(kind, side_by_side(g), other, torch.ones_like(other[0]))]
 
     return result + known(lb, [torch.zeros_like(result)], forms)[0]
-
-
-def energy(w: Tensor, u: Tensor, c: Tensor) -> list[BilinearForm]:
-    """Σ_k c_k w_kᵀ(K + C)u_k; the matrix C of a potential counts where there is one."""
-    return [BilinearForm("stiffness", w, u, c), BilinearForm("potential", w, u, c)]

@@ -13,7 +13,7 @@ from torchlb.linalg.exponential import chebyshev_vectors, poles, rational_coeffi
 from torchlb.linalg.once import once_differentiable
 from torchlb.operator.laplace_beltrami import LaplaceBeltrami
 from torchlb.operator.systems import pair_system
-from torchlb.operator.through import Origins, energy, origins
+from torchlb.operator.through import Origins, origins
 from torchlb.pde.checks import uncompiled
 
 
@@ -124,7 +124,7 @@ def _forms(
             smooth = (v[k - 1] + advanced) / 2
             weight = torch.full((len(chosen),), 2.0 if k == 1 else 4.0, dtype=x.dtype)
             forms += [
-                *energy(solved, smooth, -pole * weight),
+                BilinearForm("energy", solved, smooth, -pole * weight),
                 BilinearForm("mass", solved, v[k - 1] - smooth, weight),
             ]
     return forms

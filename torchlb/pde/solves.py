@@ -19,7 +19,7 @@ from torchlb.operator.checks import check_tolerance
 from torchlb.operator.laplace_beltrami import LaplaceBeltrami
 from torchlb.operator.pair_methods import check_pair
 from torchlb.operator.systems import means, solve_columns
-from torchlb.operator.through import Origins, energy, origins, without
+from torchlb.operator.through import Origins, origins, without
 from torchlb.pde.checks import as_columns, as_times, uncompiled
 
 TOLERANCE = 1e-10
@@ -276,12 +276,15 @@ class _Solve(torch.autograd.Function):
             one = torch.ones_like(w[0])
             if time is None:
                 forms = [
-                    *energy(w, whole, -one),
+                    BilinearForm("energy", w, whole, -one),
                     BilinearForm("mass", w, f - means(lb, b), one),
                     BilinearForm("mass", means(lb, g), u, -one),
                 ]
             else:
-                forms = [*energy(w, whole, -time), BilinearForm("mass", w, f - whole, one)]
+                forms = [
+                    BilinearForm("energy", w, whole, -time),
+                    BilinearForm("mass", w, f - whole, one),
+                ]
             gradients = found.gradient(forms)
         return w, grad_t, None, None, None, None, None, *gradients
 
