@@ -34,7 +34,15 @@ LAYERS = {
 }
 OF_DATA = {"save_operator", "to_scipy", "unbatch", "check_points", "at", "with_medium"}
 """What returns no tensors, or operators."""
-OF_THE_SHAPE = {"adjoint", "divergence", "frames", "gradient", "hessian", "local_gradient", "mass"}
+OF_THE_SHAPE = {
+    "curvatures",
+    "divergence",
+    "frames",
+    "gradient",
+    "hessian",
+    "local_gradient",
+    "mass",
+}
 OF_THE_SHAPE |= {"matrix", "mean_curvature_normal", "normals", "points", "forward", "laplacian"}
 OF_THE_SHAPE |= {"geodesic_distance", "GradientFeatures"}
 """What no medium has a part in."""
@@ -82,6 +90,9 @@ def tensors(result):
         return [dense] if dense.is_floating_point() else []
     if isinstance(result, torchlb.Eigenbasis):
         return [result.eigenvalues, result.eigenvectors, result.left]
+    if isinstance(result, torchlb.Curvatures):
+        names = "k1", "k2", "mean", "gaussian", "curvedness", "shape_index", "directions"
+        return [getattr(result, name) for name in names]
     if isinstance(result, (list, tuple)):
         return [t for part in result for t in tensors(part)]
     return []
@@ -91,7 +102,8 @@ def is_told(value, variable):
     """Whether the gradient is finite and not zero, or an error."""
     weight = torch.arange(1.0, value.numel() + 1).view(value.shape).to(value)
     try:
-        (g,) = torch.autograd.grad((weight * value).square().sum(), variable, allow_unused=True)
+        result = (weight * value).square().sum()
+        (g,) = torch.autograd.grad(result, variable, allow_unused=True, retain_graph=True)
     except DerivativeError:
         return True
     except RuntimeError:  # it does not require a gradient

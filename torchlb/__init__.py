@@ -36,6 +36,7 @@ from torchlb.nn.poisson_block import PoissonBlock, PoissonFeatures
 from torchlb.nn.spectral_conv import SpectralConv
 from torchlb.operator.cleaning import clean_mesh, clean_points
 from torchlb.operator.collate import collate
+from torchlb.operator.curvature import Curvatures
 from torchlb.operator.laplace_beltrami import LaplaceBeltrami
 from torchlb.operator.report import StencilReport
 from torchlb.pde.geodesics import geodesic_distance
@@ -55,6 +56,7 @@ from torchlb.version import __version__
 __all__ = [
     "CacheWarning",
     "Certificate",
+    "Curvatures",
     "DerivativeError",
     "Diffusion",
     "DiffusionError",

@@ -9,6 +9,7 @@ from torch import Tensor
 from torchlb.errors import InputError
 from torchlb.geometry.boundary import boundary_faces
 from torchlb.linalg.checks import check_tensor
+from torchlb.operator.curvature import Curvatures, curvatures_of
 from torchlb.operator.report import StencilReport
 from torchlb.operator.storage import OperatorStorage
 
@@ -40,13 +41,6 @@ class StencilMethods(OperatorStorage):
     def __matmul__(self, f: Tensor) -> Tensor:
         """``lb @ f`` is ``lb(f)``."""
         return self(f)
-
-    def adjoint(self, f: Float[Tensor, "*batch N C"] | Float[Tensor, " N"]) -> Tensor:
-        """Lᵀf, of the shape of f, for the matrix L of Δ: Σ_i (Δg)_i f_i = Σ_i g_i (Lᵀf)_i for all g.
-
-        In the inner product of the mass π the adjoint is Lᵀ(πf)/π.
-        """
-        return self.stencil.product(0, f, transposed=True)
 
     def local_gradient(self, f: Tensor) -> Tensor:
         """∇f in the frames, (N, d, C) for f (N, C), (N, d) for (N,), (B, N, d, C) for (B, N, C). Units of f by 1/ℓ."""
@@ -117,6 +111,21 @@ class StencilMethods(OperatorStorage):
         row = self.stencil.row[on_boundary[self.stencil.col]]
         free = torch.ones_like(on_boundary).index_fill(0, row, False)[:, None]
         return torch.where(free, normal, self.divergence(self.gradient(self.points)))
+
+    def curvatures(self) -> Curvatures:
+        """Principal, mean and Gaussian curvature of a surface in R³, of the order p of the operator.
+
+        They are those of the derivative of the normals by the rows of ∇, on meshes and clouds; at low-order rows
+        (`report`) of first order at best. Signs are those of the normals: positive on a sphere with outer ones.
+        Differentiable in the points. Raises InputError for other shapes.
+
+        >>> from torchlb.surfaces import Sphere
+        >>> from torchlb import LaplaceBeltrami
+        >>> found = LaplaceBeltrami.from_mesh(*Sphere(2.0).mesh(500)).curvatures()
+        >>> bool((found.gaussian - 0.25).abs().max() < 1e-3 and (found.mean - 0.5).abs().max() < 1e-3)
+        True
+        """
+        return curvatures_of(self)
 
     def _boundary_points(self) -> Bool[Tensor, " N"]:
         """Mask of the boundary points, whether or not a condition holds there."""
