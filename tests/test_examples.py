@@ -181,6 +181,10 @@ GALLERY = {  # options of a small run, and what it prints
     "match_bodies": (["--points", "150", "--k", "30"], "refined, torchlb: half of the points "),
     "cotangent_vs_orders": (["--points", "960"], "   cotangent     order 1     order 3"),
     "cortical_eigenmodes": (["--points", "400", "--k", "10"], "     torchlb        LaPy   cosine"),
+    "heterogeneous_modes": (
+        ["--points", "400", "--k", "10"],
+        "heat later, κ = 9 up and down: ",
+    ),
     "diffusion_distances": (["--points", "400", "--k", "40"], "on a sphere of 400 points: 1"),
     "signatures_matching": (["--points", "300", "--k", "40"], "wave kernel signature: "),
     "wavelets": (["--points", "400", "--k", "40"], "low-pass: "),
