@@ -111,7 +111,8 @@ def lanczos(
         h, end = np.pad(h, (0, BLOCK)), end + BLOCK
         z = np.ascontiguousarray(solve(np.ascontiguousarray(mz.T)).T)
     raise EigenbasisError(
-        f"eigenbasis: block Lanczos did not find {k} pairs of {size} points to {tolerance:.1g}; ask for fewer"
+        f"eigenbasis: block Lanczos did not find {k} pairs of {size} points to {tolerance:.1g}; ask for fewer, or "
+        "for a medium of less contrast"
     )
 
 
