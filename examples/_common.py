@@ -72,6 +72,14 @@ def smooth_cortex(points, levels):
     return f"{name}, made smooth", smoothed(vertices, faces, points, levels)[0]
 
 
+def normals(vertices, faces):
+    """Normals of the triangles, twice as long as their areas, and unit ones of the vertices: the means around them."""
+    a, b, c = vertices[faces].unbind(1)
+    flat = torch.linalg.cross(b - a, c - a)
+    mean = torch.zeros_like(vertices).index_add_(0, faces.flatten(), flat.repeat_interleave(3, 0))
+    return flat, torch.nn.functional.normalize(mean)
+
+
 def minimize(loss, unknowns, steps):
     """LBFGS with a line search, in place."""
     optimizer = torch.optim.LBFGS(

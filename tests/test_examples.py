@@ -193,6 +193,14 @@ GALLERY = {  # options of a small run, and what it prints
         "           torchlb ",
     ),
     "find_heat_source": (["--points", "150", "--level", "2", "--steps", "5"], "         torchlb "),
+    "mean_curvature_flow": (
+        ["--points", "300", "--steps", "4", "--sphere", "60", "--times", "1"],
+        "it falls in 20 of 20 steps",
+    ),
+    "isospectralization": (
+        ["--points", "150", "--steps", "3", "--k", "8"],
+        "0 of 296 triangles flipped",
+    ),
     "diffusion_maps": (["--points", "400"], "correlation of coordinate 2 with cos(π width): 0.99"),
     "train_pyg": (["--points", "150", "--epochs", "2"], "right on a shape never seen: "),
     "spectral_gallery": (["--points", "400", "--k", "40"], "Eigenbasis(40 pairs of 400 points"),

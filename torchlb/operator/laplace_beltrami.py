@@ -269,9 +269,8 @@ class LaplaceBeltrami(StencilMethods, PairMethods):
         Parameters
         ----------
         points
-            (N, n), ℓ, in the order of those that the operator was built from. If they require a gradient, it comes by
-            eigenvalues, the mass, and `product` with "stiffness" and "mass"; where another result is asked for one, it
-            raises DerivativeError.
+            (N, n), ℓ, in the order of those that the operator was built from. If they require a gradient, results are
+            differentiable in them; those that are not raise DerivativeError where they are asked for one.
 
         Raises InputError for another shape, where there is no `plan`, and with a certificate.
 
