@@ -30,7 +30,7 @@ from torchlb.operator.medium import checked_fields, pair_in, split_fields
 from torchlb.operator.options import Options
 from torchlb.operator.pair_methods import PairMethods
 from torchlb.operator.parts import MediumFields, Modes, PairMatrices
-from torchlb.operator.plan import Plan, evaluate
+from torchlb.operator.plan import Plan, check_fit, evaluate
 from torchlb.operator.stencil_methods import StencilMethods
 from torchlb.operator.storage import FIT_FIELDS, ROW_FIELDS
 from torchlb.operator.through import carrying, origins
@@ -228,9 +228,7 @@ class LaplaceBeltrami(StencilMethods, PairMethods):
         check_alike(shapes)
         sizes = [n for shape in shapes for n in shape.sizes or (shape.num_points,)]
         if all(shape.has_weak_form for shape in shapes):
-            _ = [
-                shape.weak.radius for shape in shapes
-            ]  # where one was loaded, it is computed here, once
+            _ = [shape.weak.radius for shape in shapes]  # computed here, once, where one was loaded
         state = join_states([shape.get_extra_state() for shape in shapes], sizes)
         bases = [shape._basis for shape in shapes if shape._basis and not shape.sizes]
         with torch.inference_mode(False):
@@ -247,7 +245,7 @@ class LaplaceBeltrami(StencilMethods, PairMethods):
         Raises InputError for batches, the cotangent operator, and operators without a weak pair.
         """
         if self._plan is None and self.source in ("mesh", "points") and self.has_weak_form:
-            self._plan = built_again(self).plan
+            self._plan, self._planned = built_again(self).plan, None
         if self._plan is None:
             raise InputError(
                 f"plan: an operator of kind {self.source!r} has none, nor has one without a weak pair; those of "
@@ -272,7 +270,8 @@ class LaplaceBeltrami(StencilMethods, PairMethods):
             (N, n), ℓ, in the order of those that the operator was built from. If they require a gradient, results are
             differentiable in them; those that are not raise DerivativeError where they are asked for one.
 
-        Raises InputError for another shape, where there is no `plan`, and with a certificate.
+        Warns where edges changed by more than three times against the others. Raises InputError for another shape,
+        cells turned inside out, where there is no `plan`, and with a certificate.
 
         >>> from torchlb.surfaces import Sphere
         >>> lb = LaplaceBeltrami.from_mesh(*Sphere().mesh(200))
@@ -285,9 +284,13 @@ class LaplaceBeltrami(StencilMethods, PairMethods):
             raise InputError(
                 f"points: expected {tuple(self.points.shape)}, as the operator has, got {tuple(there.shape)}"
             )
+        plan = self.plan
+        planned = self.points.detach().cpu().double() if self._planned is None else self._planned
+        check_fit(planned, there, plan.faces)
         with torch.inference_mode(False):
-            built = replace(evaluate(self.plan, there), surface=self.surface, plan=self.plan)
+            built = replace(evaluate(plan, there), surface=self.surface, plan=plan)
             lb = self._from_assembled(built, points).to(self.device)
+        lb._planned = planned
         lb = carrying(lb, points)
         if not self._in_medium:
             return lb
@@ -336,14 +339,11 @@ class LaplaceBeltrami(StencilMethods, PairMethods):
             medium, lb = checked_fields(self, given), self._alias()
             lb.weak = pair_in(self, medium.fields(self.num_points))
             lb.modes, lb._medium, lb._in_medium = Modes(None, self.mass), medium, True
-        lb._plan, lb.cache.elements = self._plan, self.cache.elements
+        lb._plan, lb._planned, lb.cache.elements = self._plan, self._planned, self.cache.elements
         return lb
 
     def unbatch(self) -> list[LaplaceBeltrami]:
-        """The operators of the shapes of a `batch`, with their certificates, spectral radii and eigenbases.
-
-        They have weak pairs only if all shapes of the batch had one.
-        """
+        """The operators of the shapes of a `batch`, with weak pairs only if all shapes of the batch had one."""
         if self.sizes is None or self._states is None:
             raise InputError(f"unbatch: expected a batch of operators, got one from {self.source}")
         basis = self._basis

@@ -10,16 +10,18 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache
+from itertools import combinations
 
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from torchlb.errors import DerivativeError, InputError, renumbered
+from torchlb.errors import DerivativeError, InputError, first_few, renumbered, warn
 from torchlb.galerkin.forms import BilinearForm, Forms
 from torchlb.galerkin.medium import Medium
 from torchlb.galerkin.pair import PairPlan
 from torchlb.geometry.numbering import Numbering
+from torchlb.geometry.thresholds import FACTOR
 from torchlb.linalg.threads import threads_for
 from torchlb.operator.assembled import AssembledOperator
 from torchlb.operator.options import Options
@@ -148,6 +150,37 @@ def evaluate(plan: Plan, points: Float[Tensor, "N n"]) -> AssembledOperator:
         rows, shape = plan._rows(placed, pair.mass)
     built = AssembledOperator.of(rows, shape, pair, plan.source, options.plain, plan.pair.counts)
     return built.restored(plan.numbering, points, plan.faces)
+
+
+def check_fit(
+    before: Float[Tensor, "N n"], after: Float[Tensor, "N n"], cells: Int[Tensor, "F corners"]
+) -> None:
+    """Warn where edges changed by more than `FACTOR` against all others, as what was decided may not fit there.
+
+    Raises InputError where triangles of the plane, or tetrahedra of space, were turned inside out.
+    """
+    edges = torch.cat([cells[:, [a, b]] for a, b in combinations(range(cells.shape[1]), 2)])
+    one, two = ((x[edges[:, 1]] - x[edges[:, 0]]).norm(dim=1) for x in (before, after))
+    stretch = torch.where(one > 0, two / one, 1.0)
+    change = stretch / stretch.median()
+    changed = edges[(change > FACTOR) | (change < 1 / FACTOR)].unique()
+    if len(changed):
+        warn(
+            f"at: {len(changed)} points ({first_few(changed)}) have edges that grew or shrank by more than "
+            f"{FACTOR:.0f} times against the others since neighbours, degrees and cells were decided; build the "
+            "operator of these points anew"
+        )
+    if cells.shape[1] == before.shape[1] + 1:
+        signs = (
+            torch.linalg.det(x[cells[:, 1:]] - x[cells[:, :1]]).sign() for x in (before, after)
+        )
+        product = torch.stack(list(signs)).prod(0)
+        inverted = cells[(product * product.sum().sign()) < 0].unique()
+        if len(inverted):
+            raise InputError(
+                f"points: cells at {len(inverted)} of them ({first_few(inverted)}) are turned inside out; smaller "
+                "steps, or other cells, are needed"
+            )
 
 
 def stencils_of(shape: Shape, options: Options) -> Stencils:

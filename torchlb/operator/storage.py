@@ -63,6 +63,7 @@ class OperatorStorage(Tensors):
         )
         self._in_medium = self._carries = False  # whether shapes of a batch require gradients
         self._plan: Any = None
+        self._planned: Tensor | None = None  # the points that the plan was made at, if others
         self._cache: OperatorCache | None = None
         self._medium = MediumFields({})
         self.stencil, self.weak, self.modes = Csr(order_t=whole), PairMatrices(), Modes(None, none)
@@ -71,7 +72,7 @@ class OperatorStorage(Tensors):
 
     def __getstate__(self) -> dict[str, Any]:
         """State for copies and files, without the plan, which is made again on demand, and the cache."""
-        return {**self.__dict__, "_plan": None, "_cache": None}
+        return {**self.__dict__, "_plan": None, "_planned": None, "_cache": None}
 
     @property
     def cache(self) -> OperatorCache:
@@ -229,6 +230,6 @@ class OperatorStorage(Tensors):
                     f"{len(theirs)} others; leave it out of the state to keep the one that is there"
                 )
         vectors = state_dict.get(f"{prefix}modes.eigenvectors")
-        self._plan = self._cache = None
+        self._plan = self._planned = self._cache = None
         super()._load_from_state_dict(state_dict, prefix, *given)
         self._hold(Modes(None, self.mass, stored=vectors is not None), vectors)

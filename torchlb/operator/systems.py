@@ -24,6 +24,7 @@ from scipy import sparse
 from scipy.sparse import csgraph
 from torch import Tensor
 
+from torchlb.errors import DiffusionError
 from torchlb.linalg.conjugate_gradients import Linear, conjugate_gradients
 from torchlb.linalg.factor import Factor
 from torchlb.linalg.precision import LOW, NEGLIGIBLE, SINGLE, TINY
@@ -285,7 +286,13 @@ class PairSystem:
             free = self.free[:, 0].cpu().numpy()
             keep = sparse.diags_array(free)
             matrix = keep @ matrix @ keep + sparse.diags_array((1 - free) * matrix.diagonal())
-        return Factor(sparse.csr_array((matrix + matrix.T) / 2))
+        try:
+            return Factor(sparse.csr_array((matrix + matrix.T) / 2))
+        except RuntimeError as error:  # a pivot of zero
+            raise DiffusionError(
+                "solves: the matrix is singular to rounding, as where cells are degenerate, or a shape moved too far "
+                "from where its plan was made (lb.at); build the operator anew"
+            ) from error
 
     def mean(self, b: Float[Tensor, "N C"]) -> Float[Tensor, "_ C"]:
         """1ᵀb over the area of each component where K1 = 0, one row if there is one component."""
