@@ -81,7 +81,7 @@ built = cache(lambda name: MESHES[name]())
 @pytest.mark.filterwarnings("ignore:.*low-order rows")
 @pytest.mark.parametrize("name", MESHES)
 def test_at_the_same_points_it_is_the_operator(name):
-    """Every matrix, the mass, frames, normals and the report, to 1e-12 of the largest entry; splines to 1e-10, order 5 to 2e-12."""
+    """Every matrix, the mass, frames, normals, the report, to 1e-12 of the largest entry; order 5, splines to more."""
     lb, bound = built(name), {"splines": 1e-10, "order 5": 2e-12}.get(name, 1e-12)
     again = lb.at(lb.points)
     for key, ours in lb.tensors.items():
