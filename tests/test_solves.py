@@ -188,20 +188,49 @@ def test_data_of_a_boundary_enter_with_the_order(condition, data):
     assert (fine < coarse / 8).all()
 
 
-@pytest.mark.parametrize("solve", [implicit_step, heat_flow])
-def test_second_derivatives_are_an_error(solve):
+def test_second_derivatives_of_flows_and_media_are_an_error():
     """And not half of what they should be."""
     lb = BUILDERS["cotangent"]()
     t = torch.tensor(0.1, dtype=torch.float64, requires_grad=True)
-    x = lb.points[:, 0].clone().requires_grad_()
-    slopes = torch.autograd.grad(solve(lb, x, t).pow(2).sum(), (x, t), create_graph=True)
-    for slope in slopes:
-        with pytest.raises(RuntimeError, match="differentiable once"):
-            slope.sum().backward(retain_graph=True)
+    x, kappa = (lb.points[:, 0].exp().clone().requires_grad_() for _ in range(2))
+    flow = heat_flow(lb, x, t).pow(2).sum()
+    step = implicit_step(lb, x, t, conductivity=kappa).pow(2).sum()
+    for slopes in (
+        torch.autograd.grad(flow, (x, t), create_graph=True),
+        torch.autograd.grad(step, (x, t, kappa), create_graph=True),
+    ):
+        for slope in slopes:
+            with pytest.raises(RuntimeError, match="differentiable once"):
+                slope.sum().backward(retain_graph=True)
     with pytest.raises(RuntimeError, match="differentiable once"):
-        torch.autograd.functional.hessian(lambda s: solve(lb, s * x.detach(), 0.1).pow(2).sum(), t)
+        torch.autograd.functional.hessian(
+            lambda s: heat_flow(lb, s * x.detach(), 0.1).pow(2).sum(), t
+        )
     with pytest.raises(RuntimeError, match="linear: the derivative in a direction"):
-        torch.autograd.functional.jvp(lambda f: solve(lb, f, 0.1), x.detach(), x.detach())
+        torch.autograd.functional.jvp(lambda f: heat_flow(lb, f, 0.1), x.detach(), x.detach())
+
+
+@pytest.mark.parametrize("condition", ["neumann", "dirichlet"])
+def test_second_derivatives_of_solves(condition):
+    """In f and t, with boundary data; the derivative in a direction is the solution for it."""
+    lb = disk(40, condition)
+    data = {"boundary_values": 0.5} if condition == "dirichlet" else {"flux": 0.3}
+    f = torch.randn(40, 2, dtype=torch.float64, requires_grad=True)
+    t = torch.tensor([0.1, 0.3], dtype=torch.float64, requires_grad=True)
+
+    def step(f, t):
+        return implicit_step(lb, f, t, tolerance=1e-13, **data)
+
+    def squared(f):
+        return poisson_solve(lb, f, tolerance=1e-13, **data).square()
+
+    assert torch.autograd.gradgradcheck(step, (f, t), fast_mode=True)
+    assert torch.autograd.gradgradcheck(squared, (f,), fast_mode=True)
+    way = torch.randn(40, dtype=torch.float64)
+    _, along = torch.autograd.functional.jvp(
+        lambda g: implicit_step(lb, g, 0.1), lb.points[:, 0].clone(), way
+    )
+    torch.testing.assert_close(along, implicit_step(lb, way, 0.1), rtol=1e-6, atol=1e-8)
 
 
 @pytest.mark.parametrize("solve", [implicit_step, heat_flow])

@@ -13,6 +13,7 @@ from scipy import sparse
 from torch.autograd import grad, gradcheck, gradgradcheck
 
 from tolerances import TOLERANCE
+from torchlb import LaplaceBeltrami
 from torchlb.linalg.sparse import (
     _product_op,
     _values_gradient_op,
@@ -21,6 +22,7 @@ from torchlb.linalg.sparse import (
     to_scipy,
     transpose_pattern,
 )
+from torchlb.surfaces import Sphere
 
 needs_compiler = pytest.mark.skipif(
     not any(map(shutil.which, ("c++", "g++", "clang++", "cl"))),
@@ -240,3 +242,26 @@ print(sum("Sparse CSR" in str(each.message) for each in said))
         text = program.replace("MINE", str(mine))
         done = subprocess.run([sys.executable, "-c", text], capture_output=True, text=True)
         assert done.stdout.strip() == str(count), done.stderr
+
+
+@pytest.mark.parametrize("name", ["stiffness", "laplacian", "gradient"])
+def test_products_under_the_transforms_of_torch_func(name):
+    """grad, jvp, vmap, a Hessian, and vmap of grad, as by autograd and by linearity."""
+    lb = LaplaceBeltrami.from_mesh(*Sphere().mesh(60))
+    f, way = torch.randn(2, 60, 2, dtype=torch.float64)
+
+    def product(x):
+        return lb.gradient(x) if name == "gradient" else lb.product(name, x)
+
+    def energy(x):
+        return product(x).square().sum()
+
+    leaf = f.clone().requires_grad_()
+    (expected,) = torch.autograd.grad(energy(leaf), leaf)
+    torch.testing.assert_close(torch.func.grad(energy)(f), expected)
+    torch.testing.assert_close(torch.func.jvp(product, (f,), (way,))[1], product(way))
+    both = torch.stack([f, way])
+    torch.testing.assert_close(torch.func.vmap(product)(both)[1], product(way))
+    torch.testing.assert_close(torch.func.vmap(torch.func.grad(energy))(both)[0], expected)
+    curvature = torch.func.hessian(lambda x: energy(x[:, None]))(f[:, 0])
+    torch.testing.assert_close(curvature @ way[:, 0], torch.func.grad(energy)(way)[:, 0])

@@ -41,7 +41,7 @@ class _Last(torch.autograd.Function):
     @staticmethod
     def backward(ctx: Any, *grads: Any) -> Any:
         raise DerivativeError(
-            "second derivatives of a solve, of heat flow or of a conductivity: they are differentiable once, by "
+            "second derivatives of heat flow, or in points or medium: they are differentiable once, by "
             "backward(); torch.autograd.functional.jvp goes back twice, too. In f they are linear: the derivative in a "
             "direction is what they make of that direction; in other data take vjp, or a difference quotient"
         )

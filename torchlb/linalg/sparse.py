@@ -20,6 +20,8 @@ from scipy import sparse
 from torch import Tensor
 from torch.nn.functional import embedding_bag
 
+from torchlb.errors import InputError
+
 
 def transpose_pattern(
     crow: Int[Tensor, " rows_plus_1"],
@@ -185,21 +187,50 @@ def _values_gradient_backward(ctx: Any, grad: Tensor, product: Any) -> Any:
 
 
 class _Product(torch.autograd.Function):
+    """A x in eager mode, also under the transforms of `torch.func`."""
+
     @staticmethod
-    def forward(ctx: Any, *inputs: Any) -> Tensor:
-        _save(ctx, inputs)
+    def forward(*inputs: Any) -> Tensor:  # pyright: ignore[reportIncompatibleMethodOverride]
         return _product(*inputs)
+
+    @staticmethod
+    def setup_context(ctx: Any, inputs: Any, output: Any) -> None:  # pyright: ignore[reportIncompatibleMethodOverride]
+        _save(ctx, inputs)
+        ctx.save_for_forward(*inputs[:7])
 
     @staticmethod
     def backward(ctx: Any, grad: Tensor) -> Any:  # pyright: ignore[reportIncompatibleMethodOverride]
         return _product_backward(ctx, grad, _Product.apply, _ValuesGradient.apply)
 
+    @staticmethod
+    def jvp(ctx: Any, *tangents: Any) -> Any:  # pyright: ignore[reportIncompatibleMethodOverride]
+        *pattern, values, x = ctx.saved_tensors
+        pairs = (values, tangents[6]), (tangents[5], x)
+        parts: Any = [
+            _Product.apply(*pattern, *pair, ctx.transposed)
+            for pair in pairs
+            if not any(part is None for part in pair)
+        ]
+        return sum(parts[1:], parts[0])
+
+    @staticmethod
+    def vmap(info: Any, in_dims: Any, *inputs: Any) -> tuple[Tensor, int]:  # pyright: ignore[reportIncompatibleMethodOverride]
+        *rest, x, transposed = inputs
+        if any(place is not None for place in in_dims[:6]):
+            raise InputError("vmap: over functions, (B, N, C), not over matrices; use a batch")
+        x = x.movedim(in_dims[6], 1)  # (N, B, C)
+        result: Any = _Product.apply(*rest, x.flatten(1), transposed)
+        return result.unflatten(1, x.shape[1:]), 1
+
 
 class _ValuesGradient(torch.autograd.Function):
     @staticmethod
-    def forward(ctx: Any, *inputs: Any) -> Tensor:
-        _save(ctx, inputs)
+    def forward(*inputs: Any) -> Tensor:  # pyright: ignore[reportIncompatibleMethodOverride]
         return _values_gradient(*inputs)
+
+    @staticmethod
+    def setup_context(ctx: Any, inputs: Any, output: Any) -> None:  # pyright: ignore[reportIncompatibleMethodOverride]
+        _save(ctx, inputs)
 
     @staticmethod
     def backward(ctx: Any, grad: Tensor) -> Any:  # pyright: ignore[reportIncompatibleMethodOverride]

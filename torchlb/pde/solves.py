@@ -264,29 +264,42 @@ class _Solve(torch.autograd.Function):
         return u
 
     @staticmethod
-    @once_differentiable
     def backward(ctx: Any, g: Tensor) -> tuple[Any, ...]:  # pyright: ignore
-        time, u, b, f, given, *_ = ctx.saved_tensors
         lb, found, tolerance = ctx.rest
-        w = solve_columns(lb, g, time, tolerance).to(g.dtype)  # pyright: ignore[reportCallIssue]
-        whole, grad_t, gradients = u if given is None else u + given, None, []
-        if time is not None and ctx.needs_input_grad[1]:
-            grad_t = -(w * _product(lb, 0, u)).sum(0).to(time)
         if found is not None:
-            one = torch.ones_like(w[0])
-            if time is None:
-                forms = [
-                    BilinearForm("energy", w, whole, -one),
-                    BilinearForm("mass", w, f - means(lb, b), one),
-                    BilinearForm("mass", means(lb, g), u, -one),
-                ]
-            else:
-                forms = [
-                    BilinearForm("energy", w, whole, -time),
-                    BilinearForm("mass", w, f - whole, one),
-                ]
-            gradients = found.gradient(forms)
-        return w, grad_t, None, None, None, None, None, *gradients
+            return _gradients_in_all(ctx, g)
+        time, u, *_ = ctx.saved_tensors
+        w = _solve(g, time, None, None, lb, None, tolerance)
+        return w, _in_time(ctx, lb, w, u), None, None, None, None, None
+
+
+def _in_time(ctx: Any, lb: LaplaceBeltrami, w: Tensor, u: Tensor) -> Tensor | None:
+    """The gradient in the times, where it is asked for."""
+    if not ctx.needs_input_grad[1]:
+        return None
+    return -(w * _product(lb, 0, u)).sum(0).to(ctx.saved_tensors[0])
+
+
+@once_differentiable
+def _gradients_in_all(ctx: Any, g: Tensor) -> tuple[Any, ...]:
+    """The gradients in data, times, points and medium, of which there are no second ones."""
+    time, u, b, f, given, *_ = ctx.saved_tensors
+    lb, found, tolerance = ctx.rest
+    w, one = solve_columns(lb, g, time, tolerance).to(g.dtype), torch.ones_like(g[0])
+    whole = u if given is None else u + given
+    if time is None:
+        forms = [
+            BilinearForm("energy", w, whole, -one),
+            BilinearForm("mass", w, f - means(lb, b), one),
+            BilinearForm("mass", means(lb, g), u, -one),
+        ]
+    else:
+        forms = [
+            BilinearForm("energy", w, whole, -time),
+            BilinearForm("mass", w, f - whole, one),
+        ]
+    none = (None,) * 5
+    return w, _in_time(ctx, lb, w, u), *none, *found.gradient(forms)
 
 
 _solve: Any = _Solve.apply
