@@ -162,7 +162,7 @@ class PairMethods(OperatorStorage):
         if origins(self) is None:
             return basis
         held = {
-            name: without(self, getattr(basis, name), "invariant_basis")
+            name: without(self, getattr(basis, name), "invariant_basis and the deflated flow")
             for name in ("eigenvalues", "eigenvectors", "left")
         }
         return replace(basis, **held)
