@@ -9,6 +9,7 @@ import torch
 from scipy.spatial import Delaunay
 from scipy.special import pro_cv
 
+from noise import noise
 from torchlb import (
     DerivativeError,
     DiffusionNet,
@@ -24,10 +25,6 @@ from torchlb.galerkin.medium import Field
 from torchlb.surfaces import Ellipsoid, Sphere, Torus, UnitDisk
 
 H = 1e-6
-
-
-def noise(*shape, seed=0):
-    return torch.randn(*shape, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
 
 
 def build(kind, n=80):
@@ -321,6 +318,23 @@ def test_a_batch_in_a_medium_is_its_shapes_in_theirs():
         implicit_step(together.float(), f.float(), 0.1)
     with pytest.raises(InputError, match="one of each vertex or face of the shapes"):
         batch.with_medium(kappa[1:])
+
+
+def test_batches_of_batches_reach_the_fields_of_their_shapes():
+    """By eigenvalues and a solve; where the shapes of an inner batch are not known, that is an error."""
+    one, two = build("mesh", 40), build("mesh", 60)
+    kappa, f = (0.5 * noise(40)).exp().requires_grad_(), noise(140, 2)
+    alone, inner = one.with_medium(kappa), LaplaceBeltrami.batch([one.with_medium(kappa), two])
+    outer = LaplaceBeltrami.batch([inner, one])
+    for value in (
+        lambda lb: implicit_step(lb, f[: lb.num_points], 0.1, tolerance=1e-12)[:40].square().sum(),
+        lambda lb: lb.eigenbasis(5, tolerance=1e-11).eigenvalues.view(-1)[:5].sum(),
+    ):
+        grads = [torch.autograd.grad(value(lb), kappa)[0] for lb in (outer, alone)]
+        assert grads[1].abs().max() > 0
+        torch.testing.assert_close(*grads, rtol=1e-5, atol=1e-8)
+    with pytest.raises(DerivativeError, match="does not know the shapes"):
+        LaplaceBeltrami.batch([inner.float(), one.float()])
 
 
 def test_what_a_medium_leaves_and_what_travels():

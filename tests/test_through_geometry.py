@@ -7,6 +7,7 @@ import pytest
 import torch
 from scipy.spatial import Delaunay
 
+from noise import noise
 from torchlb import (
     DerivativeError,
     Diffusion,
@@ -21,10 +22,6 @@ from torchlb import (
 from torchlb.surfaces import Ellipsoid, Hemisphere, Sphere, Torus
 
 H = 1e-6
-
-
-def noise(*shape, seed=0):
-    return torch.randn(*shape, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
 
 
 def rough(points, faces=None, **options):

@@ -116,9 +116,8 @@ def in_cells(
     places = {1: [[0]], 3: [[0, 1], [1, 2]], 6: [[0, 1, 2], [1, 3, 4], [2, 4, 5]]}
     r = torch.linalg.cholesky_ex(g[..., places[g.shape[-1]]], upper=True).L.clone()
     others = r.diagonal(dim1=-2, dim2=-1)[..., :-1].prod(-1)
-    r[..., -1, -1] = (
-        area_element(g) / others
-    )  # rounded as for numbers: needles have hardly any area
+    # rounded as for numbers: needles have hardly any area
+    r[..., -1, -1] = area_element(g) / others
     one = torch.eye(r.shape[-1], dtype=r.dtype).expand_as(r)
     inverse = torch.linalg.solve_triangular(r, one, upper=True)
     row, col = torch.triu_indices(*r.shape[-2:])

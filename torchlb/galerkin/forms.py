@@ -167,13 +167,14 @@ class Forms:
         """Build flat P1 elements, whose stiffness for κ = 1 is the cotangent matrix, with a lumped mass."""
         lengths, element = edge_lengths(points, faces), simplex(faces.shape[1] - 1, 1)
         corners, same = faces.shape[1], sparse.eye_array(len(points), format="csr")
-        area = area_element(flat_metric(lengths)) * element.weights.sum() / corners
+        g = flat_metric(lengths)
+        area = area_element(g) * element.weights.sum() / corners
         shares = torch.zeros_like(mass).index_add(
             0, faces.flatten(), area.repeat_interleave(corners)
         )
         whole: Any = sparse.eye_array(len(faces), format="csr")
         flats = [FlatCells(faces, lengths, 1.0, mass / shares, whole)]
-        metric = flat_metric(lengths[:0])[:, None].expand(-1, len(element.weights), -1)
+        metric = spread(g[:0], element)
         curved = faces[:0], lengths[:0], faces[:0, 0], len(faces), same, faces[:0], metric, element
         return cls(points, points, *curved, None, flats)
 
@@ -275,9 +276,8 @@ class Forms:
         """Σ of bilinear forms, differentiable in the medium; of "lumped" and "boundary", which depend on none, 0."""
         values = {name: self.values(field) for name, field in medium.items()}
         total = [torch.zeros((), dtype=torch.float64)]
-        prolong = cache(
-            partial(_times, self.prolongation)
-        )  # a function that stands in two forms is one
+        # a function that stands in two forms is one
+        prolong = cache(partial(_times, self.prolongation))
         for form in forms:
             if form.name in FIELDS:
                 total.append(self.form(form, [prolong(form.w), prolong(form.u)], values))
@@ -288,10 +288,8 @@ class Forms:
     ) -> Float[Tensor, ""]:
         """The value of a form, from its functions at the nodes and the values of the medium; differentiable in all."""
         stiffness, corners, c = form.name == "stiffness", [form.w, form.u], form.c
-        values, density = (
-            medium.get(FIELDS.get(form.name, "")),
-            _slopes if stiffness else weighted_products,
-        )
+        values = medium.get(FIELDS.get(form.name, ""))
+        density = _slopes if stiffness else weighted_products
         coefficient = None if values is None else values[0]
         coefficient = self._on_curved(coefficient) if stiffness else coefficient
         own = density(self.metric, self.element, outer(self.nodes, nodes, c), coefficient)

@@ -58,9 +58,8 @@ class _Leading(torch.autograd.Function):
         values, vectors = ctx.saved_tensors
         leading, rest = vectors[..., -ctx.dim :], vectors[..., : -ctx.dim]
         gap = values[..., None, -ctx.dim :] - values[..., : -ctx.dim, None]
-        turn = (
-            rest.mT @ grad
-        )  # zero where a frame is not used, as on creases, where the gap may be zero, too
+        # zero where a frame is not used, as on creases, where the gap may be zero, too
+        turn = rest.mT @ grad
         half = rest @ torch.where(turn == 0, 0.0, turn / gap) @ leading.mT
         return (half + half.mT) / 2, None
 

@@ -74,10 +74,14 @@ def remember_shapes(batch: OperatorStorage, shapes: Sequence[OperatorStorage]) -
 
 
 def shapes_of(batch: Any) -> tuple[Any, ...]:
-    """The operators that a batch was made of, while none of them has been copied, cast, moved or loaded; else none."""
+    """The operators that a batch was made of, while none of them has been copied, cast, moved or loaded; else none.
+
+    Of batches of batches the single shapes, as far as these are known.
+    """
     known = batch.cache.shapes
     same = all(shape.weak.values is values for shape, values in known)
-    return tuple(shape for shape, _ in known) if same else ()
+    parts = (shapes_of(shape) or (shape,) for shape, _ in known)
+    return tuple(part for own in parts for part in own) if same else ()
 
 
 def join_states(states: Sequence[dict[str, Any]], sizes: Sequence[int]) -> dict[str, Any]:

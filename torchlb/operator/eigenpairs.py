@@ -29,7 +29,7 @@ def through_eigenpairs(lb: Any, whole: Eigenbasis, k: int) -> Eigenbasis:
     basis = whole.truncate(k)
     if origins(lb) is None:
         return basis
-    shapes = (lb,) if lb.sizes is None else shapes_of(lb)
+    shapes = shapes_of(lb) or (lb,)
     wholes = unstack_eigenbases(whole)
 
     def forms(*grads: Tensor) -> list[BilinearForm]:
@@ -66,14 +66,14 @@ def _of_shape(
     """
     phi, lam = whole.eigenvectors.cpu().double(), whole.eigenvalues.cpu().double()
     count = min(of_values.shape[0], len(lam))
-    solver = pair_system(lb)
-    of_left = solver.inside(of_left.to(lb.device)).cpu()  # MΦ is zero at Dirichlet points
-    own = of_values[:count] * phi[:, :count], of_left[:, :count]
-    more = (0, len(lam) - count)
-    w, v = pad(own[0], more), pad(own[1] - lam[:count] * own[0], more)
+    more, own = (0, len(lam) - count), of_values[:count] * phi[:, :count]
+    w, v = pad(own, more), pad(-lam[:count] * own, more)
     if not (of_vectors.any() or of_left.any()):
         return w, v, phi
-    gradient = of_vectors[:, :count] + solver.mass_product(of_left[:, :count].to(lb.device)).cpu()
+    solver = pair_system(lb)
+    left = solver.inside(of_left[:, :count].to(lb.device))  # MΦ is zero at Dirichlet points
+    v += pad(left.cpu(), more)
+    gradient = of_vectors[:, :count] + solver.mass_product(left).cpu()
     inside = pad(phi.T @ gradient, more)  # φ_jᵀḡ_i
     gap = lam - lam[:, None]
     gap = gap / (gap.square() + (ROOT_EPS * lam[-1]) ** 2)

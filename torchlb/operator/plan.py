@@ -10,14 +10,14 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache
-from itertools import combinations
 
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
 from torchlb.errors import DerivativeError, InputError, first_few, renumbered, warn
-from torchlb.galerkin.forms import BilinearForm, Forms
+from torchlb.galerkin.elements import subsets
+from torchlb.galerkin.forms import BilinearForm, Forms, edge_lengths
 from torchlb.galerkin.medium import Medium
 from torchlb.galerkin.pair import PairPlan
 from torchlb.geometry.numbering import Numbering
@@ -159,8 +159,8 @@ def check_fit(
 
     Raises InputError where triangles of the plane, or tetrahedra of space, were turned inside out.
     """
-    edges = torch.cat([cells[:, [a, b]] for a, b in combinations(range(cells.shape[1]), 2)])
-    one, two = ((x[edges[:, 1]] - x[edges[:, 0]]).norm(dim=1) for x in (before, after))
+    edges = cells[:, torch.tensor(subsets(cells.shape[1] - 1, 2))]
+    one, two = (edge_lengths(x, cells) for x in (before, after))
     stretch = torch.where(one > 0, two / one, 1.0)
     change = stretch / stretch.median()
     changed = edges[(change > FACTOR) | (change < 1 / FACTOR)].unique()
@@ -171,11 +171,11 @@ def check_fit(
             "operator of these points anew"
         )
     if cells.shape[1] == before.shape[1] + 1:
-        signs = (
+        sides = [
             torch.linalg.det(x[cells[:, 1:]] - x[cells[:, :1]]).sign() for x in (before, after)
-        )
-        product = torch.stack(list(signs)).prod(0)
-        inverted = cells[(product * product.sum().sign()) < 0].unique()
+        ]
+        turned = sides[0] * sides[1]
+        inverted = cells[turned * turned.sum().sign() < 0].unique()
         if len(inverted):
             raise InputError(
                 f"points: cells at {len(inverted)} of them ({first_few(inverted)}) are turned inside out; smaller "

@@ -1,12 +1,11 @@
 """The linear systems behind implicit steps and Poisson problems.
 
 A system is a K + b M, where K includes the terms of a Robin condition and of a potential, without the rows and columns
-of Dirichlet points.
-It is solved by conjugate gradients, preconditioned with a factor of the P1 pair, which is spectrally close and 20 times
-sparser (`method.md`, section 10). Where rows of the fits have large weights, K is up to thirty times stiffer than K₁ at
-single points, in local functions: smoothing before and after the factor's solve then takes a third of the iterations.
-Several times in one call share factors, those of powers of four. Factors are kept as long as their operator; a batch
-uses those of its shapes.
+of Dirichlet points. It is solved by conjugate gradients, preconditioned with a factor of the P1 pair, which is
+spectrally close and 20 times sparser (`method.md`, section 10). Where rows of the fits have large weights, K is up to
+thirty times stiffer than K₁ at single points, in local functions: smoothing before and after the factor's solve then
+takes a third of the iterations. Several times in one call share factors, those of powers of four. Factors are kept as
+long as their operator; a batch uses those of its shapes.
 """
 
 from __future__ import annotations
@@ -61,20 +60,22 @@ def solve_columns(
     tolerance: float | None,
 ) -> Float[Tensor, "N C"]:
     """(M + tK)⁻¹b of every column by its time, or K⁻¹b for a time of None; by P1 elements for a tolerance of None."""
-    shapes = shapes_of(lb)
-    if shapes:
-        blocks = zip(shapes, b.split([shape.num_points for shape in shapes]), strict=True)
-        return torch.cat([solve_columns(s, part, time, tolerance) for s, part in blocks])
-    return pair_system(lb).solve(b, None if time is None else time.detach(), tolerance)
+    time = None if time is None else time.detach()
+    return _by_shape(lb, b, lambda system, part: system.solve(part, time, tolerance))
 
 
 def means(lb: OperatorStorage, b: Float[Tensor, "N C"]) -> Float[Tensor, "N C"]:
     """1ᵀb over the area of each component on which K1 = 0, at its points; zero on others."""
-    shapes = shapes_of(lb)
-    if shapes:
-        blocks = zip(shapes, b.split([shape.num_points for shape in shapes]), strict=True)
-        return torch.cat([means(shape, part) for shape, part in blocks])
-    return pair_system(lb).mean(b.double()).expand_as(b)
+    return _by_shape(lb, b, lambda system, part: system.mean(part.double()).expand_as(part))
+
+
+def _by_shape(
+    lb: OperatorStorage, b: Tensor, function: Callable[[PairSystem, Tensor], Tensor]
+) -> Tensor:
+    """A function of the system and the rows of b of each shape, whose factors serve its batch."""
+    shapes = shapes_of(lb) or (lb,)
+    parts = zip(shapes, b.split([shape.num_points for shape in shapes]), strict=True)
+    return torch.cat([function(pair_system(shape), part) for shape, part in parts])
 
 
 class _Components:

@@ -21,21 +21,19 @@ from torchlb.linalg.csr import side_by_side
 from torchlb.linalg.once import once_differentiable
 from torchlb.operator.batching import shapes_of
 from torchlb.operator.medium import elements_of, plain
+from torchlb.operator.parts import PairMatrices
 
 Forms = Callable[..., Sequence[BilinearForm]]
 """From the gradients of results the bilinear forms whose sum has their derivative."""
 
 
 class _Origin(NamedTuple):
-    """What the weak pair of one shape follows from: a plan at points that require a gradient, or elements; a medium.
-
-    Of a Robin condition it has the square root of a at the vertices, (N, 1).
-    """
+    """What the weak pair of one shape follows from: a plan at points that require a gradient, or elements; a medium."""
 
     points: Tensor
     medium: dict[str, Field]
     evaluated: Any
-    absorption: Tensor | None
+    weak: PairMatrices
 
     @property
     def variables(self) -> list[Tensor]:
@@ -45,8 +43,8 @@ class _Origin(NamedTuple):
 
     def gradient(self, forms: Sequence[BilinearForm]) -> list[Tensor]:
         """The derivative of a sum of forms in the variables; DerivativeError where it is not finite."""
-        medium = plain(self.medium)
-        forms = [part for form in forms for part in self._parts(form)]
+        medium, root = plain(self.medium), _root_of_absorption(self.weak)
+        forms = [part for form in forms for part in self._parts(form, root)]
         points = self.points.detach().cpu().double()
         if self.points.requires_grad:
             points.requires_grad_()
@@ -62,16 +60,15 @@ class _Origin(NamedTuple):
                 found = torch.autograd.grad(total, leaves, materialize_grads=True)
         return [_finite(g).to(v) for g, v in zip(found, self.variables, strict=True)]
 
-    def _parts(self, form: BilinearForm) -> list[BilinearForm]:
-        """The forms that a form is the sum of."""
+    def _parts(self, form: BilinearForm, root: Tensor | None) -> list[BilinearForm]:
+        """The forms that a form is the sum of; of a Robin condition `root` has √a at the vertices, (N, 1)."""
         if form.name != "energy":
             return [form]
         parts = [form._replace(name="stiffness")]
         if "potential" in self.medium:
             parts.append(form._replace(name="potential"))
-        if self.absorption is not None:
-            w, u = self.absorption * form.w, self.absorption * form.u
-            parts.append(BilinearForm("boundary", w, u, form.c))
+        if root is not None:
+            parts.append(BilinearForm("boundary", root * form.w, root * form.u, form.c))
         return parts
 
 
@@ -122,8 +119,8 @@ def origins(lb: Any) -> Origins | None:
     carries = lb._carries or any(t.requires_grad for t in held)
     if not (carries and torch.is_grad_enabled()):
         return None
-    shapes = [lb] if lb.sizes is None else shapes_of(lb)
-    if not shapes:
+    shapes = shapes_of(lb) or (lb,)
+    if any(shape.sizes is not None and shape._carries for shape in shapes):
         raise DerivativeError(
             "a batch that was copied, cast or moved does not know the shapes whose points or medium require gradients; "
             "move the shapes, and batch them then"
@@ -133,16 +130,15 @@ def origins(lb: Any) -> Origins | None:
         moved, medium = shape.points.requires_grad, shape._medium.fields(shape.num_points)
         constant = not moved and not any(f.values.requires_grad for f in medium.values())
         evaluated = None if constant else shape.plan if moved else elements_of(shape)
-        root = None if constant else _root_of_absorption(shape)
-        parts.append(_Origin(shape.points, medium, evaluated, root))
+        parts.append(_Origin(shape.points, medium, evaluated, shape.weak))
     return Origins(parts, [shape.num_points for shape in shapes])
 
 
-def _root_of_absorption(lb: Any) -> Tensor | None:
+def _root_of_absorption(weak: PairMatrices) -> Tensor | None:
     """√a of a Robin condition, from R_ii = a_i B_ii; None for another condition."""
-    values = lb.weak.values[:, lb.weak.row == lb.weak.col].cpu().double()
-    if len(values) < 4 or not values[3].any():
+    if not weak.values[3:4].any():
         return None
+    values = weak.values[:, weak.row == weak.col].cpu().double()
     return torch.where(values[2] != 0, values[3] / values[2], 0.0).clamp_min(0).sqrt()[:, None]
 
 

@@ -22,7 +22,6 @@ from torchlb.linalg.sparse import compute_dtype
 from torchlb.operator.checks import check_tolerance
 from torchlb.operator.laplace_beltrami import LaplaceBeltrami
 from torchlb.operator.pair_methods import check_pair
-from torchlb.operator.through import without
 from torchlb.pde.checks import as_columns, as_times, check_choice
 from torchlb.pde.pair_flow import pair_flow
 from torchlb.spectral.eigenbasis import Eigenbasis
@@ -95,7 +94,6 @@ def flow(
     if method == "spectral":
         return _spectral(lb.eigenbasis(k), x, time)
     if method == "deflated":
-        x = without(lb, x, "the method 'deflated'")
         return _deflated(lb, lb.invariant_basis(k), x, time, tolerance)
     return pair_flow(lb, x, time, tolerance).to(x.dtype)
 

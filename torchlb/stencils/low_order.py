@@ -44,9 +44,8 @@ class MeshLowOrder:
     @property
     def flips(self) -> list[Tensor]:
         """Edge flips to the triangulation; none where it was not needed, or for other cells than triangles."""
-        return self._blocks[2] if "_blocks" in vars(self) else []
+        return self._elements[2] if "_elements" in vars(self) else []
 
-    @cached_property
     def _blocks(
         self,
     ) -> tuple[Int[Tensor, "T corners"], Complex[Tensor, "T entries"], list[Tensor]]:
@@ -62,15 +61,15 @@ class MeshLowOrder:
         return cells, blocks if share is None else share[:, None] * blocks, flips
 
     @cached_property
-    def _elements(self) -> tuple[sparse.csr_array, Float[Tensor, " N"]]:
-        """Stiffness and lumped mass."""
-        cells, blocks, _ = self._blocks
+    def _elements(self) -> tuple[sparse.csr_array, Float[Tensor, " N"], list[Tensor]]:
+        """Stiffness, lumped mass, and flips."""
+        cells, blocks, flips = self._blocks()
         pair = summed(blocks.detach(), cells, len(self.points))
-        return pair.real, torch.from_numpy(pair.imag.sum(axis=1))
+        return pair.real, torch.from_numpy(pair.imag.sum(axis=1)), flips
 
     def entries(self, row: Int[Tensor, " e"], col: Int[Tensor, " e"]) -> Float[Tensor, " e"]:
         """Entries of Δ, 1/ℓ², differentiable in the points."""
-        cells, blocks, _ = self._blocks
+        cells, blocks, _ = self._blocks()
         count, corners = len(self.points), cells.shape[1]
         first, second = cells.repeat_interleave(corners, 1).flatten(), cells.repeat(1, corners)
         mass = blocks.imag.new_zeros(count).index_add(0, first, blocks.imag.flatten())
