@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cache, partial
-from typing import Any, Literal, NamedTuple
+from itertools import combinations_with_replacement
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -20,38 +21,25 @@ from torchlb.galerkin.assembly import (
     flat_metric,
     gradient_products,
     in_cells,
+    linear_blocks,
     linear_elements,
     spread,
-    squares,
     summed,
     upper_congruence,
 )
+from torchlb.galerkin.bilinear import BilinearForm, outer, weighted_products, weighted_slopes
 from torchlb.galerkin.curving import CurvedMesh, CurvingPlan
 from torchlb.galerkin.delaunay import sound_lengths
 from torchlb.galerkin.elements import Element, simplex, subsets
-from torchlb.galerkin.medium import Field, Medium
+from torchlb.galerkin.medium import Field, Medium, projector
 from torchlb.galerkin.prolongation import prolongation
 from torchlb.geometry.local_fits import FitPlan, LocalFits
 from torchlb.geometry.numbering import Numbering
 from torchlb.geometry.vectors import at
 from torchlb.linalg.once import once_differentiable
-from torchlb.linalg.precision import rows_at_once
 
 Linear = Callable[[Tensor], Tensor]
 FIELDS = {"stiffness": "conductivity", "mass": "density", "potential": "potential"}
-
-
-class BilinearForm(NamedTuple):
-    """Σ_k c_k w_kᵀA u_k of constant functions w, u (N, C) and numbers c (C,).
-
-    A is K, "stiffness"; M, "mass"; ∫cwu of the potential c, "potential"; the sum of K, that, and the term of a
-    condition, "energy"; the boundary mass B, "boundary"; or the mass of the vertices, "lumped".
-    """
-
-    name: Literal["stiffness", "mass", "potential", "energy", "boundary", "lumped"]
-    w: Float[Tensor, "N C"]
-    u: Float[Tensor, "N C"]
-    c: Float[Tensor, " C"]
 
 
 class FlatCells(NamedTuple):
@@ -219,6 +207,13 @@ class Forms:
             found.append(_mean(inside, corners))
         return found
 
+    def projectors(self) -> list[Tensor]:
+        """Π onto the tangent plane, (…, n, n), where `values` has those of a field."""
+        places = at(self.places, self.nodes)
+        slopes = torch.einsum("tnk,qnd->tqkd", places, self.element.gradients)
+        corners = [at(self.points, flat.cells) for flat in self.flats]
+        return [projector(slopes), *(projector((x[:, 1:] - x[:, :1]).mT) for x in corners)]
+
     def matrix(
         self, conductivity: list[Tensor] | None = None, density: list[Tensor] | None = None
     ) -> sparse.csr_array:
@@ -272,9 +267,42 @@ class Forms:
             total = total + flat.share * sparse.triu(part, format="csr")
         return total
 
+    def directed(
+        self, conductivity: list[Tensor] | None
+    ) -> Iterator[tuple[sparse.csr_array, sparse.csr_array]]:
+        """Upper triangles of the stiffness for the conductivities κΠ_kl, k ≤ l row by row, and those of P1 elements."""
+        projectors, n = self.projectors(), self.points.shape[1]
+        kappa = [None] * len(projectors) if conductivity is None else conductivity
+        slopes = self.element.weights[:, None] * conductance(self.metric, self._on_curved(kappa[0]))
+        slopes = slopes if self.shares is None else self.shares[:, None, None] * slopes
+        mean = None if kappa[0] is None else _mean(kappa[0], self.element)
+        lots = [(self.cells, self.lengths, mean, _mean(projectors[0], self.element))]
+        lots += [
+            (f.cells, f.lengths, *rest)
+            for f, *rest in zip(self.flats, kappa[1:], projectors[1:], strict=True)
+        ]
+        shares = [1.0 if self.shares is None else self.shares[:, None]]
+        shares += [flat.share for flat in self.flats]
+        blocks = [
+            share * linear_blocks(lengths, cells, self._on_flat(a, cells, lengths)).real
+            for (cells, lengths, a, _), share in zip(lots, shares, strict=True)
+        ]
+        for k, m in combinations_with_replacement(range(n), 2):
+            own = (slopes * projectors[0][..., k, m, None]).flatten(1)
+            own = own @ gradient_products(self.element).flatten(0, 1)
+            elements = summed(own, self.nodes, self.prolongation.shape[0])
+            triangles = [
+                sparse.triu(summed(x * pi[:, k, m, None], cells, len(self.points)), format="csr")
+                for x, (cells, *_, pi) in zip(blocks, lots, strict=True)
+            ]
+            flat = sum(triangles[1:])
+            yield upper_congruence(self.prolongation, elements) + flat, triangles[0] + flat
+
     def bilinear(self, forms: Sequence[BilinearForm], medium: Medium) -> Float[Tensor, ""]:
         """Σ of bilinear forms, differentiable in the medium; of "lumped" and "boundary", which depend on none, 0."""
         values = {name: self.values(field) for name, field in medium.items()}
+        if any(form.along for form in forms):
+            values["projectors"] = self.projectors()
         total = [torch.zeros((), dtype=torch.float64)]
         # a function that stands in two forms is one
         prolong = cache(partial(_times, self.prolongation))
@@ -289,10 +317,11 @@ class Forms:
         """The value of a form, from its functions at the nodes and the values of the medium; differentiable in all."""
         stiffness, corners, c = form.name == "stiffness", [form.w, form.u], form.c
         values = medium.get(FIELDS.get(form.name, ""))
-        density = _slopes if stiffness else weighted_products
+        density = weighted_slopes if stiffness else weighted_products
         coefficient = None if values is None else values[0]
         coefficient = self._on_curved(coefficient) if stiffness else coefficient
         own = density(self.metric, self.element, outer(self.nodes, nodes, c), coefficient)
+        own = own * (1.0 if form.along is None else medium["projectors"][0][form.entry])
         total = [own.sum() if self.shares is None else (self.shares[:, None] * own).sum()]
         for number, flat in enumerate(self.flats, 1):
             shape = simplex(self.element.dim, 1)
@@ -304,7 +333,10 @@ class Forms:
                 own = flat.lumped[flat.cells] * blocks[:, :: flat.cells.shape[1] + 1]
                 blocks = own.mean(1, keepdim=True).expand_as(blocks)
             mean = None if mean is None else spread(mean, shape)
-            total.append(flat.share * density(metric, shape, blocks, mean).sum())
+            own = density(metric, shape, blocks, mean)
+            if form.along is not None:
+                own = own * medium["projectors"][number][form.entry][:, None]
+            total.append(flat.share * own.sum())
         return torch.stack(total).sum()
 
     def _on_curved(self, a: Tensor | None) -> Tensor | None:
@@ -336,39 +368,6 @@ def edge_lengths(
 def _renumbered(matrix: Any, columns: Int[Tensor, " C"], count: int) -> sparse.csr_array:
     parts = matrix.data, columns.numpy()[matrix.indices], matrix.indptr
     return sparse.csr_array(parts, shape=(matrix.shape[0], count))
-
-
-def outer(
-    nodes: Int[Tensor, "T n"], values: list[Tensor], c: Float[Tensor, " C"]
-) -> Float[Tensor, "T n_times_n"]:
-    """Σ_k c_k w_k(i) u_k(j) for all pairs of nodes of each element."""
-    one, two = values[0] * c, values[1]
-    parts = nodes.split(rows_at_once(nodes.shape[1] * len(c)))
-    return torch.cat([(at(one, part) @ at(two, part).mT).flatten(1) for part in parts])
-
-
-def _slopes(
-    metric: Float[Tensor, "T Q S"],
-    element: Element,
-    blocks: Float[Tensor, "T n_times_n"],
-    conductivity: Tensor | None,
-) -> Float[Tensor, "T Q"]:
-    """Quadrature weights times Σ_k c_k A∇w_k·∇u_k at the Gauss points."""
-    entries = conductance(metric, conductivity).unbind(-1)
-    crosses = gradient_products(element).unbind(1)
-    total = [entry * (blocks @ cross.T) for entry, cross in zip(entries, crosses, strict=True)]
-    return element.weights * torch.stack(total).sum(0)
-
-
-def weighted_products(
-    metric: Float[Tensor, "T Q S"],
-    element: Element,
-    blocks: Float[Tensor, "T n_times_n"],
-    density: Tensor | None,
-) -> Float[Tensor, "T Q"]:
-    """Quadrature weights times Σ_k c_k ρ w_k u_k at the Gauss points."""
-    found = element.weights * area_element(metric) * (blocks @ squares(element).T)
-    return found if density is None else density * found
 
 
 def _mean(values: Float[Tensor, "T Q ..."], element: Element) -> Float[Tensor, "T ..."]:

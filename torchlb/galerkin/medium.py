@@ -8,8 +8,10 @@ from typing import Any, Literal, NamedTuple
 import torch
 from jaxtyping import Float, Shaped
 from torch import Tensor
+from torch.nn.functional import normalize
 
 from torchlb.linalg.once import once_differentiable
+from torchlb.linalg.precision import TINY
 
 FieldName = Literal["conductivity", "density", "potential"]
 Map = Callable[[Tensor], Tensor]
@@ -86,3 +88,15 @@ def symmetric_exp(matrix: Float[Tensor, "*batch n n"]) -> Float[Tensor, "*batch 
     [[2.0, 1.0], [1.0, 2.0]]
     """
     return _SpectralFunction.apply(matrix, "exp")  # pyright: ignore[reportReturnType]
+
+
+def projector(slopes: Float[Tensor, "*batch n d"]) -> Float[Tensor, "*batch n n"]:
+    """The orthogonal projector onto the span of vectors, by Gram and Schmidt; of a vector that is zero, zero."""
+    unit: list[Tensor] = []
+    for x in slopes.unbind(-1):
+        for _ in range(2):  # the second time takes off what rounding leaves
+            for e in unit:
+                x = x - (x * e).sum(-1, keepdim=True) * e
+        unit.append(normalize(x, dim=-1, eps=TINY))
+    frame = torch.stack(unit, -1)
+    return frame @ frame.mT

@@ -20,11 +20,12 @@ from torchlb.galerkin.assembly import (
     summed,
     upper_congruence,
 )
+from torchlb.galerkin.bilinear import BilinearForm, outer, weighted_products
 from torchlb.galerkin.boundary import boundary_nodes
 from torchlb.galerkin.coarse import boundary_shares
 from torchlb.galerkin.curving import CurvedMesh, CurvingPlan, curve
 from torchlb.galerkin.elements import simplex
-from torchlb.galerkin.forms import BilinearForm, Forms, outer, weighted_products
+from torchlb.galerkin.forms import Forms
 from torchlb.galerkin.medium import Medium
 from torchlb.galerkin.nodes import lagrange_nodes
 from torchlb.galerkin.prolongation import prolonged
@@ -187,6 +188,8 @@ class PairPlan:
         elements = self.forms(fits, mesh, prolong=False)
         prolong = partial(prolonged, self.fits, fits, self.curving, mesh)
         values = {name: elements.values(field, prolong) for name, field in medium.items()}
+        if any(form.along for form in forms):
+            values["projectors"] = elements.projectors()
         flat = self.curving.bent.index_fill(0, self.lowered, False)
         total = []
         for lumped, curving in ((False, self.curving), (True, replace(self.curving, bent=flat))):

@@ -9,7 +9,7 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.nn.functional import pad
 
-from torchlb.galerkin.forms import BilinearForm
+from torchlb.galerkin.bilinear import BilinearForm
 from torchlb.linalg.precision import ROOT_EPS
 from torchlb.operator.batching import shapes_of
 from torchlb.operator.systems import pair_system

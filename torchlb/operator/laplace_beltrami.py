@@ -25,6 +25,7 @@ from torchlb.operator.batching import (
     split_parts,
 )
 from torchlb.operator.build_cloud import Reconstruction, build_cloud, built_again
+from torchlb.operator.connection import Connection, connection_of
 from torchlb.operator.inputs import ArrayLike, check_points, float_type, warn_of_gradients
 from torchlb.operator.medium import checked_fields, pair_in, split_fields
 from torchlb.operator.options import Options
@@ -341,6 +342,19 @@ class LaplaceBeltrami(StencilMethods, PairMethods):
             lb.modes, lb._medium, lb._in_medium = Modes(None, self.mass), medium, True
         lb._plan, lb._planned, lb.cache.elements = self._plan, self._planned, self.cache.elements
         return lb
+
+    @property
+    def connection(self) -> Connection:
+        """The tangent fields of the shape, or of a batch: `Connection`, with stiffness, mass matrix, eigenbasis.
+
+        Computed where it is asked for first, in about the time of a build. Raises InputError without a weak pair.
+
+        >>> from torchlb.surfaces import Sphere
+        >>> lb = LaplaceBeltrami.from_mesh(*Sphere().mesh(500))
+        >>> lb.connection.eigenbasis(6).eigenvalues.round(decimals=3).tolist()  # l(l + 1) − 1
+        [1.0, 1.0, 1.0, 1.0, 1.0, 1.0]
+        """
+        return connection_of(self)
 
     def unbatch(self) -> list[LaplaceBeltrami]:
         """The operators of the shapes of a `batch`, with weak pairs only if all shapes of the batch had one."""

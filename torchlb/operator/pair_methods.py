@@ -206,17 +206,21 @@ class PairMethods(OperatorStorage):
         for start, end in zip(self.offsets[:-1], self.offsets[1:], strict=True):
             block = slice(start, end)
             near = None if self.weak.linear.num_rows == 0 else [m[block, block] for m in linear]
-            bases.append(
-                pencil_eigenbasis(
-                    stiffness[block, block],
-                    mass[block, block],
-                    self.mass[block].detach().cpu().double(),
-                    k,
-                    dim=self.dim,
-                    linear=None if near is None else (near[0], near[1]),
-                    fixed=fixed[block],
-                    losing=losing[block],
-                    tolerance=tolerance,
-                )
+            k_of, m_of, shift = stiffness[block, block], mass[block, block], 0.0
+            if not self.weak.of_functions:  # fields may be parallel
+                shift = float(self.mass[block].sum() / self.dim) ** (-2 / self.dim)
+                k_of = k_of + shift * m_of
+                near = near and [near[0] + shift * near[1], near[1]]
+            basis = pencil_eigenbasis(
+                k_of,
+                m_of,
+                self.mass[block].detach().cpu().double(),
+                k,
+                dim=self.dim,
+                linear=None if near is None else (near[0], near[1]),
+                fixed=fixed[block],
+                losing=losing[block],
+                tolerance=tolerance,
             )
+            bases.append(replace(basis, eigenvalues=(basis.eigenvalues - shift).clamp_min(0.0)))
         return bases[0] if self.sizes is None else stack_eigenbases(bases)

@@ -33,6 +33,7 @@ class PairMatrices(Csr):
     """
 
     linear: Csr
+    of_functions = True
 
     def __init__(
         self,
@@ -67,7 +68,9 @@ class PairMatrices(Csr):
 
     def losing(self, fixed: Bool[Tensor, " N"] | None) -> Bool[Tensor, " N"]:
         """Mask of the points where a condition or a potential keeps constants from the kernel of K; `fixed` too."""
-        found = torch.zeros(self.num_rows, dtype=torch.bool, device=self.col.device)
+        found = torch.full((self.num_rows,), not self.of_functions, device=self.col.device)
+        if not self.of_functions:
+            return found
         if len(self.near.values) > 3:
             found = self.near.values[3:, self.near.row == self.near.col].sum(0) > 0
         return found if fixed is None else found | fixed
@@ -226,12 +229,15 @@ class OperatorCache:
         Linear systems with their factors.
     elements
         Elements of the weak pair, made for the first medium.
+    connection
+        The operator's tangent fields.
     shapes
         Shapes of a batch, whose caches serve it, each with the values that it had.
     """
 
     def __init__(self, values: Tensor) -> None:
         self.values = values
+        self.connection: Any = None
         self.systems: OrderedDict[Any, Any] = OrderedDict()
         self.elements: Any = None
         self.shapes: tuple[tuple[Any, Tensor], ...] = ()

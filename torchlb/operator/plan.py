@@ -16,10 +16,12 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from torchlb.errors import DerivativeError, InputError, first_few, renumbered, warn
+from torchlb.galerkin.bilinear import BilinearForm
 from torchlb.galerkin.elements import subsets
-from torchlb.galerkin.forms import BilinearForm, Forms, edge_lengths
+from torchlb.galerkin.forms import Forms, edge_lengths
 from torchlb.galerkin.medium import Medium
 from torchlb.galerkin.pair import PairPlan
+from torchlb.galerkin.tangent import in_space
 from torchlb.geometry.numbering import Numbering
 from torchlb.geometry.thresholds import FACTOR
 from torchlb.linalg.threads import threads_for
@@ -79,13 +81,24 @@ class Plan:
         return self.pair.forms(fits).restored(self.numbering, self.order, len(self.faces))
 
     def bilinear(
-        self, points: Float[Tensor, "N n"], forms: Sequence[BilinearForm], medium: Medium
+        self,
+        points: Float[Tensor, "N n"],
+        forms: Sequence[BilinearForm],
+        medium: Medium,
+        *,
+        tangent: bool = False,
     ) -> Float[Tensor, ""]:
         """The sum of bilinear forms of functions at the user's points, differentiable in points and medium.
 
+        The forms are of tangent fields if `tangent`, given by their components in the frames, (N d, C).
+
         Raises DerivativeError for a medium on the faces of coarse triangles, which flips mix.
         """
-        sort = cache(self.numbering.sorted)  # a function that stands in two forms is one
+
+        @cache  # a function that stands in two forms is one
+        def sort(f: Tensor) -> Tensor:
+            return self.numbering.sorted(f.view(self.num_points, -1)).view_as(f)
+
         forms = [form._replace(w=sort(form.w), u=sort(form.u)) for form in forms]
         if any(f.on_faces for f in medium.values()) and bool(self.pair.curving.coarse.any()):
             raise DerivativeError(
@@ -93,10 +106,13 @@ class Plan:
                 "way that is not differentiated in the points; give it at the vertices"
             )
         medium = {
-            name: f._replace(values=f.values[self.order] if f.on_faces else sort(f.values))
+            name: f._replace(
+                values=f.values[self.order] if f.on_faces else self.numbering.sorted(f.values)
+            )
             for name, f in medium.items()
         }
-        _, fits = self.shape.at(self._sorted(points))
+        placed, fits = self.shape.at(self._sorted(points))
+        forms = in_space(forms, placed.frames) if tangent else forms
         return self.pair.bilinear(fits, forms, medium)
 
     def rows_at(self, points: Float[Tensor, "N n"]) -> list[Tensor]:

@@ -120,9 +120,10 @@ class PairSystem:
         self.steps = 0
         crow, col, linear = lb.weak.linear_pair
         first, second = (to_scipy(crow, col, v.double(), lb.shape) for v in linear)
-        sums = first.sum(1)  # negative row sums (float32) would make it indefinite
-        sums = np.where(lb.weak.losing(lb.fixed).cpu().numpy(), np.minimum(sums, 0.0), sums)
-        first = first - sparse.diags_array(sums)
+        if lb.weak.of_functions:
+            sums = first.sum(1)  # negative row sums (float32) would make it indefinite
+            sums = np.where(lb.weak.losing(lb.fixed).cpu().numpy(), np.minimum(sums, 0.0), sums)
+            first = first - sparse.diags_array(sums)
         self.linear, self.factors = (first, second), OrderedDict()
 
     def solve(

@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 
 from torchlb.errors import DerivativeError, first_few
-from torchlb.galerkin.forms import BilinearForm
+from torchlb.galerkin.bilinear import BilinearForm
 from torchlb.galerkin.medium import Field
 from torchlb.linalg.csr import side_by_side
 from torchlb.linalg.once import once_differentiable
@@ -127,7 +127,7 @@ def origins(lb: Any) -> Origins | None:
         )
     parts = []
     for shape in shapes:
-        moved, medium = shape.points.requires_grad, shape._medium.fields(shape.num_points)
+        moved, medium = shape.points.requires_grad, shape._medium.fields(len(shape.points))
         constant = not moved and not any(f.values.requires_grad for f in medium.values())
         evaluated = None if constant else shape.plan if moved else elements_of(shape)
         parts.append(_Origin(shape.points, medium, evaluated, shape.weak))

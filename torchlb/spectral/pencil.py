@@ -111,7 +111,7 @@ def pencil_eigenbasis(
             "scaled, or kept in float64"
         )
     # A power of two as the unit of length: float32 holds the entries, and scaling rounds nothing.
-    length = 2.0 ** round(float(np.log2(mass_matrix.sum())) / dim)
+    length = 2.0 ** round(float(np.log2(abs(mass_matrix).sum())) / dim)
     units = length ** (dim - 2), length**dim
     whole = _narrow(stiffness, units[0]), _narrow(mass_matrix, units[1])
     near = linear and (_narrow(linear[0], units[0]), _narrow(linear[1], units[1]))
@@ -200,7 +200,9 @@ def _pairs(part: _Part, k: int, tolerance: float) -> tuple[np.ndarray, ...]:
         null = np.full(size, float(m1.sum()) ** -0.5) if zero else None
         accuracy = ROOT_EPS if part.linear is None else START
         settings = {"tolerance": accuracy, "more": BLOCK, "null": null}
-        solve, (values, u) = lanczos_of_pair(k1, m1, k - zero, SHIFT / float(m1.sum()), **settings)
+        solve, (values, u) = lanczos_of_pair(
+            k1, m1, k - zero, SHIFT / float(abs(m1).sum()), **settings
+        )
         if null is not None:
             values, u = np.append(0.0, values), np.column_stack([null.astype(u.dtype), u])
         if part.linear is None:

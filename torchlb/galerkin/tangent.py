@@ -1,0 +1,124 @@
+"""Tangent fields on the elements: the connection Laplacian by matrices of functions (`method.md`, section 18).
+
+A tangent field has the components c in the frames E of the vertices, and is the vector field Ec of space, prolonged
+component by component. With the projector Π onto the tangent plane its covariant derivative is Π∇ũ, so that
+
+    ∫κ|Π∇ũ|² = Σ_kl ∫κΠ_kl ∇ũ_k·∇ũ_l
+
+is made of stiffness matrices of functions, with the conductivities κΠ_kl. It is symmetric and positive whatever the
+fits are, in any codimension. All else (mass, boundary, potential) is that of functions, for every component in space.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from itertools import combinations_with_replacement
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from scipy import sparse
+from torch import Tensor
+
+from torchlb.galerkin.bilinear import BilinearForm
+from torchlb.galerkin.forms import Forms
+from torchlb.galerkin.medium import Medium
+from torchlb.galerkin.pair import Pattern
+from torchlb.geometry.vectors import at
+from torchlb.linalg.csr import Csr
+from torchlb.linalg.sparse import on_one_pattern
+
+
+class TangentForms(NamedTuple):
+    """Forms of tangent fields by those of functions, at constant points, with the frames (N, n, d) there."""
+
+    of_functions: Forms
+    frames: Tensor
+
+    def bilinear(self, forms: Sequence[BilinearForm], medium: Medium) -> Float[Tensor, ""]:
+        """Σ of bilinear forms, differentiable in the medium."""
+        return self.of_functions.bilinear(in_space(forms, self.frames), medium)
+
+
+def in_space(forms: Sequence[BilinearForm], frames: Float[Tensor, "N n d"]) -> list[BilinearForm]:
+    """Forms of the components (N d, C) of tangent fields as forms of functions, differentiable in the frames."""
+    known: dict[int, tuple[Tensor, ...]] = {}
+    for f in (f for form in forms for f in (form.w, form.u)):
+        if id(f) not in known:
+            local = f.view(*frames.shape[::2], -1)
+            known[id(f)] = torch.einsum("ind,idc->inc", frames, local).unbind(1)
+    found = []
+    for name, w, u, c, _ in forms:
+        for k, one in enumerate(known[id(w)]):
+            for m, two in enumerate(known[id(u)]):
+                if name == "stiffness":
+                    found.append(BilinearForm(name, one, two, c, (k, m)))
+                elif k == m:
+                    found.append(BilinearForm(name, one, two, c))
+    return found
+
+
+def connection_matrices(
+    forms: Forms,
+    conductivity: list[Tensor] | None,
+    frames: Float[Tensor, "N n d"],
+    others: tuple[Csr, Csr | None],
+) -> list[Csr]:
+    """Matrices of tangent fields, and those of P1 elements if there are others than these.
+
+    Their channels are the stiffness, and then all but the first channel of `others`, which are of functions.
+    """
+    parts = zip(zip(*forms.directed(conductivity), strict=True), others, strict=True)
+    return [_framed(list(own), frames, other) for own, other in parts if other is not None]
+
+
+def _framed(parts: list[Any], frames: Float[Tensor, "N n d"], others: Csr) -> Csr:
+    """Σ_kl E_kᵀ S_kl E_l of upper triangles of S_kl, k ≤ l, with Σ_k E_kᵀ A E_k of the other channels A."""
+    count, n, dim = frames.shape
+    pairs = list(combinations_with_replacement(range(n), 2))
+    rest = [others.to_scipy(channel) for channel in range(1, len(others.values))]
+    upper, values = _on_one_pattern([*parts, *(sparse.triu(a, format="csr") for a in rest)])
+    row = np.arange(count).repeat(np.diff(upper.indptr))
+    left, right = (at(frames, torch.from_numpy(x).long()) for x in (row, upper.indices))
+    blocks = values.new_zeros(1 + len(rest), len(row), dim, dim)
+    for value, (k, m) in zip(values, pairs, strict=False):
+        product = left[:, k, :, None] * right[:, m, None, :]
+        if k != m:
+            product += left[:, m, :, None] * right[:, k, None, :]
+        blocks[0] += value[:, None, None] * product
+    blocks[1:] = values[len(pairs) :, :, None, None] * (left.mT @ right)
+    pattern = Pattern.of(upper)
+    blocks = blocks[:, torch.from_numpy(pattern.order).long()]
+    below = pattern.col < torch.arange(count).repeat_interleave(pattern.crow.diff())
+    return _by_rows(pattern.crow, pattern.col, torch.where(below[:, None, None], blocks.mT, blocks))
+
+
+def _on_one_pattern(matrices: list[Any]) -> tuple[Any, Float[Tensor, "c nnz"]]:
+    """A pattern that has the entries of all matrices, and their values on it."""
+    if all(on_one_pattern(matrices[0], other) for other in matrices):
+        return matrices[0], torch.from_numpy(np.stack([m.data.astype(float) for m in matrices]))
+    joint: Any = sparse.csr_array(sum(abs(matrix) for matrix in matrices))
+    joint.sort_indices()
+    row, col = sparse.coo_array(joint).coords
+    keys = row.astype(np.int64) * joint.shape[1] + col
+    values = torch.zeros(len(matrices), len(keys), dtype=torch.float64)
+    for value, matrix in zip(values, matrices, strict=True):
+        row, col = sparse.coo_array(matrix).coords
+        place = np.searchsorted(keys, row.astype(np.int64) * joint.shape[1] + col)
+        value[place] = torch.from_numpy(matrix.data.astype(float))
+    return joint, values
+
+
+def _by_rows(crow: Tensor, col: Tensor, blocks: Float[Tensor, "c nnz d d"]) -> Csr:
+    """Matrices of d × d blocks as CSR."""
+    dim, uses = blocks.shape[-1], crow.diff()
+    within, start = torch.arange(dim), crow[:-1].repeat_interleave(uses)
+    first = dim**2 * start + dim * (torch.arange(len(col)) - start)
+    step = dim * uses.repeat_interleave(uses)
+    place = (first[:, None, None] + step[:, None, None] * within[:, None] + within).flatten()
+    values, columns = torch.empty_like(blocks).flatten(1), torch.empty_like(place)
+    values[:, place] = blocks.flatten(1)
+    columns[place] = (dim * col[:, None, None] + within).expand(-1, dim, -1).flatten()
+    rows = torch.cat([crow[:1], (dim * uses).repeat_interleave(dim).cumsum(0)])
+    return Csr(rows, columns, values)

@@ -1,0 +1,136 @@
+"""The connection Laplacian: tangent fields in the place of functions (`method.md`, section 18)."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from functools import partial
+from typing import Any, NamedTuple
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from torchlb.errors import InputError
+from torchlb.galerkin.tangent import TangentForms, connection_matrices
+from torchlb.linalg.checks import check_tensor
+from torchlb.linalg.csr import Csr
+from torchlb.operator.batching import remember_shapes, shapes_of
+from torchlb.operator.medium import elements_of, plain
+from torchlb.operator.pair_methods import PairMethods, check_pair
+from torchlb.operator.parts import Modes, PairMatrices
+
+
+class FieldMatrices(PairMatrices):
+    """The weak pair of tangent fields: no constants are in the kernel of its stiffness."""
+
+    of_functions = False
+
+
+class _TangentPlan(NamedTuple):
+    """What the pair of tangent fields on a shape follows from, with the operator of functions there."""
+
+    lb: Any
+
+    @property
+    def bilinear(self) -> Any:
+        """Forms at other points, as `Plan.bilinear`."""
+        return partial(self.lb.plan.bilinear, tangent=True)
+
+    def forms(self, points: Tensor) -> TangentForms:
+        """Forms at the points of the operator."""
+        frames = self.lb.frames.detach().cpu().double()
+        assert len(points) == len(frames)
+        return TangentForms(elements_of(self.lb), frames)
+
+
+class Connection(PairMethods):
+    """Tangent fields of a shape: −∇*∇, Bochner's or the connection Laplacian, as a weak pair.
+
+    A field v has the components c = Eᵀv in ``lb.frames``, row d·i + c of a matrix. The stiffness is ∫κ∇u:∇v of
+    covariant derivatives, without the term of the curvature that Hodge's Laplacian has beside it; conditions, media and
+    derivatives in points and medium are as for functions. All that takes an operator's weak pair takes this one:
+    `implicit_step`, `heat_flow`, and `eigenbasis`, whose relative errors are those of λ + area^{−2/d}, since fields may
+    be parallel (λ = 0) in no, one or more ways.
+    """
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._lb: tuple[Any, ...] = ()
+
+    @property
+    def dim(self) -> int:
+        """Dimension d of the manifold."""
+        return self.frames.shape[-1]
+
+    @property
+    def plan(self) -> Any:
+        """What the matrices follow from."""
+        return _TangentPlan(self._lb[0])
+
+    def components(
+        self, v: Float[Tensor, "N n C"] | Float[Tensor, "N n"]
+    ) -> Float[Tensor, "rows C"] | Float[Tensor, " rows"]:
+        """Components in the frames, (N d, C) or (N d,), of the tangential part of a field of space vectors.
+
+        Raises InputError for another shape.
+        """
+        check_tensor(v, "v")
+        size, n, _ = self.frames.shape
+        if v.ndim not in (2, 3) or v.shape[:2] != (size, n):
+            raise InputError(
+                f"expected a field of shape (N, n) or (N, n, C) with N = {size}, n = {n}, got {tuple(v.shape)}"
+            )
+        return torch.einsum("ind,in...->id...", self.frames.to(v), v).flatten(0, 1)
+
+    def vectors(
+        self, c: Float[Tensor, "rows C"] | Float[Tensor, " rows"]
+    ) -> Float[Tensor, "N n C"] | Float[Tensor, "N n"]:
+        """The tangent field of space vectors, (N, n, C) or (N, n), with components (N d, C) or (N d,)."""
+        return torch.einsum("ind,id...->in...", self.frames.to(c), c.unflatten(0, (-1, self.dim)))
+
+    @classmethod
+    def _of(cls, lb: Any, weak: PairMatrices) -> Connection:
+        """The tangent fields of an operator with their matrices."""
+        own, dim = cls(), lb.dim
+        own.source, own.options = "connection", lb.options
+        own.mass, own.points, own.frames = lb.mass.repeat_interleave(dim), lb.points, lb.frames
+        own._on_boundary = lb._on_boundary.repeat_interleave(dim)
+        own.weak, own.stencil = weak, Csr(values=lb.stencil.values[:, :0].detach())
+        own.sizes = None if lb.sizes is None else [dim * size for size in lb.sizes]
+        own._states, own._medium, own._in_medium = lb._states, lb._medium, lb._in_medium
+        own._carries, own._lb, own.modes = lb._carries, (lb,), Modes(None, own.mass)
+        return own
+
+
+def connection_of(lb: Any) -> Connection:
+    """The tangent fields of an operator, of one shape or a batch, made once and kept in its cache."""
+    if lb.cache.connection is None:
+        check_pair(lb)
+        with torch.inference_mode(False):
+            lb.cache.connection = _of_batch(lb) if lb.sizes is not None else _of_shape(lb)
+    return lb.cache.connection
+
+
+def _of_shape(lb: Any) -> Connection:
+    if lb._in_medium and not lb._medium.tensors:
+        raise InputError(
+            "connection: the medium of this operator is not known, as it comes from a batch"
+        )
+    frames = lb.frames.detach().cpu().double()
+    elements, medium = elements_of(lb), plain(lb._medium.fields(len(lb.points)))
+    with torch.no_grad():
+        kappa = medium.get("conductivity")
+        kappa = None if kappa is None else elements.values(kappa)
+        linear = lb.weak.linear if lb.weak.linear.num_rows else None
+        found = connection_matrices(elements, kappa, frames, (lb.weak, linear))
+    whole, *near = (each.to(lb.weak.values) for each in found)
+    return Connection._of(lb, FieldMatrices(whole.crow, whole.col, whole.values, *near))
+
+
+def _of_batch(lb: Any) -> Connection:
+    parts: Sequence[Connection] = [shape.connection for shape in shapes_of(lb) or lb.unbatch()]
+    joined = PairMatrices.join([part.weak for part in parts])
+    weak = FieldMatrices(joined.crow, joined.col, joined.values, joined.linear)
+    own = Connection._of(lb, weak)
+    remember_shapes(own, parts)
+    return own
