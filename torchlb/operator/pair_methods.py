@@ -208,7 +208,7 @@ class PairMethods(OperatorStorage):
             near = None if self.weak.linear.num_rows == 0 else [m[block, block] for m in linear]
             k_of, m_of, shift = stiffness[block, block], mass[block, block], 0.0
             if not self.weak.of_functions:  # fields may be parallel
-                shift = float(self.mass[block].sum() / self.dim) ** (-2 / self.dim)
+                shift = float(self.mass[block].detach().sum() / self.dim) ** (-2 / self.dim)
                 k_of = k_of + shift * m_of
                 near = near and [near[0] + shift * near[1], near[1]]
             basis = pencil_eigenbasis(
