@@ -87,7 +87,7 @@ class Original:
         self.basis = Eigenbasis(*(part.to(device) for part in parts))
         return self
 
-    has_weak_form = True  # its basis stands for a pair
+    _has_weak_form = True  # its basis stands for a pair
 
     def eigenbasis(self, k: int) -> Eigenbasis:
         return self.basis.truncate(k)

@@ -56,6 +56,7 @@ import torch
 import torch.distributed as dist
 from torch import nn
 from torch.nn.parallel import DistributedDataParallel
+from torchlb.linalg.csr import tensors_of
 from torchlb import Diffusion, LaplaceBeltrami
 from torchlb.surfaces import Ellipsoid
 
@@ -80,7 +81,7 @@ class Holds(Takes):
 
 def own_buffers(model):
     modules = model.named_modules()
-    return [f"{name}.{b}" for name, m in modules if isinstance(m, LaplaceBeltrami) for b in m.tensors]
+    return [f"{name}.{b}" for name, m in modules if isinstance(m, LaplaceBeltrami) for b in tensors_of(m)]
 
 
 dist.init_process_group("gloo")

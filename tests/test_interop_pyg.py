@@ -110,7 +110,7 @@ def test_eigenbases_come_along(k, monkeypatch):
     torch.testing.assert_close(ours.eigenvectors, expected.eigenvectors)
     one = to_operator(shapes[1]).eigenbasis(k)
     torch.testing.assert_close(one.eigenvectors, single[1].eigenbasis(k).eigenvectors)
-    closed, expected = lb.invariant_basis(k), theirs.invariant_basis(k)
+    closed, expected = lb._invariant_basis(k), theirs._invariant_basis(k)
     torch.testing.assert_close(closed.left, expected.left)
 
 
@@ -184,7 +184,7 @@ def test_a_batch_has_faces_and_pairs_as_its_shapes_have_them():
     cloud = LaplaceBeltramiTransform(order=1, weak_form=False)(data_of(Sphere().points(50)))
     for order in ([mesh, cloud], [cloud, mesh]):
         lb = to_operator(Batch.from_data_list(order))
-        assert not lb.has_weak_form
+        assert not lb._has_weak_form
         assert len(lb.faces) == sum(len(to_operator(data).faces) for data in order)
 
 

@@ -460,7 +460,7 @@ def test_one_rule_of_types(name):
 @pytest.mark.parametrize("name", ["deflated", "spectral", "convolution", "net"])
 def test_a_stored_basis_that_is_too_short_is_named(name):
     lb = LaplaceBeltrami.from_cotangent(*Sphere().mesh(60))
-    held = lb.float().invariant_basis(8).eigenvectors.shape[1]
+    held = lb.float()._invariant_basis(8).eigenvectors.shape[1]
     with pytest.warns(UserWarning, match=f"basis of {held} pairs, a layer asks for k = {K}"):
         layer_of(name)(features(lb), lb)
 

@@ -87,7 +87,7 @@ def test_the_order_of_the_points_does_not_matter(build, count):
     """Rows, certificate, pair, frames, masses, surface and report are those of the same points."""
     order = torch.randperm(count, generator=torch.Generator().manual_seed(1))
     one, two = build(torch.arange(count)), build(order)
-    for name in ("matrix", *(["stiffness", "mass_matrix"] if one.has_weak_form else [])):
+    for name in ("matrix", *(["stiffness", "mass_matrix"] if one._has_weak_form else [])):
         given, shuffled = (getattr(lb, name).to_dense() for lb in (one, two))
         torch.testing.assert_close(given[order][:, order], shuffled, rtol=1e-12, atol=1e-12)
     for name in ("mass", "frames", "normals", "boundary", "fixed"):

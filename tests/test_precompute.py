@@ -206,7 +206,7 @@ def test_killed_and_resumed_computes_nothing_twice(tmp_path):
     assert [result.name for result in report.failed] == ["broken.ply"]
     assert len(after) == 40
     for file in report.files.values():
-        assert load_operator(file).has_weak_form
+        assert load_operator(file)._has_weak_form
 
 
 def test_the_same_call_runs_on_a_dask_cluster(tmp_path, monkeypatch):

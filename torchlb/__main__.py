@@ -71,7 +71,7 @@ def _stencil_options(command: Callable[..., Any]) -> Callable[..., Any]:
 
 def _stability(lb: LaplaceBeltrami) -> str:
     """What is known of an operator's stability."""
-    pair = "stable: symmetric, positive by its weak pair" if lb.has_weak_form else ""
+    pair = "stable: symmetric, positive by its weak pair" if lb._has_weak_form else ""
     known = [pair, "" if lb.certificate is None else str(lb.certificate)]
     return "\n".join(filter(None, known)) or "no certificate"
 

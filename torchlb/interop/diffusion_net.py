@@ -157,7 +157,7 @@ def _tuple(
     index = torch.stack([row, lb.stencil.col])
     gradient = torch.einsum("exd,de->xe", turn[row], lb.stencil.values[1:])
     weak = -lb.mass[row] * lb.stencil.values[0]
-    if symmetric and lb.has_weak_form:
+    if symmetric and lb._has_weak_form:
         _, col, values = lb.weak.pair
         matrix = _coo(torch.stack([lb.weak.row, col]), values[0], like)
     elif symmetric:

@@ -178,7 +178,7 @@ def _keys(lb: LaplaceBeltrami, k: int) -> dict[str, Any]:
         keys[f"lb_{name}_index"] = torch.stack([pair.col, pair.row])
         keys[f"lb_{name}_values"] = pad(pair.values, (0, 0, 0, more)).T.contiguous()
     if k > 0:
-        basis = lb.invariant_basis(k)
+        basis = lb._invariant_basis(k)
         parts = [getattr(basis, name) for name in BASIS]
         keys["lb_basis"] = torch.cat([part.flatten() for part in parts if part is not None])
         keys["lb_basis_size"] = torch.tensor([basis.eigenvectors.shape[1]])
@@ -209,7 +209,7 @@ def to_operator(data: Any) -> LaplaceBeltrami:
         bases = _bases(data, sizes.tolist())
         basis = stack_eigenbases(bases) if batched else bases[0]
     state = join_states(infos, sizes.tolist()) if batched else infos[0]
-    return LaplaceBeltrami.of_parts(_parts(data, sizes), state, basis)
+    return LaplaceBeltrami._of_parts(_parts(data, sizes), state, basis)
 
 
 def _parts(data: Any, sizes: Int[Tensor, " S"]) -> dict[str, Any]:

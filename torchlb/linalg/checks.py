@@ -21,6 +21,15 @@ def check_tensor(f: object, what: str = "f") -> None:
         )
 
 
+def check_rows(f: Tensor, count: int) -> None:
+    """Raise InputError unless f is (N,), (N, C) or (B, N, C) with N = `count`, InputTypeError unless a tensor."""
+    check_tensor(f)
+    if f.ndim not in (1, 2, 3) or f.shape[max(f.ndim - 2, 0)] != count:
+        raise InputError(
+            f"expected f of shape (N,), (N, C) or (B, N, C) with N = {count}, got {tuple(f.shape)}"
+        )
+
+
 def check_operator(lb: object) -> None:
     """Raise InputTypeError unless `lb` is an operator; swapped arguments are the usual cause.
 

@@ -17,8 +17,7 @@ from scipy import sparse
 from torch import Tensor, nn
 from torch.nn.functional import pad
 
-from torchlb.errors import InputError
-from torchlb.linalg.checks import check_tensor
+from torchlb.linalg.checks import check_rows
 from torchlb.linalg.sparse import csr_product, csr_tensor, to_scipy, transpose_pattern
 
 Held = TypeVar("Held", bound="Tensors")
@@ -77,17 +76,17 @@ class Tensors(nn.Module):
         }
         return other
 
-    @property
-    def tensors(self) -> dict[str, Tensor]:
-        """All buffers by name, including those of submodules and those that share memory."""
-        return dict(self.named_buffers(remove_duplicate=False))
-
     def _load_from_state_dict(self, state_dict: Any, prefix: str, *given: Any) -> None:  # pyright: ignore[reportIncompatibleMethodOverride]
         for name, buffer in self._buffers.items():
             incoming = state_dict.get(prefix + name)
             if incoming is not None and buffer is not None:
                 setattr(self, name, torch.empty_like(incoming, device=buffer.device))
         super()._load_from_state_dict(state_dict, prefix, *given)
+
+
+def tensors_of(module: nn.Module) -> dict[str, Tensor]:
+    """All buffers by name, including those of submodules and those that share memory."""
+    return dict(module.named_buffers(remove_duplicate=False))
 
 
 class Record(Tensors):
@@ -101,14 +100,16 @@ class Record(Tensors):
     @staticmethod
     def join(records: Sequence[Tensors]) -> Record:
         """Record of a batch."""
-        names = records[0].tensors
-        return Record({n: torch.cat([each.tensors[n] for each in records]) for n in names})
+        names = tensors_of(records[0])
+        return Record({n: torch.cat([tensors_of(each)[n] for each in records]) for n in names})
 
     def split(self, sizes: Sequence[int]) -> list[Record]:
         """Records of the shapes of a batch, with `sizes` points."""
-        rows = zip(*(tensor.split(list(sizes)) for tensor in self.tensors.values()), strict=True)
+        rows = zip(
+            *(tensor.split(list(sizes)) for tensor in tensors_of(self).values()), strict=True
+        )
         copies = [map(torch.clone, row) for row in rows]  # do not keep the batch alive
-        return [Record(dict(zip(self.tensors, row, strict=True))) for row in copies]
+        return [Record(dict(zip(tensors_of(self), row, strict=True))) for row in copies]
 
 
 class Csr(Tensors):
@@ -211,11 +212,7 @@ class Csr(Tensors):
 
         Raises InputError for another shape.
         """
-        check_tensor(f)
-        if f.ndim not in (1, 2, 3) or f.shape[max(f.ndim - 2, 0)] != self.num_rows:
-            raise InputError(
-                f"expected f of shape (N,), (N, C) or (B, N, C) with N = {self.num_rows}, got {tuple(f.shape)}"
-            )
+        check_rows(f, self.num_rows)
         values = self.values[channel] if dtype is None else self.values[channel].to(dtype)
         return shaped_like(csr_product(self.pattern, values, side_by_side(f), transposed), f)
 

@@ -13,7 +13,7 @@ from torch import Tensor
 from torchlb.errors import InputError
 from torchlb.galerkin.tangent import TangentForms, connection_matrices
 from torchlb.linalg.checks import check_tensor
-from torchlb.linalg.csr import Csr
+from torchlb.linalg.csr import Csr, tensors_of
 from torchlb.operator.batching import remember_shapes, shapes_of
 from torchlb.operator.medium import elements_of, plain
 from torchlb.operator.pair_methods import PairMethods, check_pair
@@ -112,7 +112,7 @@ def connection_of(lb: Any) -> Connection:
 
 
 def _of_shape(lb: Any) -> Connection:
-    if lb._in_medium and not lb._medium.tensors:
+    if lb._in_medium and not tensors_of(lb._medium):
         raise InputError(
             "connection: the medium of this operator is not known, as it comes from a batch"
         )

@@ -14,7 +14,7 @@ from torchlb.cloud.surface import SurfaceSummary
 from torchlb.errors import InputError, InputTypeError
 from torchlb.fits.rules import WeightsName
 from torchlb.geometry.frames import Projection
-from torchlb.linalg.csr import Csr, Record
+from torchlb.linalg.csr import Csr, Record, tensors_of
 from torchlb.operator import build
 from torchlb.operator.batching import (
     check_alike,
@@ -228,13 +228,13 @@ class LaplaceBeltrami(StencilMethods, PairMethods):
             raise InputError("batch: got no shapes")
         check_alike(shapes)
         sizes = [n for shape in shapes for n in shape.sizes or (shape.num_points,)]
-        if all(shape.has_weak_form for shape in shapes):
+        if all(shape._has_weak_form for shape in shapes):
             _ = [shape.weak.radius for shape in shapes]  # computed here, once, where one was loaded
         state = join_states([shape.get_extra_state() for shape in shapes], sizes)
         bases = [shape._basis for shape in shapes if shape._basis and not shape.sizes]
         with torch.inference_mode(False):
             basis = stack_eigenbases(bases) if len(bases) == len(shapes) else None
-            joined = cls.of_parts(joined_parts(shapes), state, basis)
+            joined = cls._of_parts(joined_parts(shapes), state, basis)
         remember_shapes(joined, shapes)
         joined._carries = any(origins(shape) is not None for shape in shapes)
         return joined
@@ -245,7 +245,7 @@ class LaplaceBeltrami(StencilMethods, PairMethods):
 
         Raises InputError for batches, the cotangent operator, and operators without a weak pair.
         """
-        if self._plan is None and self.source in ("mesh", "points") and self.has_weak_form:
+        if self._plan is None and self.source in ("mesh", "points") and self._has_weak_form:
             self._plan, self._planned = built_again(self).plan, None
         if self._plan is None:
             raise InputError(
@@ -295,11 +295,11 @@ class LaplaceBeltrami(StencilMethods, PairMethods):
         lb = carrying(lb, points)
         if not self._in_medium:
             return lb
-        if not self._medium.tensors:
+        if not tensors_of(self._medium):
             raise InputError(
                 "at: the medium of this operator is not known, as it comes from a batch"
             )
-        return lb.with_medium(**self._medium.tensors)
+        return lb.with_medium(**tensors_of(self._medium))
 
     def with_medium(
         self,
@@ -363,7 +363,7 @@ class LaplaceBeltrami(StencilMethods, PairMethods):
         basis = self._basis
         bases = [None] * len(self.sizes) if basis is None else unstack_eigenbases(basis)
         shapes = zip(split_parts(self, self.sizes), self._states, bases, strict=True)
-        return [type(self).of_parts(*shape) for shape in shapes]
+        return [type(self)._of_parts(*shape) for shape in shapes]
 
     @classmethod
     def _from_assembled(cls, built: build.AssembledOperator, given: ArrayLike) -> LaplaceBeltrami:
@@ -386,23 +386,11 @@ class LaplaceBeltrami(StencilMethods, PairMethods):
             parts["weak"] = PairMatrices(**vars(pair.matrices), linear=linear)
         if built.on_boundary is not None and built.on_boundary.any():
             parts["_on_boundary"] = built.on_boundary
-        lb = cls.of_parts(parts, {"source": built.source, "options": built.options})
+        lb = cls._of_parts(parts, {"source": built.source, "options": built.options})
         lb.certificate, lb.surface, lb._plan = built.certificate, built.surface, built.plan
-        if lb.has_weak_form:
+        if lb._has_weak_form:
             _ = lb.weak.radius  # before the values are rounded
         return lb.to(float_type(given))
-
-    def __repr__(self) -> str:
-        """N, d, n, source and options."""
-        if self.source == "empty":
-            return "LaplaceBeltrami(empty)"
-        size = f"{self.num_points} points, dim={self.dim} in R^{self.points.shape[1]}, from {self.source}"
-        options = self.options | {"condition": self.condition}
-        options = [f"{k}={v!r}" for k, v in options.items() if v is not None]
-        certified = "" if self.certificate is None or self.certificate.holds else "NOT STABLE"
-        last = [f"{len(self.stencil.col)} entries", str(self.dtype), certified]
-        inside = ", ".join(part for part in [size, *options, *last] if part)
-        return f"LaplaceBeltrami({inside})"
 
 
 # A whole module can be read back with torch.load(weights_only=True) where torchlb is imported.

@@ -10,6 +10,7 @@ from scipy import sparse
 from torch import Tensor
 
 from torchlb.errors import InputError
+from torchlb.linalg.checks import check_rows
 from torchlb.linalg.csr import Csr
 from torchlb.linalg.sparse import csr_tensor, to_scipy
 from torchlb.linalg.threads import threads_for
@@ -35,7 +36,7 @@ NO_PAIR = (
 
 def check_pair(lb: Any) -> None:
     """Raise InputError for an operator without a weak pair, on which eigenpairs, flows and solves rest."""
-    if not lb.has_weak_form:
+    if not lb._has_weak_form:
         raise InputError(NO_PAIR.format("eigenpairs, flows and solves"))
 
 
@@ -43,7 +44,7 @@ class PairMethods(OperatorStorage):
     """Stiffness and mass matrix of the weak pair, and its eigenbasis."""
 
     @property
-    def has_weak_form(self) -> bool:
+    def _has_weak_form(self) -> bool:
         """Whether the operator has a weak pair; only one built with weak_form=False has none."""
         return self.weak.num_rows > 0
 
@@ -81,7 +82,7 @@ class PairMethods(OperatorStorage):
             raise InputError(f"name: expected one of {list(get_args(MatrixName))}, got {name!r}")
         if name == "laplacian":
             return self.stencil, 0
-        if not self.has_weak_form:
+        if not self._has_weak_form:
             raise InputError(NO_PAIR.format(name))
         if name == "boundary_mass" and not self.weak.has_boundary:
             raise InputError("boundary_mass: the shape is closed")
@@ -106,6 +107,36 @@ class PairMethods(OperatorStorage):
         matrices, channel = self._channel(name)
         result = matrices.product(channel, f)
         return through_product(self, name, f, result)
+
+    def integral(self, f: Tensor) -> Tensor:
+        """∫f over the shape, by the weights `mass`: () for f (N,), (C,) for (N, C), (B, C) for (B, N, C).
+
+        Of a batch of S shapes one for each, (S,), (S, C) or (B, S, C). Units of f by ℓ^d.
+
+        >>> from torchlb import LaplaceBeltrami
+        >>> from torchlb.surfaces import Sphere
+        >>> lb = LaplaceBeltrami.from_mesh(*Sphere().mesh(500))
+        >>> bool((lb.integral(lb.points.square()) - 4 * torch.pi / 3).abs().max() < 1e-4)
+        True
+        """
+        check_rows(f, self.num_points)
+        weights = self.mass.to(torch.promote_types(f.dtype, self.dtype))
+        return self._summed((weights if f.ndim == 1 else weights[:, None]) * f)
+
+    def inner(self, f: Tensor, g: Tensor) -> Tensor:
+        """∫fg = fᵀMg for functions of equal shape, with the density of a medium if any; shapes as for `integral`."""
+        if f.shape != g.shape:
+            raise InputError(
+                f"inner: expected equal shapes, got {tuple(f.shape)}, {tuple(g.shape)}"
+            )
+        return self._summed(f * self.product("mass", g))
+
+    def _summed(self, x: Tensor) -> Tensor:
+        """Sums over the points of each shape."""
+        where = max(x.ndim - 2, 0)
+        if self.sizes is None:
+            return x.sum(where)
+        return torch.stack([part.sum(where) for part in x.split(self.sizes, where)], where)
 
     def to_scipy(self, name: MatrixName = "laplacian") -> sparse.csr_array:
         """Δ, or another matrix of the operator, as a scipy CSR matrix (N, N) on the CPU.
@@ -151,7 +182,7 @@ class PairMethods(OperatorStorage):
         count = k + (0 if origins(self) is None else BEYOND)
         return through_eigenpairs(self, self._known_basis(count, tolerance, store), k)
 
-    def invariant_basis(
+    def _invariant_basis(
         self, k: int, *, tolerance: float | None = None, store: bool = False
     ) -> Eigenbasis:
         """All eigenpairs known, at least k, so that their span is invariant under Δ; otherwise as `eigenbasis`.
@@ -162,7 +193,7 @@ class PairMethods(OperatorStorage):
         if origins(self) is None:
             return basis
         held = {
-            name: without(self, getattr(basis, name), "invariant_basis and the deflated flow")
+            name: without(self, getattr(basis, name), "the deflated flow")
             for name in ("eigenvalues", "eigenvectors", "left")
         }
         return replace(basis, **held)

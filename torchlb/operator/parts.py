@@ -12,7 +12,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from torchlb.galerkin.medium import Field, FieldName
-from torchlb.linalg.csr import Csr, Tensors
+from torchlb.linalg.csr import Csr, Tensors, tensors_of
 from torchlb.linalg.exponential import spectral_radius
 from torchlb.linalg.sparse import to_scipy
 from torchlb.spectral.eigenbasis import Eigenbasis
@@ -137,7 +137,7 @@ class MediumFields(Tensors):
         """The fields, which are on the faces where there are not as many as points."""
         return {
             name: Field(values, len(values) != num_points, name != "potential")
-            for name, values in self.tensors.items()
+            for name, values in tensors_of(self).items()
         }
 
     def _load_from_state_dict(self, state_dict: Any, prefix: str, *given: Any) -> None:  # pyright: ignore[reportIncompatibleMethodOverride]

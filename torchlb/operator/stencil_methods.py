@@ -9,7 +9,8 @@ from torch import Tensor
 from torchlb.errors import InputError
 from torchlb.geometry.boundary import boundary_faces
 from torchlb.linalg.checks import check_tensor
-from torchlb.operator.curvature import Curvatures, curvatures_of
+from torchlb.linalg.csr import tensors_of
+from torchlb.operator.curvature import Curvatures, curvatures_of, turned_frames
 from torchlb.operator.report import StencilReport
 from torchlb.operator.storage import OperatorStorage
 
@@ -27,7 +28,7 @@ class StencilMethods(OperatorStorage):
         """The order that each point reached, and why not more; print it."""
         if len(self._record.order) != self.num_points:
             raise InputError("report: PyG's Data do not carry it; it is with the operator as built")
-        order, fields = self.options.get("order", 0), self._record.tensors
+        order, fields = self.options.get("order", 0), tensors_of(self._record)
         return StencilReport(order, self.dim, **fields, surface=self.surface)
 
     def forward(self, f: Float[Tensor, "*batch N C"] | Float[Tensor, " N"]) -> Tensor:
@@ -59,12 +60,13 @@ class StencilMethods(OperatorStorage):
         local = self.local_gradient(f)
         return self._turned("ind,id->in" if f.ndim == 1 else "ind,...idc->...inc", local)
 
-    def _turned(self, equation: str, local: Tensor) -> Tensor:
-        """The frames times a field, in its type, also under autocast: rounding before a derivative grows by 1/h."""
+    def _turned(self, equation: str, local: Tensor, frames: Tensor | None = None) -> Tensor:
+        """Frames times a field, in its type, also under autocast: rounding before a derivative grows by 1/h."""
         if torch.is_autocast_enabled(local.device.type):
             with torch.autocast(local.device.type, enabled=False):
-                return self._turned(equation, local)
-        return torch.einsum(equation, self.frames.to(local.dtype), local)
+                return self._turned(equation, local, frames)
+        frames = self.frames if frames is None else frames
+        return torch.einsum(equation, frames.to(local.dtype), local)
 
     def divergence(self, v: Tensor) -> Tensor:
         """div v = Σ_c E_c · ∂_c v of space vectors v: (N,) for (N, n), (N, C) for (N, n, C), batches (B, N, C) too.
@@ -73,9 +75,27 @@ class StencilMethods(OperatorStorage):
         curvature. Units of v by 1/ℓ. It is consistent, but neither −1 times the adjoint of `gradient` nor exactly
         conservative: ∫ div v = 0 on a closed surface, and div ∇f = Δf, up to the order of the stencils.
         """
+        return self._contracted(v, self.frames)
+
+    def curl(self, v: Tensor) -> Tensor:
+        """curl v = ν·(∇ × v) = div(v × ν) of space vectors v on a surface in R³ with normals ν; shapes as `divergence`.
+
+        What v has of a normal part does not count. Units of v by 1/ℓ. Raises InputError for other shapes.
+
+        >>> from torchlb import LaplaceBeltrami
+        >>> from torchlb.surfaces import Sphere
+        >>> lb = LaplaceBeltrami.from_mesh(*Sphere().mesh(500))
+        >>> turning = torch.linalg.cross(torch.tensor([[0.0, 0.0, 1.0]]).to(lb.points), lb.points)
+        >>> bool((lb.curl(turning) - 2 * lb.points[:, 2]).abs().max() < 1e-2)
+        True
+        """
+        return self._contracted(v, turned_frames(self))
+
+    def _contracted(self, v: Tensor, frames: Tensor) -> Tensor:
+        """Σ_c F_c · ∂_c v for vectors F_c at each point, (N, n, d)."""
         check_tensor(v, "v")
         if v.ndim == 2:
-            return self.divergence(v[..., None])[:, 0]
+            return self._contracted(v[..., None], frames)[:, 0]
         size, n = self.num_points, self.points.shape[1]
         if not (v.ndim in (3, 4) and v.shape[-3:-1] == (size, n)):
             raise InputError(
@@ -83,7 +103,7 @@ class StencilMethods(OperatorStorage):
                 f"{tuple(v.shape)}"
             )
         local = self.local_gradient(v.flatten(-2)).unflatten(-1, v.shape[-2:])  # (…, N, d, n, C)
-        return self._turned("ind,...idnc->...ic", local)
+        return self._turned("ind,...idnc->...ic", local, frames)
 
     def hessian(self, f: Tensor) -> Tensor:
         """∇²f, covariant second derivatives E_b·∂_a(∇f) in the frames: (N, d, d) for f (N,), (N, d, d, C) for (N, C).

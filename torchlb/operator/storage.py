@@ -96,7 +96,7 @@ class OperatorStorage(Tensors):
         self._sizes = None if sizes is None else [torch.empty(n, 0) for n in sizes]
 
     @classmethod
-    def of_parts(
+    def _of_parts(
         cls: type[Storage],
         parts: dict[str, Any],
         state: dict[str, Any],
@@ -193,6 +193,18 @@ class OperatorStorage(Tensors):
         An operator does not follow its points: after scaling, turning, or taking a part of them it is another one.
         """
         check_same_points(points, self.points)
+
+    def __repr__(self) -> str:
+        """N, d, n, source and options."""
+        if self.source == "empty":
+            return f"{type(self).__name__}(empty)"
+        size = f"{self.num_points} points, dim={self.dim} in R^{self.points.shape[1]}, from {self.source}"
+        options = self.options | {"condition": self.condition}
+        options = [f"{k}={v!r}" for k, v in options.items() if v is not None]
+        certified = "" if self.certificate is None or self.certificate.holds else "NOT STABLE"
+        last = [f"{len(self.stencil.col)} entries", str(self.dtype), certified]
+        inside = ", ".join(part for part in [size, *options, *last] if part)
+        return f"{type(self).__name__}({inside})"
 
     def get_extra_state(self) -> dict[str, Any]:
         """Source, options, certificate, spectral radius and the surface's summary, plain types only."""

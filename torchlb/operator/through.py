@@ -17,7 +17,7 @@ from torch import Tensor
 from torchlb.errors import DerivativeError, first_few
 from torchlb.galerkin.bilinear import BilinearForm
 from torchlb.galerkin.medium import Field
-from torchlb.linalg.csr import side_by_side
+from torchlb.linalg.csr import side_by_side, tensors_of
 from torchlb.linalg.once import once_differentiable
 from torchlb.operator.batching import shapes_of
 from torchlb.operator.medium import elements_of, plain
@@ -115,7 +115,7 @@ def origins(lb: Any) -> Origins | None:
 
     Raises DerivativeError for a batch whose shapes are no longer known.
     """
-    held = [lb.points, *lb._medium.tensors.values()]
+    held = [lb.points, *tensors_of(lb._medium).values()]
     carries = lb._carries or any(t.requires_grad for t in held)
     if not (carries and torch.is_grad_enabled()):
         return None
@@ -226,7 +226,7 @@ def carrying(lb: Any, points: Any) -> Any:
     """
     if not (isinstance(points, Tensor) and points.requires_grad and torch.is_grad_enabled()):
         return lb
-    if not lb.has_weak_form or len(lb.plan.moved):
+    if not lb._has_weak_form or len(lb.plan.moved):
         raise DerivativeError(
             "points: they require gradients, which there are none of without a weak pair and of noisy curves, whose "
             "points are moved; pass points.detach() if results may be constants of them"

@@ -63,7 +63,7 @@ def geodesic_distance(
     True
     """
     check_operator(lb)
-    start = _sources(lb, sources)
+    start = source_points(lb, sources)
     points = lb.points.detach().cpu().double().numpy()
     row, col = _edges(lb)
     length = _distances(points, row, col)
@@ -78,7 +78,7 @@ def geodesic_distance(
     return without(lb, torch.from_numpy(distance).to(lb.mass), "distances")
 
 
-def _sources(lb: LaplaceBeltrami, sources: int | Sequence[int] | Tensor) -> Int[Tensor, " S"]:
+def source_points(lb: LaplaceBeltrami, sources: int | Sequence[int] | Tensor) -> Int[Tensor, " S"]:
     index = torch.as_tensor(sources)
     if index.dtype == torch.bool and index.shape == (lb.num_points,):
         index = index.nonzero()
@@ -97,7 +97,7 @@ def _edges(lb: LaplaceBeltrami) -> tuple[np.ndarray, np.ndarray]:
     matrix: Any = mesh_graph(lb.faces.cpu(), lb.num_points)
     if len(lb.faces) == 0 or lb.source not in FROM_MESH:
         crow, col = (
-            lb.weak.linear_pair[:2] if lb.has_weak_form else (lb.stencil.crow, lb.stencil.col)
+            lb.weak.linear_pair[:2] if lb._has_weak_form else (lb.stencil.crow, lb.stencil.col)
         )
         where = (np.ones(len(col)), col.cpu().numpy(), crow.cpu().numpy())
         near = sparse.csr_array(where, shape=lb.shape)

@@ -94,7 +94,7 @@ def flow(
     if method == "spectral":
         return _spectral(lb.eigenbasis(k), x, time)
     if method == "deflated":
-        return _deflated(lb, lb.invariant_basis(k), x, time, tolerance)
+        return _deflated(lb, lb._invariant_basis(k), x, time, tolerance)
     return pair_flow(lb, x, time, tolerance).to(x.dtype)
 
 

@@ -83,7 +83,7 @@ def implicit_step(
         right = right + time * lb.product("boundary_mass", fluxes)
     if given is not None:
         right = right - _product(lb, 1, given) - time * _product(lb, 0, given)
-    u = _solved(lb, right, time, columns, given, tolerance)
+    u = solved(lb, right, time, columns, given, tolerance)
     return shaped_like(u, f).to(x.dtype)
 
 
@@ -121,7 +121,7 @@ def poisson_solve(
         right = right + lb.product("boundary_mass", fluxes)
     if given is not None:
         right = right - _product(lb, 0, given)
-    u = _solved(lb, right, None, columns, given, tolerance)
+    u = solved(lb, right, None, columns, given, tolerance)
     return shaped_like(u, f).to(x.dtype)
 
 
@@ -165,7 +165,7 @@ def potential(
         columns = without(lb, columns, "solutions by P1 elements")
         u = _solve(columns, None, None, None, lb, None, tolerance)
     else:
-        u = _solved(lb, columns, None, torch.zeros_like(columns), None, tolerance)
+        u = solved(lb, columns, None, torch.zeros_like(columns), None, tolerance)
     return shaped_like(u, source).to(source.dtype)
 
 
@@ -223,7 +223,7 @@ def _product(lb: LaplaceBeltrami, number: int, x: Tensor) -> Tensor:
     return symmetric_product(crow, col, values[number].to(x), x)
 
 
-def _solved(
+def solved(
     lb: LaplaceBeltrami,
     right: Float[Tensor, "N C"],
     time: Float[Tensor, " C"] | None,

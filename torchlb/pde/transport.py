@@ -1,0 +1,163 @@
+"""Tangent fields: their heat flow, parallel transport, and the logarithmic map (`method.md`, section 18)."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+from torch.nn.functional import normalize
+
+from torchlb.errors import InputError
+from torchlb.linalg.precision import LOW, ROOT_EPS, ROUNDING, TINY
+from torchlb.operator.laplace_beltrami import LaplaceBeltrami
+from torchlb.pde.geodesics import geodesic_distance, source_points
+from torchlb.pde.heat import heat_flow
+from torchlb.pde.solves import solved
+
+SHORT = 2.0
+"""Time of transport over the square of the mean spacing: at half of it the source is hardly resolved."""
+FARTHEST = -math.log(torch.finfo(torch.float32).tiny)
+"""Largest distance over √t: what has decayed further is zero in float32, in which steps are preconditioned."""
+
+
+def vector_heat_flow(
+    lb: LaplaceBeltrami,
+    v: Float[Tensor, "N n C"] | Float[Tensor, "N n"],
+    t: float | Tensor,
+    *,
+    tolerance: float = ROOT_EPS,
+) -> Tensor:
+    """The tangential part of v after a time t of heat flow by the connection Laplacian, ∂_t v = −∇*∇v.
+
+    Parameters
+    ----------
+    lb
+        Operator of one shape, or of a batch.
+    v
+        Space vectors, (N, n) or (N, n, C).
+    t, tolerance
+        As for `heat_flow`.
+
+    Differentiable in v, t, points and medium. Raises InputError for other shapes, and without a weak pair.
+
+    >>> from torchlb.surfaces import Sphere
+    >>> lb = LaplaceBeltrami.from_mesh(*Sphere().mesh(500))
+    >>> axis = torch.tensor([[0.0, 0.0, 1.0]], dtype=torch.float64)
+    >>> v = torch.linalg.cross(axis, lb.points)  # an eigenfield, λ = 1
+    >>> bool((vector_heat_flow(lb, v, 0.5) - torch.exp(torch.tensor(-0.5)) * v).abs().max() < 1e-3)
+    True
+    """
+    fields = lb.connection
+    return fields.vectors(heat_flow(fields, fields.components(v), t, tolerance=tolerance))
+
+
+def parallel_transport(
+    lb: LaplaceBeltrami,
+    sources: int | Int[Tensor, " S"],
+    vectors: Float[Tensor, " n"] | Float[Tensor, "S n"] | Float[Tensor, "S n C"],
+) -> Float[Tensor, "N n"] | Float[Tensor, "N n C"]:
+    """Vectors at the sources, transported to all points along shortest paths from the nearest source.
+
+    By the vector heat method (Sharp, Soliman, Crane 2019): the direction is that of an implicit step of the connection
+    Laplacian, extrapolated from two short times to none; the length is the ratio of two steps of functions.
+
+    Parameters
+    ----------
+    lb
+        Operator of one shape.
+    sources
+        Index of a point, or indices of several.
+    vectors
+        Their space vectors, of which the tangential part counts; with C channels so many fields.
+
+    Differentiable in the vectors, points and medium. Zero where no path leads to a source. Raises InputError for
+    indices out of range and vectors of other shapes.
+
+    >>> from torchlb.surfaces import Sphere
+    >>> lb = LaplaceBeltrami.from_mesh(*Sphere().mesh(500))
+    >>> moved = parallel_transport(lb, 0, lb.frames[0, :, 0])
+    >>> bool((moved.norm(dim=1) - 1).abs().max() < 1e-12)
+    True
+    """
+    index = source_points(lb, sources)
+    given = vectors[None] if vectors.ndim == 1 else vectors
+    if given.ndim not in (2, 3) or given.shape[:2] != (len(index), lb.points.shape[1]):
+        raise InputError(
+            f"vectors: expected shape (S, n) or (S, n, C) with S = {len(index)}, n = {lb.points.shape[1]}, got "
+            f"{tuple(vectors.shape)}"
+        )
+    columns = given[..., None] if given.ndim == 2 else given
+    local = torch.einsum("snd,snc->sdc", lb.frames[index].double(), columns.double())
+    count, width = lb.num_points, columns.shape[2]
+    start = local.new_zeros(count, lb.dim, width).index_add(0, index, local)
+    t = _time(lb, geodesic_distance(lb, index))
+    direction = _directions(lb, start, t)
+    size = local.norm(dim=1)
+    lengths = size.amin(0).expand(count, -1)
+    if len(index) > 1:
+        spread = size.new_zeros(count, 1 + width)
+        spread = spread.index_add(0, index, torch.cat([torch.ones_like(size[:, :1]), size], 1))
+        reached = _step(lb, spread, t)
+        lengths = reached[:, 1:] / reached[:, :1].clamp_min(TINY)
+        lengths = lengths.clamp(size.amin(0), size.amax(0))
+    moved = (direction * lengths[:, None]).to(vectors)
+    return moved if given.ndim == 3 else moved[..., 0]
+
+
+def logarithmic_map(
+    lb: LaplaceBeltrami, sources: int | Int[Tensor, " S"]
+) -> Float[Tensor, "N d"] | Float[Tensor, "N d S"]:
+    """Normal coordinates of all points: the initial velocities, in the source's frame, of shortest paths in unit time.
+
+    At a point at the distance r they are r times the direction of ∇(r²/2) there, in the parallel transport of the
+    frame. One map for one source, (N, d), maps (N, d, S) for several. Not smooth where shortest paths from a source
+    meet; NaN where no path leads to it. Errors as for `parallel_transport`; without derivatives in the points.
+
+    >>> from torchlb.surfaces import Sphere
+    >>> lb = LaplaceBeltrami.from_mesh(*Sphere().mesh(500))
+    >>> x = logarithmic_map(lb, 0)
+    >>> bool((x.norm(dim=1) - geodesic_distance(lb, 0)).abs().max() < 1e-9)
+    True
+    """
+    index, dim = source_points(lb, sources), lb.dim
+    places = torch.arange(len(index)).to(index)
+    start = torch.zeros(lb.num_points, dim, len(index), dim, dtype=torch.float64).to(index.device)
+    start[index, :, places] = torch.eye(dim, dtype=torch.float64).to(start)
+    distance = torch.stack([geodesic_distance(lb, int(i)) for i in index], 1).double()
+    frame = _directions(lb, start.flatten(2), _time(lb, distance)).unflatten(2, (-1, dim))
+    slope = lb.gradient(torch.where(distance.isfinite(), distance, 0.0).square() / 2)
+    local = normalize(torch.einsum("insd,ins->ids", frame, slope), dim=1, eps=TINY)
+    found = torch.where(distance == 0, 0.0, distance)[:, None] * local
+    return (found if torch.as_tensor(sources).ndim else found[..., 0]).to(lb.points)
+
+
+def _time(lb: LaplaceBeltrami, distance: Tensor) -> float:
+    """Time of the shorter step, ℓ², by the spacing and the largest distance from a source."""
+    spacing = float(lb.mass.detach().double().mean()) ** (1 / lb.dim)
+    longest = float(distance[distance.isfinite()].max())
+    return max(SHORT * spacing**2, (longest / (1 - LOW) / FARTHEST) ** 2)
+
+
+def _directions(
+    lb: LaplaceBeltrami, start: Float[Tensor, "N d C"], t: float
+) -> Float[Tensor, "N n C"]:
+    """Unit space vectors of the transport of each column from the points where it is not zero.
+
+    An implicit step mixes paths within a width of (r²t)^{1/4} at the distance r, so that its direction is off in
+    proportion to √t; that of four times the time cancels this.
+    """
+    one, two = (
+        normalize(
+            lb.connection.vectors(_step(lb.connection, start.flatten(0, 1), time)), dim=1, eps=TINY
+        )
+        for time in (t, 4 * t)
+    )
+    return normalize(2 * one - two, dim=1, eps=TINY)
+
+
+def _step(fields: Any, b: Float[Tensor, "rows C"], t: float) -> Float[Tensor, "rows C"]:
+    """(M + tK)⁻¹b, as exact as rounding allows, since values far away are tiny."""
+    return solved(fields, b, b.new_full((b.shape[1],), t), torch.zeros_like(b), None, ROUNDING)
