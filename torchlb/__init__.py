@@ -36,12 +36,15 @@ from torchlb.nn.poisson_block import PoissonBlock, PoissonFeatures
 from torchlb.nn.spectral_conv import SpectralConv
 from torchlb.operator.cleaning import clean_mesh, clean_points
 from torchlb.operator.collate import collate
+from torchlb.operator.connection import Connection
 from torchlb.operator.curvature import Curvatures
 from torchlb.operator.laplace_beltrami import LaplaceBeltrami
 from torchlb.operator.report import StencilReport
 from torchlb.pde.geodesics import geodesic_distance
 from torchlb.pde.heat import heat_flow
+from torchlb.pde.hodge import HodgeParts, hodge_decomposition
 from torchlb.pde.solves import implicit_step, poisson_solve
+from torchlb.pde.transport import logarithmic_map, parallel_transport, vector_heat_flow
 from torchlb.spectral.eigenbasis import Eigenbasis
 from torchlb.spectral.signatures import (
     diffusion_distance,
@@ -56,6 +59,7 @@ from torchlb.version import __version__
 __all__ = [
     "CacheWarning",
     "Certificate",
+    "Connection",
     "Curvatures",
     "DerivativeError",
     "Diffusion",
@@ -65,6 +69,7 @@ __all__ = [
     "Eigenbasis",
     "EigenbasisError",
     "GradientFeatures",
+    "HodgeParts",
     "ImplicitDiffusion",
     "InputError",
     "InputTypeError",
@@ -90,16 +95,20 @@ __all__ = [
     "geodesic_distance",
     "heat_flow",
     "heat_kernel_signature",
+    "hodge_decomposition",
     "implicit_step",
     "load_operator",
     "load_or_build",
+    "logarithmic_map",
     "operator_key",
+    "parallel_transport",
     "poisson_solve",
     "precompute_operators",
     "read_shape",
     "save_operator",
     "spectral_wavelets",
     "surfaces",
+    "vector_heat_flow",
     "wave_kernel_signature",
 ]
 

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cache, partial
-from itertools import combinations_with_replacement
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -16,12 +15,9 @@ from torch import Tensor
 
 from torchlb.galerkin.assembly import (
     area_element,
-    conductance,
     element_matrices,
     flat_metric,
-    gradient_products,
     in_cells,
-    linear_blocks,
     linear_elements,
     spread,
     summed,
@@ -31,7 +27,7 @@ from torchlb.galerkin.bilinear import BilinearForm, outer, weighted_products, we
 from torchlb.galerkin.curving import CurvedMesh, CurvingPlan
 from torchlb.galerkin.delaunay import sound_lengths
 from torchlb.galerkin.elements import Element, simplex, subsets
-from torchlb.galerkin.medium import Field, Medium, projector
+from torchlb.galerkin.medium import Field, Medium, orthonormal
 from torchlb.galerkin.prolongation import prolongation
 from torchlb.geometry.local_fits import FitPlan, LocalFits
 from torchlb.geometry.numbering import Numbering
@@ -197,22 +193,30 @@ class Forms:
         x, corners = field.values, simplex(self.element.dim, 1)
         if field.on_faces:
             own = spread(x[self.faces], self.element)
-            return [own, *(_along(partial(_times, flat.mix), x) for flat in self.flats)]
+            return [own, *(_along(partial(times, flat.mix), x) for flat in self.flats)]
         before, after = field.transforms
         y = before(x)
-        nodes = at(_along(prolong or partial(_times, self.prolongation), y), self.nodes)
+        nodes = at(_along(prolong or partial(times, self.prolongation), y), self.nodes)
         found = [after(torch.einsum("qn,tn...->tq...", self.element.values, nodes))]
         for flat in self.flats:
             inside = after(torch.einsum("qc,tc...->tq...", corners.values, at(y, flat.cells)))
-            found.append(_mean(inside, corners))
+            found.append(cell_mean(inside, corners))
         return found
 
     def projectors(self) -> list[Tensor]:
         """Π onto the tangent plane, (…, n, n), where `values` has those of a field."""
+        return [frame @ frame.mT for frame in self.tangents()]
+
+    def tangents(self) -> list[Tensor]:
+        """Orthonormal tangent vectors, (…, n, d), oriented as the cells are, where `values` has those of a field."""
+        return [orthonormal(slopes) for slopes in self.slopes()]
+
+    def slopes(self) -> list[Tensor]:
+        """Derivatives of the position in reference coordinates, (…, n, d), where `values` has those of a field."""
         places = at(self.places, self.nodes)
-        slopes = torch.einsum("tnk,qnd->tqkd", places, self.element.gradients)
         corners = [at(self.points, flat.cells) for flat in self.flats]
-        return [projector(slopes), *(projector((x[:, 1:] - x[:, :1]).mT) for x in corners)]
+        own = torch.einsum("tnk,qnd->tqkd", places, self.element.gradients)
+        return [own, *((x[:, 1:] - x[:, :1]).mT for x in corners)]
 
     def matrix(
         self, conductivity: list[Tensor] | None = None, density: list[Tensor] | None = None
@@ -227,7 +231,7 @@ class Forms:
         self, conductivity: list[Tensor] | None = None, density: list[Tensor] | None = None
     ) -> Tensor:
         """Element matrices K_FE + iM_FE of the curved elements, (T, n²)."""
-        kappa = None if conductivity is None else self._on_curved(conductivity[0])
+        kappa = None if conductivity is None else self.on_curved(conductivity[0])
         rho = None if density is None else density[0]
         blocks = element_matrices(self.metric, self.element, kappa, rho)
         return blocks if self.shares is None else self.shares[:, None] * blocks
@@ -243,9 +247,9 @@ class Forms:
         `flat` has the part of the flat cells, if it is known.
         """
         kappa, rho = (
-            None if x is None else _mean(x[0], self.element) for x in (conductivity, density)
+            None if x is None else cell_mean(x[0], self.element) for x in (conductivity, density)
         )
-        kappa = self._on_flat(kappa, self.cells, self.lengths)
+        kappa = self.on_flat(kappa, self.cells, self.lengths)
         own = linear_elements(
             self.lengths, self.cells, len(self.points), kappa, rho, shares=self.shares
         )
@@ -262,41 +266,10 @@ class Forms:
         total: Any = sparse.csr_array((count, count), dtype=complex)
         for number, flat in enumerate(self.flats, 1):
             kappa, rho = (None if x is None else x[number] for x in (conductivity, density))
-            kappa = self._on_flat(kappa, flat.cells, flat.lengths)
+            kappa = self.on_flat(kappa, flat.cells, flat.lengths)
             part = linear_elements(flat.lengths, flat.cells, count, kappa, rho, lumped=flat.lumped)
             total = total + flat.share * sparse.triu(part, format="csr")
         return total
-
-    def directed(
-        self, conductivity: list[Tensor] | None
-    ) -> Iterator[tuple[sparse.csr_array, sparse.csr_array]]:
-        """Upper triangles of the stiffness for the conductivities κΠ_kl, k ≤ l row by row, and those of P1 elements."""
-        projectors, n = self.projectors(), self.points.shape[1]
-        kappa = [None] * len(projectors) if conductivity is None else conductivity
-        slopes = self.element.weights[:, None] * conductance(self.metric, self._on_curved(kappa[0]))
-        slopes = slopes if self.shares is None else self.shares[:, None, None] * slopes
-        mean = None if kappa[0] is None else _mean(kappa[0], self.element)
-        lots = [(self.cells, self.lengths, mean, _mean(projectors[0], self.element))]
-        lots += [
-            (f.cells, f.lengths, *rest)
-            for f, *rest in zip(self.flats, kappa[1:], projectors[1:], strict=True)
-        ]
-        shares = [1.0 if self.shares is None else self.shares[:, None]]
-        shares += [flat.share for flat in self.flats]
-        blocks = [
-            share * linear_blocks(lengths, cells, self._on_flat(a, cells, lengths)).real
-            for (cells, lengths, a, _), share in zip(lots, shares, strict=True)
-        ]
-        for k, m in combinations_with_replacement(range(n), 2):
-            own = (slopes * projectors[0][..., k, m, None]).flatten(1)
-            own = own @ gradient_products(self.element).flatten(0, 1)
-            elements = summed(own, self.nodes, self.prolongation.shape[0])
-            triangles = [
-                sparse.triu(summed(x * pi[:, k, m, None], cells, len(self.points)), format="csr")
-                for x, (cells, *_, pi) in zip(blocks, lots, strict=True)
-            ]
-            flat = sum(triangles[1:])
-            yield upper_congruence(self.prolongation, elements) + flat, triangles[0] + flat
 
     def bilinear(self, forms: Sequence[BilinearForm], medium: Medium) -> Float[Tensor, ""]:
         """Σ of bilinear forms, differentiable in the medium; of "lumped" and "boundary", which depend on none, 0."""
@@ -305,7 +278,7 @@ class Forms:
             values["projectors"] = self.projectors()
         total = [torch.zeros((), dtype=torch.float64)]
         # a function that stands in two forms is one
-        prolong = cache(partial(_times, self.prolongation))
+        prolong = cache(partial(times, self.prolongation))
         for form in forms:
             if form.name in FIELDS:
                 total.append(self.form(form, [prolong(form.w), prolong(form.u)], values))
@@ -319,7 +292,7 @@ class Forms:
         values = medium.get(FIELDS.get(form.name, ""))
         density = weighted_slopes if stiffness else weighted_products
         coefficient = None if values is None else values[0]
-        coefficient = self._on_curved(coefficient) if stiffness else coefficient
+        coefficient = self.on_curved(coefficient) if stiffness else coefficient
         own = density(self.metric, self.element, outer(self.nodes, nodes, c), coefficient)
         own = own * (1.0 if form.along is None else medium["projectors"][0][form.entry])
         total = [own.sum() if self.shares is None else (self.shares[:, None] * own).sum()]
@@ -328,7 +301,7 @@ class Forms:
             metric = spread(flat_metric(flat.lengths), shape)
             blocks = outer(flat.cells, corners, c)
             mean = None if values is None else values[number]
-            mean = self._on_flat(mean, flat.cells, flat.lengths) if stiffness else mean
+            mean = self.on_flat(mean, flat.cells, flat.lengths) if stiffness else mean
             if flat.lumped is not None and not stiffness:
                 own = flat.lumped[flat.cells] * blocks[:, :: flat.cells.shape[1] + 1]
                 blocks = own.mean(1, keepdim=True).expand_as(blocks)
@@ -339,18 +312,16 @@ class Forms:
             total.append(flat.share * own.sum())
         return torch.stack(total).sum()
 
-    def _on_curved(self, a: Tensor | None) -> Tensor | None:
+    def on_curved(self, a: Tensor | None) -> Tensor | None:
         """A conductivity as `conductance` takes it, at the Gauss points of the curved elements."""
         if a is None or a.ndim == 2:
             return a
-        places = at(self.places, self.nodes)
-        slopes = torch.einsum("tnk,qnd->tqkd", places, self.element.gradients)
-        return in_cells(a, slopes, self.metric)
+        return in_cells(a, self.slopes()[0], self.metric)
 
-    def _on_flat(
+    def on_flat(
         self, a: Tensor | None, cells: Int[Tensor, "T corners"], lengths: Float[Tensor, "T e"]
     ) -> Tensor | None:
-        """As `_on_curved`, on flat cells; their plane is that of their corners, whatever the edge lengths are."""
+        """As `on_curved`, on flat cells; their plane is that of their corners, whatever the edge lengths are."""
         if a is None or a.ndim == 1:
             return a
         corners = at(self.points, cells)
@@ -370,7 +341,7 @@ def _renumbered(matrix: Any, columns: Int[Tensor, " C"], count: int) -> sparse.c
     return sparse.csr_array(parts, shape=(matrix.shape[0], count))
 
 
-def _mean(values: Float[Tensor, "T Q ..."], element: Element) -> Float[Tensor, "T ..."]:
+def cell_mean(values: Float[Tensor, "T Q ..."], element: Element) -> Float[Tensor, "T ..."]:
     """Mean over each cell of values at its Gauss points."""
     return torch.einsum("q,tq...->t...", element.weights / element.weights.sum(), values)
 
@@ -394,4 +365,4 @@ class _Times(torch.autograd.Function):
         return None, torch.from_numpy(np.asarray(ctx.matrix.T @ g.numpy()))
 
 
-_times: Any = _Times.apply
+times: Any = _Times.apply

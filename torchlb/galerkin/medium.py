@@ -90,13 +90,12 @@ def symmetric_exp(matrix: Float[Tensor, "*batch n n"]) -> Float[Tensor, "*batch 
     return _SpectralFunction.apply(matrix, "exp")  # pyright: ignore[reportReturnType]
 
 
-def projector(slopes: Float[Tensor, "*batch n d"]) -> Float[Tensor, "*batch n n"]:
-    """The orthogonal projector onto the span of vectors, by Gram and Schmidt; of a vector that is zero, zero."""
+def orthonormal(slopes: Float[Tensor, "*batch n d"]) -> Float[Tensor, "*batch n d"]:
+    """Orthonormal vectors of the same span, by Gram and Schmidt; zero for a vector that is zero."""
     unit: list[Tensor] = []
     for x in slopes.unbind(-1):
         for _ in range(2):  # the second time takes off what rounding leaves
             for e in unit:
                 x = x - (x * e).sum(-1, keepdim=True) * e
         unit.append(normalize(x, dim=-1, eps=TINY))
-    frame = torch.stack(unit, -1)
-    return frame @ frame.mT
+    return torch.stack(unit, -1)

@@ -11,13 +11,14 @@ from jaxtyping import Float
 from torch import Tensor
 
 from torchlb.errors import InputError
-from torchlb.galerkin.tangent import TangentForms, connection_matrices
+from torchlb.galerkin.tangent import TangentForms, tangent_matrices
 from torchlb.linalg.checks import check_tensor
 from torchlb.linalg.csr import Csr, tensors_of
 from torchlb.operator.batching import remember_shapes, shapes_of
 from torchlb.operator.medium import elements_of, plain
 from torchlb.operator.pair_methods import PairMethods, check_pair
-from torchlb.operator.parts import Modes, PairMatrices
+from torchlb.operator.parts import MediumFields, Modes, PairMatrices
+from torchlb.operator.through import without
 
 
 class FieldMatrices(PairMatrices):
@@ -67,6 +68,27 @@ class Connection(PairMethods):
         """What the matrices follow from."""
         return _TangentPlan(self._lb[0])
 
+    @property
+    def hodge(self) -> Connection:
+        """The same with Hodge's Laplacian of a surface, ∫κ(div u)² + κ(curl u)², made where it is asked for first.
+
+        On fields it is Bochner's plus the Gaussian curvature. Those in its kernel are harmonic: 2g of them on a closed
+        surface of genus g. Without derivatives in points and medium. Raises InputError in other dimensions, for a
+        conductivity that is a tensor, and for a batch, whose shapes have their own.
+        """
+        if self.cache.connection is None:
+            tensors = self._medium.fields(len(self.points)).get("conductivity")
+            if self.dim != 2 or self.sizes or (tensors and tensors.values.ndim == 3):
+                raise InputError(
+                    "hodge: expected one surface with a conductivity that is a number, if any"
+                )
+            with torch.inference_mode(False):
+                made = _of_shape(self._lb[0], hodge=True)
+            made.weak.values = without(self, made.weak.values, "Hodge's Laplacian")
+            made.points, made._medium = self.points.detach(), MediumFields({})
+            self.cache.connection = made
+        return self.cache.connection
+
     def components(
         self, v: Float[Tensor, "N n C"] | Float[Tensor, "N n"]
     ) -> Float[Tensor, "rows C"] | Float[Tensor, " rows"]:
@@ -111,7 +133,7 @@ def connection_of(lb: Any) -> Connection:
     return lb.cache.connection
 
 
-def _of_shape(lb: Any) -> Connection:
+def _of_shape(lb: Any, *, hodge: bool = False) -> Connection:
     if lb._in_medium and not tensors_of(lb._medium):
         raise InputError(
             "connection: the medium of this operator is not known, as it comes from a batch"
@@ -122,7 +144,7 @@ def _of_shape(lb: Any) -> Connection:
         kappa = medium.get("conductivity")
         kappa = None if kappa is None else elements.values(kappa)
         linear = lb.weak.linear if lb.weak.linear.num_rows else None
-        found = connection_matrices(elements, kappa, frames, (lb.weak, linear))
+        found = tangent_matrices(elements, kappa, frames, (lb.weak, linear), hodge=hodge)
     whole, *near = (each.to(lb.weak.values) for each in found)
     return Connection._of(lb, FieldMatrices(whole.crow, whole.col, whole.values, *near))
 

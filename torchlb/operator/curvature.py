@@ -73,7 +73,7 @@ def curvatures_of(lb: Any) -> Curvatures:
 
     A neighbour's normal is taken on the side of that of the row, so that surfaces without sides have curvatures.
     """
-    _check_surface(lb, "curvatures")
+    check_surface(lb, "curvatures")
     stencil, normals = lb.stencil, lb.normals
     opposed = (normals[stencil.row] * normals[stencil.col]).sum(1) < 0
     sign = torch.where(opposed, -1.0, 1.0).to(normals.dtype)
@@ -86,11 +86,12 @@ def curvatures_of(lb: Any) -> Curvatures:
 
 def turned_frames(lb: Any) -> Float[Tensor, "N 3 2"]:
     """The frames of a surface in R³ after a quarter turn about the normals, ν × E."""
-    _check_surface(lb, "a curl or a quarter turn")
+    check_surface(lb, "a curl or a quarter turn")
     return torch.linalg.cross(lb.normals[:, :, None].expand_as(lb.frames), lb.frames, dim=1)
 
 
-def _check_surface(lb: Any, what: str) -> None:
+def check_surface(lb: Any, what: str) -> None:
+    """Raise InputError unless the operator is of a surface in R³ with normals."""
     if lb.points.shape[1:] != (3,) or lb.dim != 2 or not len(lb.normals):
         raise InputError(
             f"{what}: expected a surface in R³ with normals, got one of dimension {lb.dim} in R^{lb.points.shape[1]}"

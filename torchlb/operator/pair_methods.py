@@ -28,6 +28,7 @@ from torchlb.spectral.eigenbasis import (
 from torchlb.spectral.pencil import pencil_eigenbasis
 
 MatrixName = Literal["laplacian", "stiffness", "mass", "boundary_mass"]
+FieldMatrixName = Literal["connection", "vector_mass"]
 NO_PAIR = (
     "{}: this operator has no weak pair, as it was built with weak_form=False, or is a batch of which one was; the "
     "stencil is lb.matrix"
@@ -138,17 +139,21 @@ class PairMethods(OperatorStorage):
             return x.sum(where)
         return torch.stack([part.sum(where) for part in x.split(self.sizes, where)], where)
 
-    def to_scipy(self, name: MatrixName = "laplacian") -> sparse.csr_array:
+    def to_scipy(self, name: MatrixName | FieldMatrixName = "laplacian") -> sparse.csr_array:
         """Δ, or another matrix of the operator, as a scipy CSR matrix (N, N) on the CPU.
 
         Parameters
         ----------
         name
             "laplacian" is Δ, 1/ℓ², negative semidefinite like `igl.cotmatrix`, but strong: no mass in it. The others
-            are `stiffness`, `mass_matrix` and `boundary_mass`, which raise InputError where there are none.
+            are `stiffness`, `mass_matrix` and `boundary_mass`, which raise InputError where there are none;
+            "connection" and "vector_mass" are stiffness and mass of `LaplaceBeltrami.connection`, (N d, N d).
 
         Weak matrices with the signs and masses of other libraries: `torchlb.interop.conventions`.
         """
+        if name in get_args(FieldMatrixName):
+            fields: PairMethods = getattr(self, "connection", self)
+            return fields.to_scipy("stiffness" if name == "connection" else "mass")
         matrices, channel = self._channel(name)
         return matrices.to_scipy(channel)
 

@@ -2,5 +2,5 @@
 
 `checks`: checks of functions and of the operator. `solves`: implicit steps and Poisson problems.
 `pair_flow`: heat flow by such solves. `heat`: heat flow by solves, by the spectrum or by series. `geodesics`:
-distances.
+distances. `transport`: flow and transport of tangent fields. `hodge`: their decomposition.
 """

@@ -11,14 +11,13 @@ from torch import Tensor
 
 from torchlb.errors import InputError
 from torchlb.linalg.checks import check_finite, check_operator, check_tensor
-from torchlb.operator.laplace_beltrami import LaplaceBeltrami
-from torchlb.operator.pair_methods import check_pair
+from torchlb.operator.pair_methods import PairMethods, check_pair
 
 P = ParamSpec("P")
 T = TypeVar("T")
 
 
-def check_shape(x: Tensor, lb: LaplaceBeltrami) -> None:
+def check_shape(x: Tensor, lb: PairMethods) -> None:
     """Raise InputError unless x is (N, C) or (B, N, C) with the N of the operator, InputTypeError unless a tensor."""
     check_operator(lb)
     check_tensor(x)
@@ -28,7 +27,7 @@ def check_shape(x: Tensor, lb: LaplaceBeltrami) -> None:
         )
 
 
-def as_columns(f: Tensor, lb: LaplaceBeltrami) -> Tensor:
+def as_columns(f: Tensor, lb: PairMethods) -> Tensor:
     """A user's f of shape (N,), (N, C) or (B, N, C) as (N, C) or (B, N, C); integers and masks in the operator's type.
 
     Errors as for `check_shape`, and InputError for complex numbers, NaN and infinity, and without a weak pair.

@@ -79,6 +79,7 @@ def geodesic_distance(
 
 
 def source_points(lb: LaplaceBeltrami, sources: int | Sequence[int] | Tensor) -> Int[Tensor, " S"]:
+    """Indices of the sources; InputError where there are none, or one is out of range."""
     index = torch.as_tensor(sources)
     if index.dtype == torch.bool and index.shape == (lb.num_points,):
         index = index.nonzero()

@@ -20,8 +20,7 @@ from torchlb.linalg.exponential import heat
 from torchlb.linalg.precision import ROOT_EPS
 from torchlb.linalg.sparse import compute_dtype
 from torchlb.operator.checks import check_tolerance
-from torchlb.operator.laplace_beltrami import LaplaceBeltrami
-from torchlb.operator.pair_methods import check_pair
+from torchlb.operator.pair_methods import PairMethods, check_pair
 from torchlb.pde.checks import as_columns, as_times, check_choice
 from torchlb.pde.pair_flow import pair_flow
 from torchlb.spectral.eigenbasis import Eigenbasis
@@ -30,7 +29,7 @@ Method = Literal["deflated", "spectral", "rational"]
 
 
 def heat_flow(
-    lb: LaplaceBeltrami,
+    lb: PairMethods,
     f: Shaped[Tensor, "*B N C"] | Shaped[Tensor, " N"],
     t: float | Tensor,
     *,
@@ -82,9 +81,7 @@ def heat_flow(
     return y[:, 0] if f.ndim == 1 else y
 
 
-def flow(
-    lb: LaplaceBeltrami, x: Tensor, time: Tensor, method: str, k: int, tolerance: float
-) -> Tensor:
+def flow(lb: PairMethods, x: Tensor, time: Tensor, method: str, k: int, tolerance: float) -> Tensor:
     """e^{tΔ}x, (N, C) or (B, N, C), in the type of x, which is float32 or float64; autocast has to be off."""
     check_tolerance(tolerance)
     if x.ndim == 3:
@@ -105,7 +102,7 @@ def _spectral(basis: Eigenbasis, x: Tensor, time: Tensor) -> Tensor:
 
 
 def _deflated(
-    lb: LaplaceBeltrami, basis: Eigenbasis, x: Tensor, time: Tensor, tolerance: float
+    lb: PairMethods, basis: Eigenbasis, x: Tensor, time: Tensor, tolerance: float
 ) -> Tensor:
     """e^{−λt} on the basis' span; on the rest, the flow of the P1 pair with lumped mass, projected off that span."""
     if lb.fixed is not None:
@@ -127,7 +124,7 @@ def _deflated(
     return slow + rest - basis.from_basis(basis.analyse(basis.left, rest))
 
 
-def _linear_flow(lb: LaplaceBeltrami) -> tuple[list[Tensor], Tensor, Tensor]:
+def _linear_flow(lb: PairMethods) -> tuple[list[Tensor], Tensor, Tensor]:
     """Pattern and values of −D^{−½}K₁D^{−½}, zero for Dirichlet points, and D^½, where D are the row sums of M₁."""
     crow, col, (stiffness, mass, *_) = lb.weak.linear_pair
     row = lb.weak.near.row

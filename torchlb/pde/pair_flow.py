@@ -11,14 +11,14 @@ from torch import Tensor
 from torchlb.galerkin.bilinear import BilinearForm
 from torchlb.linalg.exponential import chebyshev_vectors, poles, rational_coefficients
 from torchlb.linalg.once import once_differentiable
-from torchlb.operator.laplace_beltrami import LaplaceBeltrami
+from torchlb.operator.pair_methods import PairMethods
 from torchlb.operator.systems import pair_system
 from torchlb.operator.through import Origins, origins
 from torchlb.pde.checks import uncompiled
 
 
 def pair_flow(
-    lb: LaplaceBeltrami, x: Float[Tensor, "N C"], time: Float[Tensor, " C"], tolerance: float
+    lb: PairMethods, x: Float[Tensor, "N C"], time: Float[Tensor, " C"], tolerance: float
 ) -> Float[Tensor, "N C"]:
     """The flow of each column for its own time, differentiable once in x, the times, points and medium.
 
@@ -60,7 +60,7 @@ _flow: Any = uncompiled(_Flow.apply)
 
 
 def _summed(
-    lb: LaplaceBeltrami, x: Tensor, time: Tensor, tolerance: float, transposed: bool
+    lb: PairMethods, x: Tensor, time: Tensor, tolerance: float, transposed: bool
 ) -> tuple[Tensor, Tensor]:
     """Σ c_k v_k and Σ c_k' v_k; at t = 0, for the transposed flow, x and −KM⁻¹x."""
     result, slope = torch.zeros_like(x), torch.zeros_like(x)
@@ -90,7 +90,7 @@ def _summed(
 
 
 def _forms(
-    lb: LaplaceBeltrami, x: Tensor, g: Tensor, time: Tensor, tolerance: float
+    lb: PairMethods, x: Tensor, g: Tensor, time: Tensor, tolerance: float
 ) -> list[BilinearForm]:
     """Forms with the derivative of ⟨g, Σ_k c_k v_k⟩ in K and M, v_k = T_k(2Z − 1)x.
 

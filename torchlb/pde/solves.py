@@ -17,7 +17,7 @@ from torchlb.linalg.precision import SINGLE
 from torchlb.linalg.sparse import compute_dtype, symmetric_product
 from torchlb.operator.checks import check_tolerance
 from torchlb.operator.laplace_beltrami import LaplaceBeltrami
-from torchlb.operator.pair_methods import check_pair
+from torchlb.operator.pair_methods import PairMethods, check_pair
 from torchlb.operator.systems import means, solve_columns
 from torchlb.operator.through import Origins, origins, without
 from torchlb.pde.checks import as_columns, as_times, uncompiled
@@ -28,7 +28,7 @@ TOLERANCE = 1e-10
 
 @uncompiled
 def implicit_step(
-    lb: LaplaceBeltrami,
+    lb: PairMethods,
     f: Shaped[Tensor, "*B N C"] | Shaped[Tensor, " N"],
     t: float | Tensor,
     *,
@@ -76,7 +76,7 @@ def implicit_step(
     x = as_columns(f, lb)
     dtype = torch.float64 if tolerance < SINGLE else compute_dtype(x, lb.mass)
     columns, time = _columns(x, as_times(t, x, torch.float64), dtype)
-    lb = lb if conductivity is None else lb.with_medium(conductivity=conductivity)
+    lb = _conducting(lb, conductivity)
     given, fluxes = (_data(lb, d, n, f) for d, n in ((boundary_values, 0), (flux, 1)))
     right = _product(lb, 1, columns)
     if fluxes is not None:
@@ -89,7 +89,7 @@ def implicit_step(
 
 @uncompiled
 def poisson_solve(
-    lb: LaplaceBeltrami,
+    lb: PairMethods,
     f: Shaped[Tensor, "*B N C"] | Shaped[Tensor, " N"],
     *,
     boundary_values: Tensor | float | None = None,
@@ -114,7 +114,7 @@ def poisson_solve(
     check_tolerance(tolerance)
     x = as_columns(f, lb)
     columns, _ = _columns(x, None)
-    lb = lb if conductivity is None else lb.with_medium(conductivity=conductivity)
+    lb = _conducting(lb, conductivity)
     given, fluxes = (_data(lb, d, n, f) for d, n in ((boundary_values, 0), (flux, 1)))
     right = _product(lb, 1, columns)
     if fluxes is not None:
@@ -177,7 +177,18 @@ def _columns(
     return side_by_side(x.to(dtype)), time if x.ndim == 2 else time.repeat(len(x))
 
 
-def _data(lb: LaplaceBeltrami, data: Tensor | float | None, kind: int, f: Tensor) -> Tensor | None:
+def _conducting(lb: PairMethods, conductivity: Tensor | None) -> PairMethods:
+    """The operator with this conductivity, if any."""
+    if conductivity is None:
+        return lb
+    if not isinstance(lb, LaplaceBeltrami):
+        raise InputError(
+            "conductivity: tangent fields have that of their operator, lb.with_medium(κ).connection"
+        )
+    return lb.with_medium(conductivity=conductivity)
+
+
+def _data(lb: PairMethods, data: Tensor | float | None, kind: int, f: Tensor) -> Tensor | None:
     """Boundary data as columns, zero where they do not count: Dirichlet values (kind 0) or fluxes (1)."""
     if data is None:
         return None
@@ -200,7 +211,7 @@ def _data(lb: LaplaceBeltrami, data: Tensor | float | None, kind: int, f: Tensor
     return columns
 
 
-def _reached_by_flux(lb: LaplaceBeltrami, free: Tensor) -> Tensor:
+def _reached_by_flux(lb: PairMethods, free: Tensor) -> Tensor:
     """Mask (N,) of the boundary points whose flux reaches a free point."""
     if not lb.weak.has_boundary:
         return torch.zeros_like(free)
@@ -208,7 +219,7 @@ def _reached_by_flux(lb: LaplaceBeltrami, free: Tensor) -> Tensor:
     return symmetric_product(lb.weak.crow, lb.weak.col, size, free.to(size)[:, None])[:, 0] > 0
 
 
-def _missing(lb: LaplaceBeltrami, kind: int) -> str:
+def _missing(lb: PairMethods, kind: int) -> str:
     """Reason why there is no point for Dirichlet values (kind 0) or for fluxes (1)."""
     if not lb.weak.has_boundary:
         return "the shape is closed; it has no boundary for them"
@@ -217,14 +228,14 @@ def _missing(lb: LaplaceBeltrami, kind: int) -> str:
     return "a Dirichlet condition holds along the whole boundary; pass a mask as `boundary` that leaves some of it"
 
 
-def _product(lb: LaplaceBeltrami, number: int, x: Tensor) -> Tensor:
+def _product(lb: PairMethods, number: int, x: Tensor) -> Tensor:
     """K, with what is added to it, or M times x."""
     crow, col, values = lb.weak.pair
     return symmetric_product(crow, col, values[number].to(x), x)
 
 
 def solved(
-    lb: LaplaceBeltrami,
+    lb: PairMethods,
     right: Float[Tensor, "N C"],
     time: Float[Tensor, " C"] | None,
     f: Float[Tensor, "N C"],
@@ -273,7 +284,7 @@ class _Solve(torch.autograd.Function):
         return w, _in_time(ctx, lb, w, u), None, None, None, None, None
 
 
-def _in_time(ctx: Any, lb: LaplaceBeltrami, w: Tensor, u: Tensor) -> Tensor | None:
+def _in_time(ctx: Any, lb: PairMethods, w: Tensor, u: Tensor) -> Tensor | None:
     """The gradient in the times, where it is asked for."""
     if not ctx.needs_input_grad[1]:
         return None

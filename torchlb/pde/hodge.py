@@ -1,0 +1,95 @@
+"""The Helmholtz–Hodge decomposition of a tangent field on a surface (`method.md`, section 18)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from torchlb.errors import InputError
+from torchlb.galerkin.weak_gradient import WeakGradient
+from torchlb.linalg.csr import Csr
+from torchlb.operator.curvature import check_surface
+from torchlb.operator.laplace_beltrami import LaplaceBeltrami
+from torchlb.operator.medium import elements_of
+from torchlb.operator.through import without
+from torchlb.pde.solves import TOLERANCE, solved
+
+
+@dataclass(frozen=True)
+class HodgeParts:
+    """v = ∇u + ν × ∇w + h, for a field (N, 3) or (N, 3, C) on a surface with normals ν.
+
+    Attributes
+    ----------
+    gradient, rotated, harmonic
+        ∇u, which has no curl; ν × ∇w, which has no divergence; the rest h, with neither; each of the shape of v.
+    potential, stream
+        u and w, (N,) or (N, C), units of v by ℓ. Their means are zero on every component; with a boundary w is zero
+        along it instead.
+    """
+
+    gradient: Tensor
+    rotated: Tensor
+    harmonic: Tensor
+    potential: Tensor
+    stream: Tensor
+
+
+def hodge_decomposition(
+    lb: LaplaceBeltrami, v: Float[Tensor, "N n C"] | Float[Tensor, "N n"]
+) -> HodgeParts:
+    """The gradient, the rotated gradient and the harmonic part of the tangential part of v; they add up to it.
+
+    ∇u is closest to v, and so is ν × ∇w, in the mean square of the prolonged fields: two Poisson solves. At the
+    vertices they are the fields whose prolongation is closest to theirs, so that in ``lb.connection.mass_matrix`` the
+    parts are orthogonal up to the square of its error. With a boundary, whatever the condition of the operator is, u is
+    free and w zero along it; h is then tangent to it. On spheres and disks h is the error of the other two.
+
+    Differentiable in v. Raises InputError for another shape, for operators in a medium, of batches, and for those that
+    are not of surfaces in R³.
+
+    >>> from torchlb.surfaces import Sphere
+    >>> lb = LaplaceBeltrami.from_mesh(*Sphere().mesh(500))
+    >>> parts = hodge_decomposition(lb, lb.gradient(lb.points[:, 2]))
+    >>> bool((parts.potential - lb.points[:, 2]).abs().max() < 1e-3)
+    True
+    """
+    check_surface(lb, "hodge_decomposition")
+    if lb.sizes is not None or lb._in_medium:
+        raise InputError(
+            "hodge_decomposition: expected one shape without a medium; lb.unbatch() has those of a batch"
+        )
+    columns = v[..., None] if v.ndim == 2 else v
+    fields, boundary, found = _constant(lb.connection), lb._boundary_points(), []
+    c = fields.components(columns.double())
+    elements, normals = elements_of(lb), lb.normals.detach().cpu().double()
+    for turned, held in ((None, boundary[:0]), (normals, boundary)):
+        functions, form = _constant(lb, held), WeakGradient.of(elements, turned)
+        right = form.divergence(fields.vectors(c).cpu()).to(c)
+        u = solved(functions, right, None, torch.zeros_like(right), None, TOLERANCE)
+        slope = fields.components(form.gradient(u.cpu()).to(c))
+        none = torch.zeros_like(slope)
+        found.append(
+            (u, solved(fields, slope, slope.new_zeros(slope.shape[1]), none, None, TOLERANCE))
+        )
+    (u, gradient), (w, rotated) = found
+    parts = [fields.vectors(x) for x in (gradient, rotated, c - gradient - rotated)]
+    results = [without(lb, x, "Hodge parts").to(v) for x in (*parts, u, w)]
+    return HodgeParts(*(x if v.ndim == 3 else x[..., 0] for x in results))
+
+
+def _constant(lb: Any, held: Tensor | None = None) -> Any:
+    """The pair of an operator without its condition, media and gradients; functions are zero where they are held."""
+    own = lb._alias()
+    own._cache, own._carries = None, False
+    own.points, own.frames, own.mass = lb.points.detach(), lb.frames.detach(), lb.mass.detach()
+    own._on_boundary = lb._on_boundary[:0] if held is None or not bool(held.any()) else held
+    own.options = {**lb.options, "condition": "dirichlet"}
+    near = lb.weak.linear
+    near = Csr(near.crow, near.col, near.values[:2]) if near.num_rows else None
+    own.weak = type(lb.weak)(lb.weak.crow, lb.weak.col, lb.weak.values[:2].detach(), near)
+    return own
