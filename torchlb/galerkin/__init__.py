@@ -5,8 +5,8 @@ elements on the reference simplex. `nodes`: the numbering of Lagrange nodes on a
 `curving`: positions of the nodes on the surface, and which cells stay flat. `coarse`: triangles too coarse for the
 fits; `delaunay`: the intrinsic Delaunay tufted cover that replaces them. `prolongation`: P, from the vertices to the
 nodes. `boundary_curves`: polynomial curves along the boundary of a surface. `boundary`: nodes along a boundary.
-`flips`: edge flips that remove folded triangles and slivers. `medium`: conductivity, density and
-potential. `forms`: PᵀK_FE P and PᵀM_FE P, in any medium; `bilinear`: what they do to two
-functions. `tangent`: matrices of tangent fields; `weak_gradient`: between these and functions. `pair`: an operator's matrices and positive lumped mass.
+`flips`: edge flips that remove folded triangles and slivers. `medium`: conductivity, density and potential. `forms`:
+PᵀK_FE P and PᵀM_FE P, in any medium; `bilinear`: what they do to two functions. `tangent`: matrices of tangent
+fields; `weak_gradient`: between these and functions. `pair`: an operator's matrices and positive lumped mass.
 `absorption`: the term that Robin conditions add to K.
 """

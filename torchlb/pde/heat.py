@@ -66,6 +66,7 @@ def heat_flow(
 
     Examples
     --------
+    >>> from torchlb import LaplaceBeltrami
     >>> theta = torch.arange(36, dtype=torch.float64) * torch.pi / 18
     >>> lb = LaplaceBeltrami.from_points(torch.stack([theta.cos(), theta.sin()], dim=1))
     >>> bool(torch.allclose(heat_flow(lb, theta.cos(), 0.5), math.exp(-0.5) * theta.cos(), atol=1e-2))
