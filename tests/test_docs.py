@@ -24,18 +24,21 @@ WITH_CODE = [page for page in PAGES if CODE.search(page.read_text("utf-8"))]
 
 
 @pytest.mark.parametrize("page", WITH_CODE, ids=lambda page: str(page.relative_to(ROOT)))
-def test_the_code_of_a_page_runs_from_top_to_bottom(page, tmp_path, monkeypatch):
+def test_the_code_of_a_page_runs_from_top_to_bottom(page, tmp_path, monkeypatch, capsys):
+    """What stands behind `# → ` is printed, and what a user may write instead, `# yours: `, runs, too."""
     monkeypatch.chdir(tmp_path)
     names = {"__name__": "__main__"}
     text = page.read_text("utf-8")
     trimesh.Trimesh(VERTICES.numpy(), FACES.numpy(), process=False).export("my.ply")
     for found in CODE.finditer(text):
         line = text.count("\n", 0, found.start()) + 1
-        shown = found.group(1).replace(
-            "\n# yours: ", "\n"
-        )  # what a user may write instead runs, too
+        shown = found.group(1).replace("\n# yours: ", "\n")
         code = compile("\n" * line + shown, str(page), "exec")
         exec(code, names)
+    printed = capsys.readouterr().out
+    for output in re.findall(r"# → (.*)$", text, re.MULTILINE):
+        assert output in printed
+        printed = printed[printed.index(output) + len(output) :]
 
 
 def test_what_a_user_may_write_instead_is_shown():
