@@ -180,7 +180,7 @@ def diffusion_map(
     """Coordinates e^{−λ_k t} φ_k(x) in which distances are diffusion distances (Coifman, Lafon 2006); ℓ^{−d/2}.
 
     The constants, of λ_0 = 0, are left out; a shape with a Dirichlet or Robin condition has none. `k` eigenpairs of
-    `lb`, at least `dim` + 1, may be asked for to share a basis. The `time` is in ℓ². On a cloud this is its diffusion map.
+    `lb`, `dim` + 1 or more, may be asked for to share a basis. The `time` is in ℓ². A cloud may lie in any Rⁿ.
     """
     basis, values = _basis(lb, max(dim + 1, k or 0))
     decay = torch.exp(-values * _numbers("time", time, values))
