@@ -20,22 +20,29 @@ from torchlb.surfaces import Circle, Sphere, UnitDisk
 ROOT = Path(__file__).parents[1]
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
 CODE = re.compile(r"^```python\n(.*?)^```$", re.DOTALL | re.MULTILINE)
+CALLED = re.compile(r"(?<![\w−])([A-Za-z_][\w.]*)\(")
 WITH_CODE = [page for page in PAGES if CODE.search(page.read_text("utf-8"))]
 
 
 @pytest.mark.parametrize("page", WITH_CODE, ids=lambda page: str(page.relative_to(ROOT)))
-def test_the_code_of_a_page_runs_from_top_to_bottom(page, tmp_path, monkeypatch):
+def test_the_code_of_a_page_runs_from_top_to_bottom(page, tmp_path, monkeypatch, capsys):
+    """So does what a user may write instead, `# or: `; a comment calls what there is, and `# → ` is printed."""
     monkeypatch.chdir(tmp_path)
     names = {"__name__": "__main__"}
     text = page.read_text("utf-8")
     trimesh.Trimesh(VERTICES.numpy(), FACES.numpy(), process=False).export("my.ply")
     for found in CODE.finditer(text):
         line = text.count("\n", 0, found.start()) + 1
-        shown = found.group(1).replace(
-            "\n# yours: ", "\n"
-        )  # what a user may write instead runs, too
+        shown = re.sub(r"^# (yours|or): ", "", found.group(1), flags=re.MULTILINE)
         code = compile("\n" * line + shown, str(page), "exec")
         exec(code, names)
+        for comment in re.findall(r"#(.*)$", shown, re.MULTILINE):
+            for called in CALLED.findall(comment):
+                assert callable(eval(called, names)), comment
+    printed = capsys.readouterr().out
+    for output in re.findall(r"# → (.*)$", text, re.MULTILINE):
+        assert output in printed
+        printed = printed[printed.index(output) + len(output) :]
 
 
 def test_what_a_user_may_write_instead_is_shown():

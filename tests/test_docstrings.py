@@ -2,13 +2,18 @@
 
 import importlib
 import inspect
+import logging
 import pkgutil
+import re
 from types import FunctionType
+
+import griffe
 
 import torchlb
 from torchlb import interop
 
 MIN_SUMMARY = 10  # characters
+REFUSED = ("LaplaceBeltrami.__init__", "given")  # whatever is given there is an error
 METHODS = (FunctionType, classmethod, staticmethod, property)
 MODULES = [torchlb] + [
     importlib.import_module(f"torchlb.interop.{found.name}")
@@ -46,4 +51,41 @@ def test_every_parameter_of_a_public_function_has_a_type():
         for parameter in inspect.signature(function).parameters.values()
         if parameter.annotation is parameter.empty and parameter.name not in ("self", "cls")
     ]
+    assert not missing
+
+
+def described(value):
+    """Names in a docstring's lists, as the API pages parse it; and its prose, for what is explained there."""
+    doc = inspect.cleandoc(value.__doc__ or "")
+    logging.getLogger("griffe").setLevel(logging.ERROR)
+    names = {
+        name.strip(" *")
+        for section in griffe.Docstring(doc, parser="numpy").parse()
+        if section.kind.value in ("parameters", "attributes")
+        for entry in section.value
+        if entry.description.strip()
+        for name in entry.name.split(",")
+    }
+    return names, re.split(r"Examples\n|>>>", doc)[0]
+
+
+def test_every_parameter_of_a_public_function_is_described():
+    """In a list or in prose, of its own, of its class, or of the function that it says to be like."""
+    missing, classes = [], dict(public())
+    for name, value in public():
+        function = getattr(value, "__func__", value)
+        if not inspect.isfunction(function):
+            continue
+        names, prose = described(function)
+        if name.endswith(".__init__"):
+            names |= described(classes[name.rpartition(".")[0]])[0]
+        if re.search(r"(?i)(as for|those of|^as) `", prose):
+            continue
+        missing += [
+            f"{name}({parameter})"
+            for parameter in inspect.signature(function).parameters
+            if parameter not in names | {"self", "cls"}
+            and (name, parameter) != REFUSED
+            and not re.search(rf"(?<![\w.]){parameter}(?![\w(])", prose)
+        ]
     assert not missing

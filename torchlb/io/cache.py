@@ -221,7 +221,7 @@ def _compact(tensor: Tensor) -> Tensor:
 
 
 def load_operator(path: str | Path) -> LaplaceBeltrami:
-    """Read an operator that `save_operator` or a cache wrote, bit for bit, on the CPU.
+    """Read the operator in the file `path`, by `save_operator` or of a cache, bit for bit, on the CPU.
 
     Raises
     ------

@@ -81,7 +81,7 @@ class Diffusion(LearnedTimes):
         self.method, self.k, self.tolerance = method, k, tolerance
 
     def forward(self, x: Float[Tensor, "*B N C"], lb: LaplaceBeltrami) -> Float[Tensor, "*B N C"]:
-        """The diffused features, of the shape and type of x: (N, C), or (B, N, C) on one surface."""
+        """Diffuse features x, (N, C) or (B, N, C), on the shape or batch of `lb`; shape and type are those of x."""
         dtype = check_features(x, lb, self.channels, self.raw_time, self.used_k)
         with torch.autocast(x.device.type, enabled=False):
             time = self.time.to(dtype)

@@ -73,7 +73,7 @@ class DiffusionNetBlock(nn.Module):
         self.mlp = mlp([inputs * width, *hidden, width], dropout)
 
     def forward(self, x: Float[Tensor, "*B N C"], lb: LaplaceBeltrami) -> Float[Tensor, "*B N C"]:
-        """Features (N, width) or (B, N, width) in the shape of x."""
+        """Features of x, (N, width) or (B, N, width), on the shape or batch of `lb`, in the shape of x."""
         width, parameter = self.diffusion.channels, self.diffusion.raw_time
         diffused = self.diffusion(unrounded(x, lb, width, parameter), lb)
         features = [x, diffused]
@@ -186,9 +186,9 @@ class DiffusionNet(nn.Module):
         return y if self.last_activation is None else self.last_activation(y)
 
     def load_original_state_dict(self, state: Mapping[str, Tensor]) -> None:
-        """Load the weights of a trained network of the original code; strict.
+        """Load `state`, the weights of a trained network of the original code; strict.
 
-        Parameters keep their names, but for ``block_{i}``, which is ``blocks.{i}``, ``mlp.miniMLP_mlp_layer_{jjj}``,
+        Parameters keep their names, except ``block_{i}``, which is ``blocks.{i}``, ``mlp.miniMLP_mlp_layer_{jjj}``,
         which is ``mlp.linear_{j}``, and ``diffusion.diffusion_time``, from which ``diffusion.raw_time`` follows.
         Times below 1e-8, which the original raises to it when it runs, become 1e-8. With method="spectral" and the same
         operators the network then computes the original's results.

@@ -66,6 +66,6 @@ class GradientFeatures(TangentMap):
     """
 
     def forward(self, x: Float[Tensor, "*B N C"], lb: LaplaceBeltrami) -> Float[Tensor, "*B N C"]:
-        """The features of x, (N, C) or (B, N, C), in its shape and type."""
+        """Features of x, (N, C) or (B, N, C), on the shape or batch of `lb`, in the shape and type of x."""
         gradient, mapped = self.gradients(x, lb)
         return torch.tanh((gradient * mapped).sum(-2))

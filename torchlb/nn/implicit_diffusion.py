@@ -50,7 +50,7 @@ class ImplicitDiffusion(LearnedTimes):
         self.tolerance = tolerance
 
     def forward(self, x: Float[Tensor, "*B N C"], lb: LaplaceBeltrami) -> Float[Tensor, "*B N C"]:
-        """The diffused features, of the shape and type of x: (N, C), or (B, N, C) on one surface."""
+        """Diffuse features x, (N, C) or (B, N, C), on the shape or batch of `lb`; shape and type are those of x."""
         dtype = check_features(x, lb, self.channels, self.raw_time)
         with torch.autocast(x.device.type, enabled=False):
             tolerance = self.tolerance

@@ -60,7 +60,7 @@ class PoissonFeatures(nn.Module):
         self.gate = nn.Linear(channels, channels) if fields else None
 
     def forward(self, x: Float[Tensor, "*B N C"], lb: LaplaceBeltrami) -> Float[Tensor, "*B N C"]:
-        """The features of x, (N, C) or (B, N, C), in its shape and type."""
+        """Features of x, (N, C) or (B, N, C), on the shape or batch of `lb`, in the shape and type of x."""
         dtype = check_features(x, lb, self.channels, self.source.weight)
         field = None
         if self.map is not None and self.gate is not None:
@@ -117,7 +117,7 @@ class PoissonBlock(nn.Module):
         self.mlp = mlp([(3 if gradient_features else 2) * width, *hidden, width], dropout)
 
     def forward(self, x: Float[Tensor, "*B N C"], lb: LaplaceBeltrami) -> Float[Tensor, "*B N C"]:
-        """Features (N, width) or (B, N, width) in the shape of x."""
+        """Features of x, (N, width) or (B, N, width), on the shape or batch of `lb`, in the shape of x."""
         width, parameter = self.features.channels, self.features.source.weight
         solved = self.features(unrounded(x, lb, width, parameter), lb)
         features = [x, solved]

@@ -59,7 +59,7 @@ class SpectralConv(nn.Module):
         nn.init.normal_(self.weight, std=1 / math.sqrt(in_channels * num_filters))
 
     def forward(self, x: Float[Tensor, "*B N C"], lb: LaplaceBeltrami) -> Float[Tensor, "*B N D"]:
-        """Features (N, out_channels) or (B, N, out_channels) of x (…, N, in_channels), of its type."""
+        """Features (…, N, out_channels) of x (…, N, in_channels), in its type, on the shape or batch of `lb`."""
         dtype = check_features(x, lb, self.in_channels, self.weight, self.k)
         basis = lb.eigenbasis(self.k)
         with torch.autocast(x.device.type, enabled=False):

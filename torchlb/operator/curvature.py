@@ -15,12 +15,14 @@ from torchlb.linalg.sparse import csr_product
 class Curvatures:
     """Curvatures of a surface in R³ at its points, positive where it bends away from its normals, as a sphere does.
 
-    All are differentiable in the points, directions where the principal curvatures differ.
+    All are differentiable in the points. Directions are so where the principal curvatures differ.
 
     Attributes
     ----------
     shape_operator
         (N, 2, 2), 1/ℓ, symmetric: the derivative of the normal along the frames, in the frames.
+    frames
+        (N, 3, 2), orthonormal tangent vectors in columns.
     """
 
     def __init__(

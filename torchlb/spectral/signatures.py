@@ -112,6 +112,8 @@ def wave_kernel_signature(
 
     Parameters
     ----------
+    lb, k
+        Operator of one shape or of a batch, and number of its eigenpairs.
     energies
         e, logarithms of eigenvalues in 1/ℓ². By default `count`, equally spaced from ln λ_1 + 2σ to ln λ_k − 2σ of each
         shape, where σ is `width` times their spacing in the original: (ln λ_k − ln λ_1)/100.
@@ -147,6 +149,8 @@ def spectral_wavelets(
 
     Parameters
     ----------
+    lb, f
+        Operator of one shape or of a batch, and a function (N,) or (N, C).
     scales
         s, ℓ²; a band has its peak at the eigenvalue 1/s.
     """
@@ -175,8 +179,8 @@ def diffusion_map(
 ) -> Float[Tensor, "N dim"]:
     """Coordinates e^{−λ_k t} φ_k(x) in which distances are diffusion distances (Coifman, Lafon 2006); ℓ^{−d/2}.
 
-    The constants, of λ_0 = 0, are left out; a shape with a Dirichlet or Robin condition has none. `k`, at least dim +
-    1, may be passed to share a basis. The time is in ℓ². On a cloud of any ambient dimension this is its diffusion map.
+    The constants, of λ_0 = 0, are left out; a shape with a Dirichlet or Robin condition has none. `k` eigenpairs of
+    `lb`, `dim` + 1 or more, may be asked for to share a basis. The `time` is in ℓ². A cloud may lie in any Rⁿ.
     """
     basis, values = _basis(lb, max(dim + 1, k or 0))
     decay = torch.exp(-values * _numbers("time", time, values))
@@ -191,8 +195,8 @@ def diffusion_distance(
 ) -> Float[Tensor, "N S"]:
     """Diffusion distance of every point to each source: (Σ_k e^{−2λ_k t}(φ_k(x) − φ_k(y))²)^{1/2}, ℓ^{−d/2}.
 
-    It is the L² distance between heat that spreads from x and from y for the time t, ℓ². Raises ValueError for a batch,
-    whose shapes have no distance from each other, and for indices out of range.
+    It is the L² distance between heat that spreads on `lb` from a point x and from y for the `time` t, ℓ², seen by `k`
+    eigenpairs. The `sources` y are numbers of points. Raises ValueError for others, and for a batch.
     """
     check_operator(lb)
     if lb.sizes is not None:
