@@ -296,3 +296,16 @@ def test_cells_without_area_do_no_harm():
     lb = LaplaceBeltrami.from_mesh(x, torch.cat([faces, lone[None]]))
     with pytest.raises(DerivativeError, match=r"the derivative at .* is not finite"):
         lb.eigenbasis(4).eigenvalues.sum().backward()
+
+
+def test_rows_lowered_for_a_positive_mass_are_decided_at_the_points():
+    """Of the moved shape the mass wants other rows lowered; its gradient has these."""
+    torch.manual_seed(2)
+    lb = LaplaceBeltrami.from_mesh(*Hemisphere().mesh(120))
+    base = lb.points + 0.003 * torch.randn_like(lb.points)
+    way, weight = torch.randn_like(base), torch.randn_like(lb.mass)
+    assert len(lb.at(base).plan.pair.lowered) > len(lb.plan.pair.lowered)
+    x = base.clone().requires_grad_()
+    (g,) = torch.autograd.grad((weight * lb.at(x).mass).sum(), x)
+    ends = [float((weight * lb.at(base + s * 1e-6 * way).mass).sum()) for s in (1, -1)]
+    assert float((g * way).sum()) == pytest.approx((ends[0] - ends[1]) / 2e-6, rel=1e-6)

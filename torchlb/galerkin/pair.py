@@ -172,10 +172,14 @@ class PairPlan:
         rest = mesh, self.stars, self.shares
         return Forms.curved(self.fits, fits, self.curving, *rest, prolong=prolong)
 
-    def at(self, fits: LocalFits, numbering: Numbering) -> WeakPair:
-        """Weak pair from the fits at given points, in the user's numbers."""
+    def at(self, fits: LocalFits, numbering: Numbering) -> tuple[PairPlan, WeakPair]:
+        """Weak pair from the fits at given points, in the user's numbers.
+
+        The plan returned with it also has the rows of P that a positive lumped mass wants lowered at these points.
+        """
         mesh = self.curving.at(fits.points, self.fits, fits)
-        return assembled_pair(self, fits, mesh, numbering, self.patterns)[0]
+        pair, lowered = assembled_pair(self, fits, mesh, numbering, self.patterns)
+        return (self if len(lowered) == len(self.lowered) else replace(self, lowered=lowered)), pair
 
     def bilinear(
         self, fits: LocalFits, forms: Sequence[BilinearForm], medium: Medium
@@ -313,7 +317,7 @@ def positive_mass(
         mass -= p[taking].T @ weights[taking]
         np.add.at(mass, nodes.corners.numpy()[taking - count], shares)
         few = np.flatnonzero(mass < LOW * linear)
-        if len(few) == 0 or len(plan.lowered):
+        if len(few) == 0:
             break
         left = sparse.csr_array(p.T) if left is None else left
         low = left[few]

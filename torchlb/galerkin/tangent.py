@@ -32,22 +32,11 @@ from torchlb.galerkin.assembly import (
 from torchlb.galerkin.bilinear import BilinearForm
 from torchlb.galerkin.elements import Element, simplex
 from torchlb.galerkin.forms import Forms, cell_mean
-from torchlb.galerkin.medium import Medium, orthonormal
+from torchlb.galerkin.medium import orthonormal
 from torchlb.galerkin.pair import Pattern
 from torchlb.geometry.vectors import at
 from torchlb.linalg.csr import Csr
 from torchlb.linalg.sparse import on_one_pattern
-
-
-class TangentForms(NamedTuple):
-    """Forms of tangent fields by those of functions, at constant points, with the frames (N, n, d) there."""
-
-    of_functions: Forms
-    frames: Tensor
-
-    def bilinear(self, forms: Sequence[BilinearForm], medium: Medium) -> Float[Tensor, ""]:
-        """Σ of bilinear forms, differentiable in the medium."""
-        return self.of_functions.bilinear(in_space(forms, self.frames), medium)
 
 
 def in_space(forms: Sequence[BilinearForm], frames: Float[Tensor, "N n d"]) -> list[BilinearForm]:
@@ -181,6 +170,9 @@ def _framed(parts: list[Any], frames: Float[Tensor, "N n d"], others: Csr) -> Cs
             product += sign * left[:, m, :, None] * right[:, k, None, :]
         blocks[0] += value[:, None, None] * product
     blocks[1:] = values[len(pairs) :, :, None, None] * (left.mT @ right)
+    diagonal = torch.from_numpy(np.flatnonzero(row == upper.indices))
+    own = blocks[:, diagonal]
+    blocks[:, diagonal] = (own + own.mT) / 2  # symmetric but for rounding
     pattern = Pattern.of(upper)
     blocks = blocks[:, torch.from_numpy(pattern.order).long()]
     below = pattern.col < torch.arange(count).repeat_interleave(pattern.crow.diff())

@@ -3,22 +3,20 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from functools import partial
 from typing import Any, NamedTuple
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from torchlb.errors import InputError
-from torchlb.galerkin.tangent import TangentForms, tangent_matrices
+from torchlb.errors import DerivativeError, InputError
+from torchlb.galerkin.tangent import in_space, tangent_matrices
 from torchlb.linalg.checks import check_tensor
 from torchlb.linalg.csr import Csr, tensors_of
 from torchlb.operator.batching import remember_shapes, shapes_of
 from torchlb.operator.medium import elements_of, plain
 from torchlb.operator.pair_methods import PairMethods, check_pair
-from torchlb.operator.parts import MediumFields, Modes, PairMatrices
-from torchlb.operator.through import without
+from torchlb.operator.parts import Modes, PairMatrices
 
 
 class FieldMatrices(PairMatrices):
@@ -32,16 +30,22 @@ class _TangentPlan(NamedTuple):
 
     lb: Any
 
-    @property
-    def bilinear(self) -> Any:
-        """Forms at other points, as `Plan.bilinear`."""
-        return partial(self.lb.plan.bilinear, tangent=True)
+    hodge: bool
 
-    def forms(self, points: Tensor) -> TangentForms:
-        """Forms at the points of the operator."""
+    def bilinear(self, *given: Any) -> Float[Tensor, ""]:
+        """Σ of forms, as `Plan.bilinear` at other points or `Forms.bilinear`; DerivativeError for Hodge's."""
+        if self.hodge:
+            raise DerivativeError("Hodge's Laplacian has no derivatives in points and medium")
+        if len(given) == 3:
+            return self.lb.plan.bilinear(*given, tangent=True)
+        forms, medium = given
         frames = self.lb.frames.detach().cpu().double()
-        assert len(points) == len(frames)
-        return TangentForms(elements_of(self.lb), frames)
+        return elements_of(self.lb).bilinear(in_space(forms, frames), medium)
+
+    def forms(self, points: Tensor) -> _TangentPlan:
+        """Forms at the points of the operator, which are these."""
+        assert len(points) == self.lb.num_points
+        return self
 
 
 class Connection(PairMethods):
@@ -57,6 +61,7 @@ class Connection(PairMethods):
     def __init__(self) -> None:
         super().__init__()
         self._lb: tuple[Any, ...] = ()
+        self._is_hodge = False
 
     @property
     def dim(self) -> int:
@@ -66,7 +71,7 @@ class Connection(PairMethods):
     @property
     def plan(self) -> Any:
         """What the matrices follow from."""
-        return _TangentPlan(self._lb[0])
+        return _TangentPlan(self._lb[0], self._is_hodge)
 
     @property
     def hodge(self) -> Connection:
@@ -83,10 +88,7 @@ class Connection(PairMethods):
                     "hodge: expected one surface with a conductivity that is a number, if any"
                 )
             with torch.inference_mode(False):
-                made = _of_shape(self._lb[0], hodge=True)
-            made.weak.values = without(self, made.weak.values, "Hodge's Laplacian")
-            made.points, made._medium = self.points.detach(), MediumFields({})
-            self.cache.connection = made
+                self.cache.connection = _of_shape(self._lb[0], hodge=True)
         return self.cache.connection
 
     def components(
@@ -146,7 +148,9 @@ def _of_shape(lb: Any, *, hodge: bool = False) -> Connection:
         linear = lb.weak.linear if lb.weak.linear.num_rows else None
         found = tangent_matrices(elements, kappa, frames, (lb.weak, linear), hodge=hodge)
     whole, *near = (each.to(lb.weak.values) for each in found)
-    return Connection._of(lb, FieldMatrices(whole.crow, whole.col, whole.values, *near))
+    own = Connection._of(lb, FieldMatrices(whole.crow, whole.col, whole.values, *near))
+    own._is_hodge = hodge
+    return own
 
 
 def _of_batch(lb: Any) -> Connection:

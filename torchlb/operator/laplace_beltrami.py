@@ -289,7 +289,7 @@ class LaplaceBeltrami(StencilMethods, PairMethods):
         planned = self.points.detach().cpu().double() if self._planned is None else self._planned
         check_fit(planned, there, plan.faces)
         with torch.inference_mode(False):
-            built = replace(evaluate(plan, there), surface=self.surface, plan=plan)
+            built = replace(evaluate(plan, there), surface=self.surface)
             lb = self._from_assembled(built, points).to(self.device)
         lb._planned = planned
         lb = carrying(lb, points)

@@ -8,7 +8,7 @@ points that the plan was made from it gives that operator, at points that moved 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 
 import torch
@@ -161,11 +161,12 @@ def evaluate(plan: Plan, points: Float[Tensor, "N n"]) -> AssembledOperator:
     here, options = plan._sorted(points), plan.options
     with renumbered(plan.numbering.given), threads_for(len(points)):
         placed, fits = plan.shape.at(here)
-        pair = plan.pair.at(fits, plan.numbering)
+        pair_plan, pair = plan.pair.at(fits, plan.numbering)
         assert pair.mass is not None
         rows, shape = plan._rows(placed, pair.mass)
     built = AssembledOperator.of(rows, shape, pair, plan.source, options.plain, plan.pair.counts)
-    return built.restored(plan.numbering, points, plan.faces)
+    plan = plan if pair_plan is plan.pair else replace(plan, pair=pair_plan)
+    return replace(built.restored(plan.numbering, points, plan.faces), plan=plan)
 
 
 def check_fit(

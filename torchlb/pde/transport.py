@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import Any
 
 import torch
@@ -56,7 +57,7 @@ def vector_heat_flow(
 
 def parallel_transport(
     lb: LaplaceBeltrami,
-    sources: int | Int[Tensor, " S"],
+    sources: int | Sequence[int] | Int[Tensor, " S"],
     vectors: Float[Tensor, " n"] | Float[Tensor, "S n"] | Float[Tensor, "S n C"],
 ) -> Float[Tensor, "N n"] | Float[Tensor, "N n C"]:
     """Vectors at the sources, transported to all points along shortest paths from the nearest source.
@@ -108,7 +109,7 @@ def parallel_transport(
 
 
 def logarithmic_map(
-    lb: LaplaceBeltrami, sources: int | Int[Tensor, " S"]
+    lb: LaplaceBeltrami, sources: int | Sequence[int] | Int[Tensor, " S"]
 ) -> Float[Tensor, "N d"] | Float[Tensor, "N d S"]:
     """Normal coordinates of all points: the initial velocities, in the source's frame, of shortest paths in unit time.
 
