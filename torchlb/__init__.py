@@ -26,7 +26,7 @@ from torchlb.errors import (
     TorchlbError,
 )
 from torchlb.io.cache import load_operator, load_or_build, operator_key, save_operator
-from torchlb.io.files import read_shape
+from torchlb.io.files import read_point_data, read_shape, write_shape
 from torchlb.io.precompute import PrecomputeReport, ShapeResult, precompute_operators
 from torchlb.nn.diffusion import Diffusion
 from torchlb.nn.diffusion_net import DiffusionNet, DiffusionNetBlock
@@ -96,11 +96,13 @@ __all__ = [
     "operator_key",
     "poisson_solve",
     "precompute_operators",
+    "read_point_data",
     "read_shape",
     "save_operator",
     "spectral_wavelets",
     "surfaces",
     "wave_kernel_signature",
+    "write_shape",
 ]
 
 

@@ -1,4 +1,4 @@
-"""Readers of polygons in .obj, .off and .ply, points in .pcd, and tables of numbers.
+"""Readers of polygons in .obj, .off, .ply and VTK's polydata, points in .pcd, and tables of numbers.
 
 Each reader returns the vertices, (N, 3) or (N, n), the concatenated corners of all polygons, and the number of corners
 of each; a shape without polygons is a cloud.
@@ -26,13 +26,17 @@ TYPES = {
 """Types of .ply, as NumPy names them."""
 
 
-def _polygons(vertices: Any, faces: Any) -> Polygons:
-    """Vertices and polygons, from faces as rows of an array or as lists of corners."""
+def concatenated(faces: Any) -> tuple[Int[np.ndarray, " C"], Int[np.ndarray, " P"]]:
+    """Corners of polygons, and their numbers, from faces as rows of an array or as lists of corners."""
     if isinstance(faces, np.ndarray):
         sizes, corners = np.full(len(faces), faces.shape[1]), faces.ravel()
     else:
         sizes, corners = np.fromiter(map(len, faces), int), np.fromiter(chain(*faces), int)
-    return np.asarray(vertices, dtype=float), corners.astype(np.int64), sizes
+    return corners.astype(np.int64), sizes
+
+
+def _polygons(vertices: Any, faces: Any) -> Polygons:
+    return np.asarray(vertices, dtype=float), *concatenated(faces)
 
 
 def read_obj(path: Path) -> Polygons:
@@ -190,6 +194,47 @@ def read_pcd(path: Path) -> Polygons:
     places = [table[str(names.index(axis))].reshape(len(table), -1)[:, 0] for axis in "xyz"]
     points = np.stack(places, 1).astype(float)
     return _polygons(points[~np.isnan(points).any(1)], [])
+
+
+def read_polydata(path: Path) -> Polygons | None:
+    """Points and polygons of VTK's polydata in a legacy file, ascii or binary; None for VTK's other kinds."""
+    data = path.read_bytes()
+    head = re.match(rb"# vtk.*\n.*\n\s*(ASCII|BINARY)\s+DATASET\s+POLYDATA\s", data, re.IGNORECASE)
+    if head is None:
+        return None
+    at, ascii_ = head.end(), head[1].upper() == b"ASCII"
+
+    def section(title: bytes) -> list[str]:
+        """The words behind a title; numbers begin in the next line."""
+        nonlocal at
+        found = re.compile(rb"\b" + title + rb"[ \t]([^\n]*)\n", re.IGNORECASE).search(data, at)
+        at = len(data) if found is None else found.end()
+        return [] if found is None else found[1].decode("ascii", "replace").lower().split()
+
+    def values(count: int, kind: str) -> np.ndarray:
+        nonlocal at
+        if ascii_:
+            *words, rest = [*data[at:].split(None, count), b""][: count + 1]
+            at = len(data) - len(rest)
+            if len(words) < count:
+                raise InputError(f"{count} numbers announced, {len(words)} there")
+            return np.array(words).astype(float)
+        found = np.frombuffer(data, f">{TYPES.get(kind, 'i8')}", count, at)
+        at += found.nbytes
+        return found
+
+    count, kind = section(b"POINTS")
+    points = values(3 * int(count), kind).reshape(-1, 3)
+    count, size, *_ = section(b"POLYGONS") or ("0", "0")
+    if data[at : at + 7].upper() == b"OFFSETS":  # since version 5
+        ends = values(int(count), section(b"OFFSETS")[0]).astype(np.int64)
+        corners = values(int(size), section(b"CONNECTIVITY")[0])
+        return points.astype(float), corners.astype(np.int64), np.diff(ends)
+    rows, polygons = values(int(size), "int").astype(np.int64), []
+    while len(rows):
+        polygons.append(rows[1 : 1 + rows[0]])
+        rows = rows[1 + rows[0] :]
+    return _polygons(points, polygons)
 
 
 def read_table(path: Path) -> Polygons:
