@@ -1,11 +1,51 @@
-"""Validation of operators, and of functions on points: tensors of finite values."""
+"""Validation of operators, and of functions on points: tensors of finite values, or NumPy arrays in their place."""
 
 from __future__ import annotations
 
+import inspect
+from collections.abc import Callable
+from functools import wraps
+from typing import Any, ParamSpec, TypeVar
+
+import numpy as np
 import torch
 from torch import Tensor
 
 from torchlb.errors import InputError, InputTypeError, first_few
+
+P = ParamSpec("P")
+T = TypeVar("T")
+DATA = {"f", "v", "coefficients", "sources"}
+
+
+def takes_arrays(function: Callable[P, T]) -> Callable[P, T]:
+    """Let a function take arrays of NumPy: if its data, a parameter in `DATA`, are one, so is what it returns.
+
+    Arrays go to the device of the operator, or basis, among the arguments; masked values become NaN. Results come back
+    without gradients.
+    """
+    names = list(inspect.signature(function).parameters)
+    place = next(i for i, name in enumerate(names) if name in DATA)
+
+    @wraps(function)
+    def called(*args: P.args, **options: P.kwargs) -> T:
+        data = args[place] if len(args) > place else options.get(names[place])
+        if not isinstance(data, np.ndarray):
+            return function(*args, **options)
+        owner = next((x for x in (*args, *options.values()) if hasattr(x, "mass")), None)
+        device = getattr(getattr(owner, "mass", None), "device", None)
+
+        def tensor(x: Any) -> Any:
+            if not isinstance(x, np.ndarray):
+                return x
+            x = x.filled(np.nan) if isinstance(x, np.ma.MaskedArray) else x
+            return torch.tensor(x.astype(x.dtype.newbyteorder("=")), device=device)
+
+        call: Any = function
+        result = call(*map(tensor, args), **{name: tensor(x) for name, x in options.items()})
+        return result.detach().cpu().numpy()
+
+    return called
 
 
 def check_tensor(f: object, what: str = "f") -> None:

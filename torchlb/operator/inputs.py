@@ -83,7 +83,9 @@ def check_corners(faces: ArrayLike, num_points: int) -> Int[Tensor, "F v"]:
     if len(faces) == 0:
         raise InputError("faces: got none; use LaplaceBeltrami.from_points for a cloud")
     if faces.is_floating_point() or faces.is_complex() or faces.dtype == torch.bool:
-        raise InputError(f"faces: expected integers, got {faces.dtype}")
+        raise InputError(
+            f"faces: expected integers, got {faces.dtype}; vertices come first, faces second"
+        )
     faces = faces.detach().to("cpu", torch.int64)
     bad = ((faces < 0) | (faces >= num_points)).any(1).nonzero()[:, 0]
     if len(bad):

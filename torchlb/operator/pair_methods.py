@@ -10,6 +10,7 @@ from scipy import sparse
 from torch import Tensor
 
 from torchlb.errors import InputError
+from torchlb.linalg.checks import takes_arrays
 from torchlb.linalg.csr import Csr
 from torchlb.linalg.sparse import csr_tensor, to_scipy
 from torchlb.linalg.threads import threads_for
@@ -77,7 +78,7 @@ class PairMethods(OperatorStorage):
 
     def _channel(self, name: str) -> tuple[Csr, int]:
         """The matrices that hold "laplacian", "stiffness", "mass" or "boundary_mass", and its channel in them."""
-        if name not in get_args(MatrixName):
+        if not isinstance(name, str) or name not in get_args(MatrixName):
             raise InputError(f"name: expected one of {list(get_args(MatrixName))}, got {name!r}")
         if name == "laplacian":
             return self.stencil, 0
@@ -87,6 +88,7 @@ class PairMethods(OperatorStorage):
             raise InputError("boundary_mass: the shape is closed")
         return self.weak, get_args(MatrixName).index(name) - 1
 
+    @takes_arrays
     def product(self, name: MatrixName, f: Tensor) -> Tensor:
         """A matrix of the operator times f, of the shape of f, differentiable in f any number of times.
 

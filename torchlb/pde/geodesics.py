@@ -19,7 +19,7 @@ from torch import Tensor
 
 from torchlb.errors import InputError
 from torchlb.geometry.neighbors import mesh_graph
-from torchlb.linalg.checks import check_operator
+from torchlb.linalg.checks import check_operator, takes_arrays
 from torchlb.linalg.precision import NEGLIGIBLE
 from torchlb.operator.laplace_beltrami import LaplaceBeltrami
 from torchlb.operator.through import without
@@ -28,6 +28,7 @@ FROM_MESH = ("mesh", "cotangent")
 """Sources of operators for which all edges are those of the faces."""
 
 
+@takes_arrays
 def geodesic_distance(
     lb: LaplaceBeltrami, sources: int | Sequence[Any] | Tensor, *, each: bool = False
 ) -> Float[Tensor, " N"] | Float[Tensor, "N S"]:

@@ -15,6 +15,7 @@ import torch
 from jaxtyping import Shaped
 from torch import Tensor
 
+from torchlb.linalg.checks import takes_arrays
 from torchlb.linalg.csr import shaped_like, side_by_side
 from torchlb.linalg.exponential import heat
 from torchlb.linalg.precision import ROOT_EPS
@@ -29,6 +30,7 @@ from torchlb.spectral.eigenbasis import Eigenbasis
 Method = Literal["deflated", "spectral", "rational"]
 
 
+@takes_arrays
 def heat_flow(
     lb: LaplaceBeltrami,
     f: Shaped[Tensor, "*B N C"] | Shaped[Tensor, " N"],
