@@ -17,6 +17,7 @@ OTHERS = {
     "time": 0.1,
     "t": 0.1,
     "f": X,
+    "fwhm": 0.3,
     "scales": [0.1],
     "k": 8,
     "v": torch.stack([X, X, X], 1),

@@ -34,13 +34,13 @@ from torchlb.nn.gradient_features import GradientFeatures
 from torchlb.nn.implicit_diffusion import ImplicitDiffusion
 from torchlb.nn.poisson_block import PoissonBlock, PoissonFeatures
 from torchlb.nn.spectral_conv import SpectralConv
-from torchlb.operator.cleaning import clean_mesh, clean_points
+from torchlb.operator.cleaning import clean_mesh, clean_points, submesh
 from torchlb.operator.collate import collate
 from torchlb.operator.curvature import Curvatures
 from torchlb.operator.laplace_beltrami import LaplaceBeltrami
 from torchlb.operator.report import StencilReport
 from torchlb.pde.geodesics import geodesic_distance
-from torchlb.pde.heat import heat_flow
+from torchlb.pde.heat import heat_flow, smooth
 from torchlb.pde.solves import implicit_step, poisson_solve
 from torchlb.spectral.eigenbasis import Eigenbasis
 from torchlb.spectral.signatures import (
@@ -99,7 +99,9 @@ __all__ = [
     "read_point_data",
     "read_shape",
     "save_operator",
+    "smooth",
     "spectral_wavelets",
+    "submesh",
     "surfaces",
     "wave_kernel_signature",
     "write_shape",

@@ -92,5 +92,5 @@ def check_finite(f: Tensor, what: str = "f") -> None:
         raise InputError(
             f"{what}: expected finite values, got NaN or infinity at {len(bad)} of {f.shape[max(f.ndim - 2, 0)]} "
             f"points ({first_few(bad)}); give these points values, as torch.nan_to_num({what}) does, or build the "
-            "operator without them"
+            "operator without them (torchlb.submesh)"
         )

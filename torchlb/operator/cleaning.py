@@ -117,6 +117,46 @@ def clean_mesh(
     return vertices[kept], renumbered.to(faces), kept
 
 
+def submesh(
+    vertices: ArrayLike, faces: ArrayLike, mask: ArrayLike
+) -> tuple[Tensor, Tensor, Tensor]:
+    """The part of a mesh whose faces have all their corners in a mask, such as a cortex without the medial wall.
+
+    Where it is cut it has a boundary, with the condition that `LaplaceBeltrami.from_mesh` is given: ∂f/∂ν = 0, unless
+    it is another. Modes, heat and distances are those of the part alone, and nothing of the rest has an influence.
+
+    Parameters
+    ----------
+    vertices, faces
+        (N, n), and (F, 3) indices.
+    mask
+        (N,), true for the vertices to keep. Those that are corners of no whole face inside are left out.
+
+    Returns
+    -------
+    vertices, faces, kept
+        As `clean_mesh` has them: `values[kept]` cuts data out, and ``whole[kept] = values`` puts them back.
+
+    Examples
+    --------
+    >>> square = torch.tensor([[0.0, 0], [1, 0], [1, 1], [0, 1]])
+    >>> submesh(square, [[0, 1, 2], [0, 2, 3]], [True, False, True, True])[1:]
+    (tensor([[0, 1, 2]]), tensor([0, 2, 3]))
+    """
+    corners, inside = check_corners(faces, len(vertices)), as_tensor(mask).detach().cpu()
+    if inside.dtype != torch.bool or inside.shape != (len(vertices),):
+        raise InputError(
+            f"mask: expected a boolean mask of shape ({len(vertices)},), such as labels != 0, got {inside.dtype} of "
+            f"shape {tuple(inside.shape)}"
+        )
+    whole = inside[corners].all(1)
+    if not whole.any():
+        raise InputError(
+            f"mask: no face has all its corners among its {int(inside.sum())} vertices"
+        )
+    return clean_mesh(vertices, as_tensor(faces)[whole])
+
+
 def cleaned(vertices: ArrayLike, faces: ArrayLike | None) -> tuple[Tensor, Tensor | None]:
     """Vertices and faces by `clean_mesh`, or by `clean_points` without faces."""
     if faces is None or len(faces) == 0:
