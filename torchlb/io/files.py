@@ -12,29 +12,19 @@ from torch import Tensor
 
 from torchlb.errors import InputError
 from torchlb.geometry.complex import edges_of
-from torchlb.io.formats import READERS, numbers_of
-from torchlb.io.libraries import (
-    BY_MESHIO,
-    BY_NIBABEL,
-    MAP,
-    SURFACE,
-    read_meshio,
-    read_nibabel,
-    start_of,
-    write_meshio,
-    write_nibabel,
-)
-from torchlb.operator.cleaning import merged, proper_faces, triangles_of
+from torchlb.io import libraries
+from torchlb.io.formats import READERS, numbers_of, triangulated
+from torchlb.operator.cleaning import merged, proper_faces
 from torchlb.operator.inputs import ArrayLike, as_tensor, check_corners, check_points
 
-SUFFIXES = tuple(sorted([".gii", ".glb", ".gltf", ".npy", ".npz", ".stl", *BY_MESHIO, *READERS]))
+SUFFIXES = tuple(
+    sorted([".gii", ".glb", ".gltf", ".npy", ".npz", ".stl", ".vtk", ".vtu", *READERS])
+)
 """Endings of the files that `read_shape` takes."""
 STEPS = 4
 """Largest difference of coinciding corners in an .stl, in steps of float32 at the largest coordinate."""
 OF_THE_SHAPE = ("vertices", "points", "pos", "faces")
 """Names in a .npz that are not of data."""
-WRITTEN = ".npz, .vtk, .vtu, .gii"
-"""Formats with data of the points that are written."""
 Shape = tuple[Float[Tensor, "N n"], Int[Tensor, "F v"] | None]
 
 
@@ -88,27 +78,21 @@ def read_point_data(path: str | Path) -> dict[str, Tensor]:
     ----------
     path
         A .npz: its arrays except the shape; .vtk (no polydata) or .vtu, through meshio; .gii, .mgh, .annot and
-        FreeSurfer's maps (lh.thickness, lh.curv, …), through nibabel.
-
-    Raises
-    ------
-    FileNotFoundError
-        If there is no such file.
-    ValueError
-        If it holds no such data, or the library is missing that reads it; the message names the file.
+        FreeSurfer's maps (lh.thickness, lh.curv, …), through nibabel. Errors are those of `read_shape`, and a
+        ValueError for a file without data.
     """
     data = _read(path)[2]
     if not data:
         raise InputError(
-            f"{path}: no data of points are read from it; {WRITTEN}, .mgh, .annot and FreeSurfer's maps hold some"
+            f"{path}: no data of points; .npz, .vtk, .vtu, .gii, .mgh, .annot and FreeSurfer's maps may hold some"
         )
     return {name: as_tensor(values) for name, values in data.items()}
 
 
-def _read(path: str | Path) -> tuple[Tensor | None, Tensor | None, dict[str, np.ndarray]]:
+def _read(path: str | Path) -> libraries.Contents:
     """The vertices, cells and data in a file, if any."""
-    path = Path(path).expanduser()
-    suffix, data = path.suffix.lower(), {}
+    path, data = Path(path).expanduser(), {}
+    suffix = path.suffix.lower()
     if not path.is_file():
         raise FileNotFoundError(f"{path}: no such file")
     try:
@@ -117,13 +101,9 @@ def _read(path: str | Path) -> tuple[Tensor | None, Tensor | None, dict[str, np.
         elif suffix == ".npz":
             vertices, faces, data = _npz(path)
         elif suffix in READERS:
-            vertices, faces = _triangulated(*READERS[suffix](path))
-        elif suffix in (*BY_MESHIO, *BY_NIBABEL) or start_of(path) in (SURFACE, MAP):
-            places, cells, data = (read_meshio if suffix in BY_MESHIO else read_nibabel)(path)
-            vertices = None if places is None else as_tensor(np.asarray(places, dtype=float))
-            faces = None if cells is None or isinstance(cells, tuple) else as_tensor(cells).long()
-            if isinstance(cells, tuple):
-                vertices, faces = _triangulated(np.asarray(vertices), *cells)
+            vertices, faces = triangulated(*READERS[suffix](path))
+        elif (found := libraries.read(path)) is not None:
+            vertices, faces, data = found
         else:
             import trimesh
 
@@ -149,21 +129,16 @@ def write_shape(
     Parameters
     ----------
     path
-        Data are held by .npz, by .vtk and .vtu (through meshio), and by .gii (through nibabel, in single precision;
-        .func.gii and .shape.gii hold the data alone). Without data also .ply, .obj, .stl, .off, … (through trimesh).
+        .npz; .vtk or .vtu (through meshio), in R² and R³; .gii (through nibabel), triangles and data in single
+        precision, or data alone in .func.gii and .shape.gii; .ply, .obj, .off, .stl, .glb (through trimesh), triangles
+        or points in R³ without data.
     points, cells
-        (N, n) and (F, 3) triangles, (F, 2) segments or (F, 4) tetrahedra, such as ``lb.points, lb.faces``; None for a
-        cloud.
+        (N, n), and (F, 3) triangles, (F, 2) segments or (F, 4) tetrahedra, or None: ``lb.points, lb.faces``.
     **point_data
         (N,) or (N, C) each, by name, such as ``thickness=f``.
 
-    Raises
-    ------
-    ValueError
-        For data of another length, a format that holds no data or no such cells, and where its library is missing.
+    Raises ValueError for data of another length, a format that does not hold them, and where its library is missing.
 
-    Examples
-    --------
     >>> import tempfile
     >>> with tempfile.TemporaryDirectory() as folder:
     ...     write_shape(f"{folder}/a.npz", torch.eye(3), [[0, 1, 2]], f=torch.ones(3))
@@ -181,65 +156,33 @@ def write_shape(
                 f"{name}: expected data of {len(places)} points, (N,) or (N, C), under a name other than "
                 f"{', '.join(OF_THE_SHAPE)}; got shape {values.shape}"
             )
-    n, writer = places.shape[1], write_meshio if suffix in BY_MESHIO else write_nibabel
+    flat = places.shape[1] == corners.shape[1] == 3
     if suffix == ".npz":
         np.savez(path, **{"vertices": places, "faces": corners, **data})
-    elif (
-        suffix in (*BY_MESHIO, ".gii")
-        and n < 4
-        and (corners.shape[1] == 3 == n or suffix != ".gii")
-    ):
-        writer(path, places, corners, data)
-    elif data or n != 3 or corners.shape[1] != 3:
-        raise InputError(
-            f"{path}: this format does not hold {list(data) or 'such cells'} on these points of R^{n}, with cells of "
-            f"{corners.shape[1]} corners; .npz holds all, .vtk and .vtu all in R² and R³, .gii triangles and data in R³"
-        )
+    elif (suffix in libraries.BY_MESHIO and places.shape[1] < 4) or (suffix == ".gii" and flat):
+        libraries.write(path, places, corners, data)
+    elif suffix in (".ply", ".obj", ".off", ".stl", ".glb") and flat and not data:
+        import trimesh
+
+        mesh = trimesh.Trimesh(places, corners, process=False)
+        _ = (mesh if len(corners) else trimesh.PointCloud(places)).export(path)
     else:
-        _write_trimesh(path, places, corners)
-
-
-def _write_trimesh(path: Path, points: np.ndarray, cells: np.ndarray) -> None:
-    import trimesh
-
-    mesh = trimesh.Trimesh(points, cells, process=False)
-    shape: Any = mesh if len(cells) else trimesh.PointCloud(points)
-    try:
-        shape.export(path)
-    except (ValueError, KeyError) as error:
+        what = f", with {', '.join(data)}" if data else ""
         raise InputError(
-            f"{path}: no format that can be written; {WRITTEN}, .ply, .obj, .off, .stl can ({error})"
-        ) from error
+            f"{path}: this format does not hold cells {corners.shape} on points {places.shape}{what}; .npz holds all, "
+            ".vtk and .vtu all in R² and R³, .gii triangles in R³ and data, .ply, .obj, .off, .stl, .glb triangles or "
+            "points in R³ without data"
+        )
 
 
 def may_be_shape(path: Path) -> bool:
     """Whether a file is taken for a shape, by its ending; .txt and .csv by three numbers in their first row."""
     if path.suffix.lower() not in (".csv", ".txt"):
-        return path.suffix.lower() in SUFFIXES or start_of(path) == SURFACE
+        return path.suffix.lower() in SUFFIXES or libraries.begins(path, libraries.SURFACE)
     try:
         return len(next(numbers_of(path), ([], []))[1]) > 2
     except InputError:
         return False
-
-
-def _triangulated(
-    vertices: Float[np.ndarray, "N n"], corners: Int[np.ndarray, " C"], sizes: Int[np.ndarray, " P"]
-) -> Shape:
-    """Split polygons into triangles, in their order; those with fewer than three corners are left out."""
-    places, every = torch.from_numpy(vertices), torch.from_numpy(corners)
-    bad = corners[(corners < 0) | (corners >= len(vertices))]
-    if len(bad):
-        raise InputError(f"faces have a corner {bad[0]}, and there are {len(vertices)} vertices")
-    starts, parts, owners = np.cumsum(sizes) - sizes, [], []
-    for size in np.unique(sizes[sizes > 2]).tolist():
-        chosen = np.flatnonzero(sizes == size)
-        polygons = every[torch.from_numpy(starts[chosen][:, None] + np.arange(size))]
-        parts.append(polygons[:, None] if size == 3 else triangles_of(places, polygons))
-        owners.append(torch.from_numpy(chosen).repeat_interleave(size - 2))
-    if not parts:
-        return places, None
-    order = torch.cat(owners).argsort(stable=True)
-    return places, torch.cat([part.flatten(0, 1) for part in parts])[order]
 
 
 def _sewn(vertices: Float[Tensor, "N 3"], faces: Int[Tensor, "F 3"]) -> tuple[Tensor, Tensor]:
@@ -262,10 +205,14 @@ def _sewn(vertices: Float[Tensor, "N 3"], faces: Int[Tensor, "F 3"]) -> tuple[Te
     return vertices[kept], number[faces]
 
 
-def _npz(path: Path) -> tuple[Tensor | None, Tensor | None, dict[str, np.ndarray]]:
+def _npz(path: Path) -> libraries.Contents:
     with np.load(path, allow_pickle=False) as archive:
-        names = [name for name in ("vertices", "points", "pos") if name in archive.files]
-        vertices = as_tensor(archive[names[0]]) if names else None
-        faces = as_tensor(archive["faces"]).long() if "faces" in archive.files else None
-        data = {name: archive[name] for name in archive.files if name not in OF_THE_SHAPE}
-    return vertices, None if faces is None or faces.numel() == 0 else faces, data
+        arrays = dict(archive)
+    data = {name: array for name, array in arrays.items() if name not in OF_THE_SHAPE}
+    shape = [as_tensor(arrays[name]) for name in OF_THE_SHAPE if name in arrays]
+    faces = shape.pop() if "faces" in arrays else None
+    return (
+        shape[0] if shape else None,
+        None if faces is None or faces.numel() == 0 else faces.long(),
+        data,
+    )

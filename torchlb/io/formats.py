@@ -13,9 +13,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
 from jaxtyping import Float, Int
+from torch import Tensor
 
 from torchlb.errors import InputError
+from torchlb.operator.cleaning import triangles_of
 
 Polygons = tuple[Float[np.ndarray, "N n"], Int[np.ndarray, " C"], Int[np.ndarray, " P"]]
 TYPES = {
@@ -37,6 +40,26 @@ def concatenated(faces: Any) -> tuple[Int[np.ndarray, " C"], Int[np.ndarray, " P
 
 def _polygons(vertices: Any, faces: Any) -> Polygons:
     return np.asarray(vertices, dtype=float), *concatenated(faces)
+
+
+def triangulated(
+    vertices: Float[np.ndarray, "N n"], corners: Int[np.ndarray, " C"], sizes: Int[np.ndarray, " P"]
+) -> tuple[Tensor, Tensor | None]:
+    """Split polygons into triangles, in their order; those with fewer than three corners are left out."""
+    places, every = torch.from_numpy(vertices), torch.from_numpy(corners)
+    bad = corners[(corners < 0) | (corners >= len(vertices))]
+    if len(bad):
+        raise InputError(f"faces have a corner {bad[0]}, and there are {len(vertices)} vertices")
+    starts, parts, owners = np.cumsum(sizes) - sizes, [], []
+    for size in np.unique(sizes[sizes > 2]).tolist():
+        chosen = np.flatnonzero(sizes == size)
+        polygons = every[torch.from_numpy(starts[chosen][:, None] + np.arange(size))]
+        parts.append(polygons[:, None] if size == 3 else triangles_of(places, polygons))
+        owners.append(torch.from_numpy(chosen).repeat_interleave(size - 2))
+    if not parts:
+        return places, None
+    order = torch.cat(owners).argsort(stable=True)
+    return places, torch.cat([part.flatten(0, 1) for part in parts])[order]
 
 
 def read_obj(path: Path) -> Polygons:
@@ -197,43 +220,20 @@ def read_pcd(path: Path) -> Polygons:
 
 
 def read_polydata(path: Path) -> Polygons | None:
-    """Points and polygons of VTK's polydata in a legacy file, ascii or binary; None for VTK's other kinds."""
+    """Points and polygons of VTK's polydata in an ascii file; None for what else a .vtk may hold."""
     data = path.read_bytes()
-    head = re.match(rb"# vtk.*\n.*\n\s*(ASCII|BINARY)\s+DATASET\s+POLYDATA\s", data, re.IGNORECASE)
-    if head is None:
+    if not {b"ASCII", b"POLYDATA"} <= {*data[:400].upper().split()}:
         return None
-    at, ascii_ = head.end(), head[1].upper() == b"ASCII"
-
-    def section(title: bytes) -> list[str]:
-        """The words behind a title; numbers begin in the next line."""
-        nonlocal at
-        found = re.compile(rb"\b" + title + rb"[ \t]([^\n]*)\n", re.IGNORECASE).search(data, at)
-        at = len(data) if found is None else found.end()
-        return [] if found is None else found[1].decode("ascii", "replace").lower().split()
-
-    def values(count: int, kind: str) -> np.ndarray:
-        nonlocal at
-        if ascii_:
-            *words, rest = [*data[at:].split(None, count), b""][: count + 1]
-            at = len(data) - len(rest)
-            if len(words) < count:
-                raise InputError(f"{count} numbers announced, {len(words)} there")
-            return np.array(words).astype(float)
-        found = np.frombuffer(data, f">{TYPES.get(kind, 'i8')}", count, at)
-        at += found.nbytes
-        return found
-
-    count, kind = section(b"POINTS")
-    points = values(3 * int(count), kind).reshape(-1, 3)
-    count, size, *_ = section(b"POLYGONS") or ("0", "0")
-    if data[at : at + 7].upper() == b"OFFSETS":  # since version 5
-        ends = values(int(count), section(b"OFFSETS")[0]).astype(np.int64)
-        corners = values(int(size), section(b"CONNECTIVITY")[0])
-        return points.astype(float), corners.astype(np.int64), np.diff(ends)
-    rows, polygons = values(int(size), "int").astype(np.int64), []
-    while len(rows):
-        polygons.append(rows[1 : 1 + rows[0]])
-        rows = rows[1 + rows[0] :]
+    words, polygons = data.upper().split(), []
+    at = words.index(b"POINTS")
+    end = at + 3 + 3 * int(words[at + 1])
+    points = np.array(words[at + 3 : end], float).reshape(-1, 3)
+    if b"POLYGONS" in words[end:]:
+        at = words.index(b"POLYGONS", end)
+        rows = np.array(words[at + 3 : at + 3 + int(words[at + 2])], int)
+        while len(rows):
+            polygons.append(rows[1 : 1 + rows[0]])
+            rows = rows[1 + rows[0] :]
     return _polygons(points, polygons)
 
 

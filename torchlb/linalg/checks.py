@@ -21,8 +21,7 @@ DATA = {"f", "v", "coefficients", "sources"}
 def takes_arrays(function: Callable[P, T]) -> Callable[P, T]:
     """Let a function take arrays of NumPy: if its data, a parameter in `DATA`, are one, so is what it returns.
 
-    Arrays go to the device of the operator, or basis, among the arguments; masked values become NaN. Results come back
-    without gradients.
+    Arrays go to the device of the operator or basis; masked values become NaN. Results have no gradients.
     """
     names = list(inspect.signature(function).parameters)
     place = next(i for i, name in enumerate(names) if name in DATA)
@@ -32,18 +31,15 @@ def takes_arrays(function: Callable[P, T]) -> Callable[P, T]:
         data = args[place] if len(args) > place else options.get(names[place])
         if not isinstance(data, np.ndarray):
             return function(*args, **options)
-        owner = next((x for x in (*args, *options.values()) if hasattr(x, "mass")), None)
-        device = getattr(getattr(owner, "mass", None), "device", None)
-
-        def tensor(x: Any) -> Any:
-            if not isinstance(x, np.ndarray):
-                return x
-            x = x.filled(np.nan) if isinstance(x, np.ma.MaskedArray) else x
-            return torch.tensor(x.astype(x.dtype.newbyteorder("=")), device=device)
-
+        given: dict[str, Any] = dict(zip(names, args, strict=False)) | options
+        mass = next((x.mass for x in given.values() if hasattr(x, "mass")), None)
+        for name, x in given.items():
+            if isinstance(x, np.ndarray):
+                x = x.filled(np.nan) if isinstance(x, np.ma.MaskedArray) else x
+                x = x.astype(x.dtype.newbyteorder("="))
+                given[name] = torch.tensor(x, device=getattr(mass, "device", None))
         call: Any = function
-        result = call(*map(tensor, args), **{name: tensor(x) for name, x in options.items()})
-        return result.detach().cpu().numpy()
+        return call(**given).detach().cpu().numpy()
 
     return called
 

@@ -14,7 +14,7 @@ from torch.nn.functional import pad
 from torchlb.errors import InputError
 from torchlb.geometry.complex import edges_of, two_orientations
 from torchlb.linalg.precision import ROUNDING
-from torchlb.operator.inputs import ArrayLike, as_tensor, check_corners, check_points
+from torchlb.operator.inputs import ArrayLike, as_tensor, check_corners, check_mask, check_points
 
 
 def coincident(
@@ -120,36 +120,19 @@ def clean_mesh(
 def submesh(
     vertices: ArrayLike, faces: ArrayLike, mask: ArrayLike
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """The part of a mesh whose faces have all their corners in a mask, such as a cortex without the medial wall.
+    """The part of a mesh whose faces have all corners in a mask (N,), such as a cortex without the medial wall.
 
-    Where it is cut it has a boundary, with the condition that `LaplaceBeltrami.from_mesh` is given: ∂f/∂ν = 0, unless
-    it is another. Modes, heat and distances are those of the part alone, and nothing of the rest has an influence.
+    Vertices of the mask that belong to no such face are left out. Returned are vertices, faces and `kept`, as
+    `clean_mesh` has them: `values[kept]` cuts data out, and ``whole[kept] = values`` puts them back. Where it is cut
+    the part has a boundary, with the condition given to `LaplaceBeltrami.from_mesh`, ∂f/∂ν = 0 by default. Modes, heat and
+    distances are those of the part alone. Raises InputError for anything but a boolean mask, or without a face inside.
 
-    Parameters
-    ----------
-    vertices, faces
-        (N, n), and (F, 3) indices.
-    mask
-        (N,), true for the vertices to keep. Those that are corners of no whole face inside are left out.
-
-    Returns
-    -------
-    vertices, faces, kept
-        As `clean_mesh` has them: `values[kept]` cuts data out, and ``whole[kept] = values`` puts them back.
-
-    Examples
-    --------
     >>> square = torch.tensor([[0.0, 0], [1, 0], [1, 1], [0, 1]])
     >>> submesh(square, [[0, 1, 2], [0, 2, 3]], [True, False, True, True])[1:]
     (tensor([[0, 1, 2]]), tensor([0, 2, 3]))
     """
-    corners, inside = check_corners(faces, len(vertices)), as_tensor(mask).detach().cpu()
-    if inside.dtype != torch.bool or inside.shape != (len(vertices),):
-        raise InputError(
-            f"mask: expected a boolean mask of shape ({len(vertices)},), such as labels != 0, got {inside.dtype} of "
-            f"shape {tuple(inside.shape)}"
-        )
-    whole = inside[corners].all(1)
+    inside = check_mask(mask, len(vertices))
+    whole = inside[check_corners(faces, len(vertices))].all(1)
     if not whole.any():
         raise InputError(
             f"mask: no face has all its corners among its {int(inside.sum())} vertices"

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from torchlb.errors import InputError, first_few, warn
@@ -68,6 +68,17 @@ def check_points(points: ArrayLike, what: str = "points") -> Float[Tensor, "N n"
             f"{what}: {len(bad)} are NaN or infinite ({first_few(bad)}); remove or repair them"
         )
     return points
+
+
+def check_mask(mask: ArrayLike, num_points: int, what: str = "mask") -> Bool[Tensor, " N"]:
+    """A boolean mask of all points on the CPU; ValueError for anything else."""
+    mask = as_tensor(mask).detach().cpu()
+    if mask.dtype != torch.bool or mask.shape != (num_points,):
+        raise InputError(
+            f"{what}: expected a boolean mask of shape ({num_points},), such as labels != 0, got {mask.dtype} of shape "
+            f"{tuple(mask.shape)}"
+        )
+    return mask
 
 
 def check_corners(faces: ArrayLike, num_points: int) -> Int[Tensor, "F v"]:

@@ -23,6 +23,7 @@ from torchlb.linalg.exponential import heat
 from torchlb.linalg.precision import ROOT_EPS
 from torchlb.linalg.sparse import compute_dtype
 from torchlb.operator.checks import check_tolerance
+from torchlb.operator.inputs import check_mask
 from torchlb.operator.laplace_beltrami import LaplaceBeltrami
 from torchlb.operator.pair_methods import check_pair
 from torchlb.pde.checks import as_columns, as_times, check_choice, check_shape
@@ -97,7 +98,7 @@ def smooth(
     """f smoothed along the surface by a Gaussian of a given full width at half maximum; differentiable in f.
 
     `heat_flow` for the time t = σ²/2, where σ = fwhm/√(8 ln 2); in the plane it is the convolution with the Gaussian of
-    standard deviation σ. A width of less than two edges is not resolved.
+    standard deviation σ. A width of less than two edges is not resolved. Errors are those of `heat_flow`.
 
     Parameters
     ----------
@@ -109,13 +110,6 @@ def smooth(
         (N,), true where f counts. With it the result is e^{tΔ}(mf)/e^{tΔ}m there, a weighted mean of the values inside,
         and NaN elsewhere, where f may be NaN, too. Without it NaN are an error.
 
-    Raises
-    ------
-    InputError
-        As `heat_flow`, and for a width or mask that is none.
-
-    Examples
-    --------
     >>> from torchlb.surfaces import Sphere
     >>> vertices, faces = Sphere().mesh(500)
     >>> g = smooth(LaplaceBeltrami.from_mesh(vertices, faces), vertices[:, 2], math.sqrt(8 * math.log(2)))
@@ -129,14 +123,10 @@ def smooth(
         return heat_flow(lb, f, time)
     check_tensor(f)
     check_shape(f[:, None] if f.ndim == 1 else f, lb)
-    if mask.dtype != torch.bool or mask.shape != (lb.num_points,):
-        raise InputError(
-            f"mask: expected a boolean mask ({lb.num_points},), got {mask.dtype} {tuple(mask.shape)}"
-        )
-    inside = mask if f.ndim == 1 else mask[:, None]
+    inside = check_mask(mask, lb.num_points).to(f.device)
+    inside = inside if f.ndim == 1 else inside[:, None]
     whole = heat_flow(lb, torch.where(inside, f, 0), time)
-    weight = heat_flow(lb, inside.to(whole), time)
-    return torch.where(inside, whole / weight, torch.nan)
+    return torch.where(inside, whole / heat_flow(lb, inside.to(whole), time), torch.nan)
 
 
 def flow(
