@@ -124,7 +124,7 @@ def submesh(
 
     Vertices of the mask that belong to no such face are left out. Returned are vertices, faces and `kept`, as
     `clean_mesh` has them: `values[kept]` cuts data out, and ``whole[kept] = values`` puts them back. Where it is cut
-    the part has a boundary, with the condition given to `LaplaceBeltrami.from_mesh`, ∂f/∂ν = 0 by default. Modes, heat and
+    the part has a boundary, with the condition given to `from_mesh`, ∂f/∂ν = 0 by default. Modes, heat and
     distances are those of the part alone. Raises InputError for anything but a boolean mask, or without a face inside.
 
     >>> square = torch.tensor([[0.0, 0], [1, 0], [1, 1], [0, 1]])
