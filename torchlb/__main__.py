@@ -229,9 +229,7 @@ def _to_file(compute: Callable[..., dict[str, Any]]) -> Callable[..., None]:
 def modes(lb: LaplaceBeltrami, k: int) -> dict[str, Any]:
     """Write the eigenfunctions of SHAPE, orthonormal in the mass, and print the eigenvalues of −Δ.
 
-    \b
-    Examples:
-      python -m torchlb modes lh.pial -k 50 --out modes.vtu
+    Example: python -m torchlb modes lh.pial -k 50 --out modes.vtu
     """
     basis = lb.eigenbasis(k)
     click.echo(" ".join(f"{value:.6g}" for value in basis.eigenvalues.tolist()))
@@ -244,13 +242,12 @@ def modes(lb: LaplaceBeltrami, k: int) -> dict[str, Any]:
 def smooth(lb: LaplaceBeltrami, data: Path, fwhm: float) -> dict[str, Any]:
     """Write maps on SHAPE smoothed by a Gaussian; where they are NaN they count nothing and stay NaN.
 
-    \b
-    Examples:
-      python -m torchlb smooth lh.pial --data lh.thickness --fwhm 10 --out smooth.func.gii
+    Example: python -m torchlb smooth lh.pial --data lh.thickness --fwhm 10 --out a.func.gii
     """
-    maps = {name: f.double() for name, f in read_point_data(data).items()}
-    masks = {name: f.isfinite().view(len(f), -1).all(1) for name, f in maps.items()}
-    return {name: heat.smooth(lb, f, fwhm, mask=masks[name]) for name, f in maps.items()}
+    return {
+        name: heat.smooth(lb, f.double(), fwhm, mask=f.isfinite().view(len(f), -1).all(1))
+        for name, f in read_point_data(data).items()
+    }
 
 
 @_to_file
@@ -259,9 +256,7 @@ def smooth(lb: LaplaceBeltrami, data: Path, fwhm: float) -> dict[str, Any]:
 def distance(lb: LaplaceBeltrami, source: tuple[int, ...], each: bool) -> dict[str, Any]:
     """Write the geodesic distance on SHAPE to points.
 
-    \b
-    Examples:
-      python -m torchlb distance bunny.ply --source 0 --source 99 --out distance.npz
+    Example: python -m torchlb distance bunny.ply --source 0 --source 99 --out distance.npz
     """
     return {"distance": geodesic_distance(lb, source, each=each)}
 
@@ -270,9 +265,7 @@ def distance(lb: LaplaceBeltrami, source: tuple[int, ...], each: bool) -> dict[s
 def curvature(lb: LaplaceBeltrami) -> dict[str, Any]:
     """Write the principal, mean and Gaussian curvatures of SHAPE.
 
-    \b
-    Examples:
-      python -m torchlb curvature bunny.ply --out curvature.vtk
+    Example: python -m torchlb curvature bunny.ply --out curvature.vtk
     """
     found = lb.curvatures()
     return {name: getattr(found, name) for name in ("k1", "k2", "mean", "gaussian")}

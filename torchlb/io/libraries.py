@@ -16,8 +16,7 @@ from torchlb.io.formats import concatenated, read_polydata, triangulated
 Contents = tuple[Tensor | None, Tensor | None, dict[str, np.ndarray]]
 SURFACE, MAP = b"\xff\xff\xfe", b"\xff\xff\xff"  # which FreeSurfer's files begin with
 BY_MESHIO, BY_NIBABEL = (".vtk", ".vtu"), (".annot", ".gii", ".mgh", ".mgz")
-SIMPLICES = {2: "line", 3: "triangle", 4: "tetra"}
-FLAT = ("triangle", "quad", "polygon")
+SIMPLICES, FLAT = {2: "line", 3: "triangle", 4: "tetra"}, {"triangle", "quad", "polygon"}
 
 
 def library(name: str) -> Any:
@@ -25,9 +24,8 @@ def library(name: str) -> Any:
     try:
         return import_module(name)
     except ImportError as error:
-        raise InputError(
-            f'{name} is needed for it: pip install {name}, or torchlb with its extra "files"'
-        ) from error
+        hint = f'pip install {name}, or torchlb with its extra "files"'
+        raise InputError(f"{name} is needed for it: {hint}") from error
 
 
 def begins(path: Path, *starts: bytes) -> bool:
@@ -38,29 +36,29 @@ def begins(path: Path, *starts: bytes) -> bool:
 
 def read(path: Path) -> Contents | None:
     """Vertices, cells and data of the points, if any; None for a file that neither library reads."""
-    suffix = path.suffix.lower()
+    suffix, shape, data = path.suffix.lower(), [None, None], {}
     if suffix in BY_MESHIO:
         return _vtk(path, suffix)
     if suffix not in BY_NIBABEL and not begins(path, SURFACE, MAP):
         return None
-    nibabel, shape, data = library("nibabel"), {}, {}
+    nibabel = library("nibabel")
     if suffix == ".gii":
-        for number, array in enumerate(nibabel.load(path).darrays):
-            intent = nibabel.nifti1.intent_codes.label[array.intent]
-            name = array.meta.get("Name") or f"data_{number}"
-            into = shape if intent in ("pointset", "triangle") else data
-            name = intent if into is shape else f"{name}_{number}" if name in data else name
-            into[name] = array.data
+        image = nibabel.load(path)
+        found = [image.get_arrays_from_intent(name) for name in ("pointset", "triangle")]
+        shape = [arrays[0].data if arrays else None for arrays in found]
+        for number, array in enumerate(image.darrays):
+            if not any(array is other for arrays in found for other in arrays):
+                name = array.meta.get("Name") or f"data_{number}"
+                data[f"{name}_{number}" if name in data else name] = array.data
     elif suffix in (".mgh", ".mgz"):
         data[path.stem] = np.asarray(nibabel.load(path).dataobj).squeeze()
     elif suffix == ".annot":
         data["annot"] = nibabel.freesurfer.read_annot(path)[0]
     elif begins(path, SURFACE):
-        shape["pointset"], shape["triangle"] = nibabel.freesurfer.read_geometry(path)
+        shape = nibabel.freesurfer.read_geometry(path)
     else:
         data[suffix[1:]] = nibabel.freesurfer.read_morph_data(path)
-    found = [shape.get("pointset"), shape.get("triangle")]
-    points, cells = (None if x is None else torch.from_numpy(x.astype(float)) for x in found)
+    points, cells = (None if x is None else torch.from_numpy(x.astype(float)) for x in shape)
     return points, None if cells is None else cells.long(), data
 
 
@@ -69,18 +67,16 @@ def _vtk(path: Path, suffix: str) -> Contents:
     polydata = read_polydata(path) if suffix == ".vtk" else None
     if polydata is not None:
         return *triangulated(*polydata), {}
-    meshio = library("meshio")
-    mesh = (meshio.vtk if suffix == ".vtk" else meshio.vtu).read(path)
+    mesh = getattr(library("meshio"), suffix[1:]).read(path)
     kinds = {block.type for block in mesh.cells} - {"vertex"}
     if not kinds <= {*SIMPLICES.values(), *FLAT}:
         raise InputError(f"cells {', '.join(sorted(kinds))}; expected tetrahedra, polygons, lines")
-    chosen = "tetra" if "tetra" in kinds else FLAT if kinds & {*FLAT} else "line"
+    chosen = {"tetra"} & kinds or FLAT & kinds or kinds
     rows = [row for block in mesh.cells if block.type in chosen for row in block.data]
-    points = mesh.points.astype(float)
-    if chosen is FLAT:
-        return *triangulated(points, *concatenated(rows)), mesh.point_data
+    if chosen & FLAT:
+        return *triangulated(mesh.points.astype(float), *concatenated(rows)), mesh.point_data
     cells = torch.from_numpy(np.array(rows, dtype=np.int64)) if rows else None
-    return torch.from_numpy(points), cells, mesh.point_data
+    return torch.from_numpy(mesh.points.astype(float)), cells, mesh.point_data
 
 
 def write(path: Path, points: np.ndarray, cells: np.ndarray, data: dict[str, np.ndarray]) -> None:
@@ -98,9 +94,9 @@ def write(path: Path, points: np.ndarray, cells: np.ndarray, data: dict[str, np.
     for name, values in data.items():
         for c, column in enumerate(values.reshape(len(values), -1).T):
             arrays.append((name if values.ndim == 1 else f"{name}_{c}", "NONE", column))
-    image = nibabel.GiftiImage()
+    image, array_of = nibabel.GiftiImage(), nibabel.gifti.GiftiDataArray
     for name, intent, values in arrays:
         values = values.astype(np.int32 if values.dtype.kind in "biu" else np.float32)
-        array = nibabel.gifti.GiftiDataArray(values, f"NIFTI_INTENT_{intent}", meta={"Name": name})
+        array = array_of(values, f"NIFTI_INTENT_{intent}", meta={"Name": name})
         image.darrays += [array] if len(values) else []
     nibabel.save(image, path)

@@ -295,27 +295,16 @@ def _across(d_j: float, d_k: float, along: float, height: float, base: float) ->
 
 @_kept(
     "void(float64[::1], int64[::1], int64[::1], float64[:, ::1], int64[::1], int64[:, ::1], float64[:, ::1], "
-    "float64[:, ::1], int64[::1], float64)"
+    "int64[::1], float64)"
 )
 @no_type_check
-def straighten(
-    distance: np.ndarray,
-    foot: np.ndarray,
-    order: np.ndarray,
-    points: np.ndarray,
-    first: np.ndarray,
-    ends: np.ndarray,
-    sides: np.ndarray,
-    place: np.ndarray,
-    fell: np.ndarray,
-    enough: float,
-) -> None:
+def straighten(distance, foot, order, points, first, ends, sides, fell, enough):
     """Lower distances by paths across triangles, in place, in sweeps until none falls by more than `enough`.
 
-    Those of point i are the rows first[i] … first[i + 1] − 1 of `ends`, their other corners (j, k), of `sides`, the
-    lengths of ij and ik, and of `place`, (along, height, base). The path to i starts at the source of j or of k, its
-    `foot`; if these differ, the distance of k from the source of j is unknown, and bounded below by the straight line
-    and by the distance of k. `order` is that of the sweeps, `fell` is work space, ones: when each distance fell last.
+    Those of point i are the rows first[i] … first[i + 1] − 1 of `ends`, their other corners (j, k), and of `sides`, the
+    lengths of ij, ik and jk, the height of i over jk and its place along it. The path to i starts at the source of j or
+    of k, its `foot`; if these differ, the distance of k from the source of j is unknown, and bounded below by the
+    straight line and by the distance of k. `order` is that of the sweeps, `fell` work space, ones: when each fell last.
     """
     most, clock = np.inf, 0
     while most > enough:
@@ -329,7 +318,7 @@ def straighten(
                     continue
                 d_j, d_k = distance[j], distance[k]
                 by_j, by_k = d_j + sides[t, 0], d_k + sides[t, 1]
-                along, height, base = place[t, 0], place[t, 1], place[t, 2]
+                base, height, along = sides[t, 2], sides[t, 3], sides[t, 4]
                 if (d_j + d_k - base) / 2 + height < best:  # a lower bound of paths across
                     line_j, line_k = 0.0, 0.0
                     if foot[j] != foot[k]:

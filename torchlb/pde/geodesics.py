@@ -140,5 +140,4 @@ def _triangles(lb: LaplaceBeltrami, points: np.ndarray) -> tuple[np.ndarray, ...
     with np.errstate(divide="ignore", invalid="ignore"):  # degenerate triangles
         along = (to_j**2 - to_k**2 + base**2) / (2 * base)
         height = np.sqrt(np.maximum(to_j**2 - along**2, 0.0))
-    sides, place = np.stack([to_j, to_k], 1), np.stack([along, height, base], 1)
-    return first, np.stack([j, k], 1), sides, place
+    return first, np.stack([j, k], 1), np.stack([to_j, to_k, base, height, along], 1)
