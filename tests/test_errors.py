@@ -52,7 +52,7 @@ def test_bad_points(points, message):
 @pytest.mark.parametrize(
     ("faces", "message"),
     [
-        (FACES.double(), "expected integers.*vertices come first, faces second"),
+        (FACES.double(), "expected integers.*vertices come first"),
         (FACES[:, 0], "expected shape \\(F, 3\\)"),
         (FACES[:0], "got none; use LaplaceBeltrami.from_points"),
         (FACES + 1, "outside 0 … 99.*subtract 1"),

@@ -174,14 +174,11 @@ def test_commands_write_what_they_compute(mesh, tmp_path, monkeypatch):
         assert torch.equal(read_shape("out.npz")[1], faces)
 
 
-COMMANDS = ["compare", "precompute", "info", "modes", "smooth", "distance", "curvature"]
-
-
-@pytest.mark.parametrize("command", [[], *([name] for name in COMMANDS)])
+@pytest.mark.parametrize("command", [[], ["compare"], ["precompute"], ["info"]])
 def test_help_has_examples(command):
     done = CliRunner().invoke(main, [*command, "--help"])
     assert done.exit_code == 0
-    assert f" python -m torchlb {command[0] if command else 'compare'} " in done.output
+    assert f"  python -m torchlb {command[0] if command else 'compare'} " in done.output
 
 
 def test_version(tmp_path):

@@ -61,8 +61,8 @@ def test_data_of_a_part_go_out_and_back():
 @pytest.mark.parametrize(
     ("mask", "message"),
     [
-        (torch.ones(60), r"boolean mask of shape \(60,\), such as labels != 0, got torch.float32"),
-        (torch.ones(59, dtype=torch.bool), r"got torch.bool of shape \(59,\)"),
+        (torch.ones(60), r"boolean mask of shape \(60,\), as f > 0, got torch.float32"),
+        (torch.ones(59, dtype=torch.bool), r"got torch.bool \(59,\)"),
         (torch.arange(60) < 2, "no face has all its corners among its 2 vertices"),
     ],
 )

@@ -26,8 +26,7 @@ from torchlb.io.precompute import concerns_the_shape, precompute_operators
 from torchlb.operator.cleaning import clean_mesh, cleaned
 from torchlb.operator.dispatch import Operator, build_operator
 from torchlb.operator.laplace_beltrami import LaplaceBeltrami
-from torchlb.pde import heat
-from torchlb.pde.geodesics import geodesic_distance
+from torchlb.pde import geodesics, heat
 from torchlb.plot.comparison import draw_comparison, spectra, spectrum_table
 from torchlb.version import __version__
 
@@ -227,10 +226,7 @@ def _to_file(compute: Callable[..., dict[str, Any]]) -> Callable[..., None]:
 @_to_file
 @click.option("-k", type=COUNT, default=20, help="Number of eigenpairs.")
 def modes(lb: LaplaceBeltrami, k: int) -> dict[str, Any]:
-    """Write the eigenfunctions of SHAPE, orthonormal in the mass, and print the eigenvalues of −Δ.
-
-    Example: python -m torchlb modes lh.pial -k 50 --out modes.vtu
-    """
+    """Write the eigenfunctions of SHAPE, orthonormal in the mass, and print the eigenvalues of −Δ."""
     basis = lb.eigenbasis(k)
     click.echo(" ".join(f"{value:.6g}" for value in basis.eigenvalues.tolist()))
     return {"modes": basis.eigenvectors}
@@ -240,10 +236,7 @@ def modes(lb: LaplaceBeltrami, k: int) -> dict[str, Any]:
 @click.option("--data", type=FILE, required=True, help="Maps, as read_point_data reads them.")
 @click.option("--fwhm", type=float, required=True, help="Full width at half maximum.")
 def smooth(lb: LaplaceBeltrami, data: Path, fwhm: float) -> dict[str, Any]:
-    """Write maps on SHAPE smoothed by a Gaussian; where they are NaN they count nothing and stay NaN.
-
-    Example: python -m torchlb smooth lh.pial --data lh.thickness --fwhm 10 --out a.func.gii
-    """
+    """Write maps on SHAPE smoothed by a Gaussian; where they are NaN they count nothing and stay NaN."""
     return {
         name: heat.smooth(lb, f.double(), fwhm, mask=f.isfinite().view(len(f), -1).all(1))
         for name, f in read_point_data(data).items()
@@ -254,19 +247,13 @@ def smooth(lb: LaplaceBeltrami, data: Path, fwhm: float) -> dict[str, Any]:
 @click.option("--source", type=int, multiple=True, required=True, help="Point; again for more.")
 @click.option("--each", is_flag=True, help="A column for each source, not the nearest of them.")
 def distance(lb: LaplaceBeltrami, source: tuple[int, ...], each: bool) -> dict[str, Any]:
-    """Write the geodesic distance on SHAPE to points.
-
-    Example: python -m torchlb distance bunny.ply --source 0 --source 99 --out distance.npz
-    """
-    return {"distance": geodesic_distance(lb, source, each=each)}
+    """Write the geodesic distance on SHAPE to points."""
+    return {"distance": geodesics.geodesic_distance(lb, source, each=each)}
 
 
 @_to_file
 def curvature(lb: LaplaceBeltrami) -> dict[str, Any]:
-    """Write the principal, mean and Gaussian curvatures of SHAPE.
-
-    Example: python -m torchlb curvature bunny.ply --out curvature.vtk
-    """
+    """Write the principal, mean and Gaussian curvatures of SHAPE."""
     found = lb.curvatures()
     return {name: getattr(found, name) for name in ("k1", "k2", "mean", "gaussian")}
 

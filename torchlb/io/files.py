@@ -13,13 +13,12 @@ from torch import Tensor
 from torchlb.errors import InputError
 from torchlb.geometry.complex import edges_of
 from torchlb.io import libraries
-from torchlb.io.formats import READERS, numbers_of, triangulated
-from torchlb.operator.cleaning import merged, proper_faces
+from torchlb.io.formats import READERS, numbers_of
+from torchlb.operator.cleaning import merged, proper_faces, triangles_of
 from torchlb.operator.inputs import ArrayLike, as_tensor, check_corners, check_points
 
-SUFFIXES = tuple(
-    sorted([".gii", ".glb", ".gltf", ".npy", ".npz", ".stl", ".vtk", ".vtu", *READERS])
-)
+OTHERS = (".gii", ".glb", ".gltf", ".npy", ".npz", ".stl", ".vtk", ".vtu")
+SUFFIXES = tuple(sorted([*OTHERS, *READERS]))
 """Endings of the files that `read_shape` takes."""
 STEPS = 4
 """Largest difference of coinciding corners in an .stl, in steps of float32 at the largest coordinate."""
@@ -48,12 +47,12 @@ def read_shape(path: str | Path) -> Shape:
     ----------
     path
         A mesh (.ply, .obj, .off, .stl, .glb, .gltf), whose polygons are split into triangles, along the shorter
-        diagonal of a quad; without faces it is a cloud. A surface in GIFTI (.gii) or FreeSurfer's format (lh.pial, …),
-        through nibabel. VTK's .vtk and .vtu, through meshio: tetrahedra, else polygons, else lines. A cloud in .pcd, or
-        a table of numbers (.xyz, .txt, .csv, .pts, .asc) with the coordinates in the columns x, y, z, or in the first
-        three. An array (N, n) of points in .npy; or a .npz with `vertices` (or `points`, or `pos`) and, for a mesh,
-        `faces`. The corners of an .stl, which has no vertices, are merged where they coincide, and along open edges
-        where they differ by rounding.
+        diagonal of a quad; without faces it is a cloud. A surface of GIFTI (.gii) or FreeSurfer (lh.pial, …), through
+        nibabel. An unstructured grid of VTK (.vtk, .vtu), through meshio: tetrahedra, else triangles, else lines. A
+        cloud in .pcd, or a table of numbers (.xyz, .txt, .csv, .pts, .asc) with the coordinates in the columns x, y, z,
+        or in the first three. An array (N, n) of points in .npy; or a .npz with `vertices` (or `points`, or `pos`) and,
+        for a mesh, `faces`. The corners of an .stl, which has no vertices, are merged where they coincide, and along
+        open edges where they differ by rounding.
 
     Raises
     ------
@@ -64,9 +63,9 @@ def read_shape(path: str | Path) -> Shape:
     """
     vertices, faces, data = _read(path)
     if vertices is None:
+        names = f"neither vertices nor points among {list(data)}"
         raise InputError(
-            f"{path}: not a mesh or cloud, neither vertices nor points among {list(data)}; torchlb.read_point_data "
-            "reads data"
+            f"{path}: not a mesh or cloud, {names}; torchlb.read_point_data reads data"
         )
     return vertices.double(), faces
 
@@ -74,18 +73,12 @@ def read_shape(path: str | Path) -> Shape:
 def read_point_data(path: str | Path) -> dict[str, Tensor]:
     """Data of the points in a file by name, (N,) or (N, C), in the type and order of the file.
 
-    Parameters
-    ----------
-    path
-        A .npz: its arrays except the shape; .vtk (no polydata) or .vtu, through meshio; .gii, .mgh, .annot and
-        FreeSurfer's maps (lh.thickness, lh.curv, …), through nibabel. Errors are those of `read_shape`, and a
-        ValueError for a file without data.
+    Arrays of a .npz besides the shape; those of .vtk and .vtu, through meshio; of .gii, and FreeSurfer's maps
+    (lh.thickness, lh.curv, …), through nibabel. Raises a ValueError for a file without data, else as `read_shape`.
     """
     data = _read(path)[2]
     if not data:
-        raise InputError(
-            f"{path}: no data of points; .npz, .vtk, .vtu, .gii, .mgh, .annot and FreeSurfer's maps may hold some"
-        )
+        raise InputError(f"{path}: no data of points; .npz, .vtk, .vtu, .gii, lh.curv, … hold some")
     return {name: as_tensor(values) for name, values in data.items()}
 
 
@@ -101,7 +94,7 @@ def _read(path: str | Path) -> libraries.Contents:
         elif suffix == ".npz":
             vertices, faces, data = _npz(path)
         elif suffix in READERS:
-            vertices, faces = triangulated(*READERS[suffix](path))
+            vertices, faces = _triangulated(*READERS[suffix](path))
         elif (found := libraries.read(path)) is not None:
             vertices, faces, data = found
         else:
@@ -126,24 +119,12 @@ def write_shape(
 ) -> None:
     """Write a mesh or cloud, with data of its points, in the format that the ending names.
 
-    Parameters
-    ----------
-    path
-        .npz; .vtk or .vtu (through meshio), in R² and R³; .gii (through nibabel), triangles and data in single
-        precision, or data alone in .func.gii and .shape.gii; .ply, .obj, .off, .stl, .glb (through trimesh), triangles
-        or points in R³ without data.
-    points, cells
-        (N, n), and (F, 3) triangles, (F, 2) segments or (F, 4) tetrahedra, or None: ``lb.points, lb.faces``.
-    **point_data
-        (N,) or (N, C) each, by name, such as ``thickness=f``.
+    .npz holds every shape; .vtk and .vtu, through meshio, those of R² and R³; .gii, through nibabel, triangles, in
+    single precision, and .func.gii and .shape.gii the data alone; .ply, .obj, .off, .stl and .glb, through trimesh,
+    triangles and points of R³ without data. `points` are (N, n), `cells` (F, 3) triangles, (F, 2) segments, (F, 4)
+    tetrahedra or None, and data (N,) or (N, C), by name: ``write_shape("a.vtu", lb.points, lb.faces, thickness=f)``.
 
     Raises ValueError for data of another length, a format that does not hold them, and where its library is missing.
-
-    >>> import tempfile
-    >>> with tempfile.TemporaryDirectory() as folder:
-    ...     write_shape(f"{folder}/a.npz", torch.eye(3), [[0, 1, 2]], f=torch.ones(3))
-    ...     print(read_shape(f"{folder}/a.npz")[1], read_point_data(f"{folder}/a.npz"))
-    tensor([[0, 1, 2]]) {'f': tensor([1., 1., 1.])}
     """
     path, places = Path(path).expanduser(), check_points(points).numpy()
     suffix, corners = path.suffix.lower(), np.zeros((0, 3), dtype=np.int64)
@@ -153,7 +134,7 @@ def write_shape(
     for name, values in data.items():
         if values.ndim not in (1, 2) or len(values) != len(places) or name in OF_THE_SHAPE:
             raise InputError(
-                f"{name}: expected data of {len(places)} points, (N,) or (N, C), under a name other than "
+                f"{name}: expected data of {len(places)} points, (N,) or (N, C), under another name than "
                 f"{', '.join(OF_THE_SHAPE)}; got shape {values.shape}"
             )
     flat = places.shape[1] == corners.shape[1] == 3
@@ -167,11 +148,12 @@ def write_shape(
         mesh = trimesh.Trimesh(places, corners, process=False)
         _ = (mesh if len(corners) else trimesh.PointCloud(places)).export(path)
     else:
-        what = f", with {', '.join(data)}" if data else ""
+        what = (
+            f"cells {corners.shape} on points {places.shape}{''.join(f', {name}' for name in data)}"
+        )
         raise InputError(
-            f"{path}: this format does not hold cells {corners.shape} on points {places.shape}{what}; .npz holds all, "
-            ".vtk and .vtu all in R² and R³, .gii triangles in R³ and data, .ply, .obj, .off, .stl, .glb triangles or "
-            "points in R³ without data"
+            f"{path}: this format does not hold {what}; .npz holds all, .vtk and .vtu all in R² and R³, .gii triangles "
+            "and data in R³, .ply, .obj, .off, .stl and .glb triangles and points of R³ without data"
         )
 
 
@@ -183,6 +165,26 @@ def may_be_shape(path: Path) -> bool:
         return len(next(numbers_of(path), ([], []))[1]) > 2
     except InputError:
         return False
+
+
+def _triangulated(
+    vertices: Float[np.ndarray, "N n"], corners: Int[np.ndarray, " C"], sizes: Int[np.ndarray, " P"]
+) -> Shape:
+    """Split polygons into triangles, in their order; those with fewer than three corners are left out."""
+    places, every = torch.from_numpy(vertices), torch.from_numpy(corners)
+    bad = corners[(corners < 0) | (corners >= len(vertices))]
+    if len(bad):
+        raise InputError(f"faces have a corner {bad[0]}, and there are {len(vertices)} vertices")
+    starts, parts, owners = np.cumsum(sizes) - sizes, [], []
+    for size in np.unique(sizes[sizes > 2]).tolist():
+        chosen = np.flatnonzero(sizes == size)
+        polygons = every[torch.from_numpy(starts[chosen][:, None] + np.arange(size))]
+        parts.append(polygons[:, None] if size == 3 else triangles_of(places, polygons))
+        owners.append(torch.from_numpy(chosen).repeat_interleave(size - 2))
+    if not parts:
+        return places, None
+    order = torch.cat(owners).argsort(stable=True)
+    return places, torch.cat([part.flatten(0, 1) for part in parts])[order]
 
 
 def _sewn(vertices: Float[Tensor, "N 3"], faces: Int[Tensor, "F 3"]) -> tuple[Tensor, Tensor]:
@@ -210,9 +212,5 @@ def _npz(path: Path) -> libraries.Contents:
         arrays = dict(archive)
     data = {name: array for name, array in arrays.items() if name not in OF_THE_SHAPE}
     shape = [as_tensor(arrays[name]) for name in OF_THE_SHAPE if name in arrays]
-    faces = shape.pop() if "faces" in arrays else None
-    return (
-        shape[0] if shape else None,
-        None if faces is None or faces.numel() == 0 else faces.long(),
-        data,
-    )
+    faces = shape.pop().long() if "faces" in arrays and arrays["faces"].size else None
+    return shape[0] if shape else None, faces, data

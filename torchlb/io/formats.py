@@ -1,4 +1,4 @@
-"""Readers of polygons in .obj, .off, .ply and VTK's polydata, points in .pcd, and tables of numbers.
+"""Readers of polygons in .obj, .off and .ply, points in .pcd, and tables of numbers.
 
 Each reader returns the vertices, (N, 3) or (N, n), the concatenated corners of all polygons, and the number of corners
 of each; a shape without polygons is a cloud.
@@ -13,12 +13,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
 from jaxtyping import Float, Int
-from torch import Tensor
 
 from torchlb.errors import InputError
-from torchlb.operator.cleaning import triangles_of
 
 Polygons = tuple[Float[np.ndarray, "N n"], Int[np.ndarray, " C"], Int[np.ndarray, " P"]]
 TYPES = {
@@ -29,37 +26,13 @@ TYPES = {
 """Types of .ply, as NumPy names them."""
 
 
-def concatenated(faces: Any) -> tuple[Int[np.ndarray, " C"], Int[np.ndarray, " P"]]:
-    """Corners of polygons, and their numbers, from faces as rows of an array or as lists of corners."""
+def _polygons(vertices: Any, faces: Any) -> Polygons:
+    """Vertices and polygons, from faces as rows of an array or as lists of corners."""
     if isinstance(faces, np.ndarray):
         sizes, corners = np.full(len(faces), faces.shape[1]), faces.ravel()
     else:
         sizes, corners = np.fromiter(map(len, faces), int), np.fromiter(chain(*faces), int)
-    return corners.astype(np.int64), sizes
-
-
-def _polygons(vertices: Any, faces: Any) -> Polygons:
-    return np.asarray(vertices, dtype=float), *concatenated(faces)
-
-
-def triangulated(
-    vertices: Float[np.ndarray, "N n"], corners: Int[np.ndarray, " C"], sizes: Int[np.ndarray, " P"]
-) -> tuple[Tensor, Tensor | None]:
-    """Split polygons into triangles, in their order; those with fewer than three corners are left out."""
-    places, every = torch.from_numpy(vertices), torch.from_numpy(corners)
-    bad = corners[(corners < 0) | (corners >= len(vertices))]
-    if len(bad):
-        raise InputError(f"faces have a corner {bad[0]}, and there are {len(vertices)} vertices")
-    starts, parts, owners = np.cumsum(sizes) - sizes, [], []
-    for size in np.unique(sizes[sizes > 2]).tolist():
-        chosen = np.flatnonzero(sizes == size)
-        polygons = every[torch.from_numpy(starts[chosen][:, None] + np.arange(size))]
-        parts.append(polygons[:, None] if size == 3 else triangles_of(places, polygons))
-        owners.append(torch.from_numpy(chosen).repeat_interleave(size - 2))
-    if not parts:
-        return places, None
-    order = torch.cat(owners).argsort(stable=True)
-    return places, torch.cat([part.flatten(0, 1) for part in parts])[order]
+    return np.asarray(vertices, dtype=float), corners.astype(np.int64), sizes
 
 
 def read_obj(path: Path) -> Polygons:
@@ -217,24 +190,6 @@ def read_pcd(path: Path) -> Polygons:
     places = [table[str(names.index(axis))].reshape(len(table), -1)[:, 0] for axis in "xyz"]
     points = np.stack(places, 1).astype(float)
     return _polygons(points[~np.isnan(points).any(1)], [])
-
-
-def read_polydata(path: Path) -> Polygons | None:
-    """Points and polygons of VTK's polydata in an ascii file; None for what else a .vtk may hold."""
-    data = path.read_bytes()
-    if not {b"ASCII", b"POLYDATA"} <= {*data[:400].upper().split()}:
-        return None
-    words, polygons = data.upper().split(), []
-    at = words.index(b"POINTS")
-    end = at + 3 + 3 * int(words[at + 1])
-    points = np.array(words[at + 3 : end], float).reshape(-1, 3)
-    if b"POLYGONS" in words[end:]:
-        at = words.index(b"POLYGONS", end)
-        rows = np.array(words[at + 3 : at + 3 + int(words[at + 2])], int)
-        while len(rows):
-            polygons.append(rows[1 : 1 + rows[0]])
-            rows = rows[1 + rows[0] :]
-    return _polygons(points, polygons)
 
 
 def read_table(path: Path) -> Polygons:

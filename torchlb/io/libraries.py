@@ -11,12 +11,10 @@ import torch
 from torch import Tensor
 
 from torchlb.errors import InputError
-from torchlb.io.formats import concatenated, read_polydata, triangulated
 
 Contents = tuple[Tensor | None, Tensor | None, dict[str, np.ndarray]]
 SURFACE, MAP = b"\xff\xff\xfe", b"\xff\xff\xff"  # which FreeSurfer's files begin with
-BY_MESHIO, BY_NIBABEL = (".vtk", ".vtu"), (".annot", ".gii", ".mgh", ".mgz")
-SIMPLICES, FLAT = {2: "line", 3: "triangle", 4: "tetra"}, {"triangle", "quad", "polygon"}
+BY_MESHIO, CELLS = (".vtk", ".vtu"), ("vertex", "line", "triangle", "tetra")
 
 
 def library(name: str) -> Any:
@@ -24,8 +22,9 @@ def library(name: str) -> Any:
     try:
         return import_module(name)
     except ImportError as error:
-        hint = f'pip install {name}, or torchlb with its extra "files"'
-        raise InputError(f"{name} is needed for it: {hint}") from error
+        raise InputError(
+            f"{name} is needed for it: pip install {name}, or torchlb[files]"
+        ) from error
 
 
 def begins(path: Path, *starts: bytes) -> bool:
@@ -36,58 +35,40 @@ def begins(path: Path, *starts: bytes) -> bool:
 
 def read(path: Path) -> Contents | None:
     """Vertices, cells and data of the points, if any; None for a file that neither library reads."""
-    suffix, shape, data = path.suffix.lower(), [None, None], {}
+    suffix, data = path.suffix.lower(), {}
     if suffix in BY_MESHIO:
-        return _vtk(path, suffix)
-    if suffix not in BY_NIBABEL and not begins(path, SURFACE, MAP):
-        return None
-    nibabel = library("nibabel")
-    if suffix == ".gii":
-        image = nibabel.load(path)
-        found = [image.get_arrays_from_intent(name) for name in ("pointset", "triangle")]
-        shape = [arrays[0].data if arrays else None for arrays in found]
-        for number, array in enumerate(image.darrays):
-            if not any(array is other for arrays in found for other in arrays):
-                name = array.meta.get("Name") or f"data_{number}"
-                data[f"{name}_{number}" if name in data else name] = array.data
-    elif suffix in (".mgh", ".mgz"):
-        data[path.stem] = np.asarray(nibabel.load(path).dataobj).squeeze()
-    elif suffix == ".annot":
-        data["annot"] = nibabel.freesurfer.read_annot(path)[0]
+        mesh = getattr(library("meshio"), suffix[1:]).read(path)
+        other = {block.type for block in mesh.cells} - {*CELLS}
+        if other:
+            raise InputError(f"cells {', '.join(other)}; expected tetrahedra, triangles or lines")
+        every = ([b.data for b in mesh.cells if b.type == kind] for kind in CELLS[:0:-1])
+        blocks, data = next(filter(None, every), None), mesh.point_data
+        shape = mesh.points, None if blocks is None else np.concatenate(blocks)
+    elif suffix == ".gii":
+        for number, array in enumerate(library("nibabel").load(path).darrays):
+            role = {1008: "POINTSET", 1009: "TRIANGLE"}.get(array.intent)  # codes of NIfTI
+            name = role or array.meta.get("Name") or f"data_{number}"
+            data[f"{name}_{number}" if name in data else name] = array.data
+        shape = data.pop("POINTSET", None), data.pop("TRIANGLE", None)
     elif begins(path, SURFACE):
-        shape = nibabel.freesurfer.read_geometry(path)
+        shape = library("nibabel").freesurfer.read_geometry(path)
+    elif begins(path, MAP):
+        shape = None, None
+        data[suffix[1:]] = library("nibabel").freesurfer.read_morph_data(path)
     else:
-        data[suffix[1:]] = nibabel.freesurfer.read_morph_data(path)
+        return None
     points, cells = (None if x is None else torch.from_numpy(x.astype(float)) for x in shape)
     return points, None if cells is None else cells.long(), data
-
-
-def _vtk(path: Path, suffix: str) -> Contents:
-    """Tetrahedra, else polygons, else lines."""
-    polydata = read_polydata(path) if suffix == ".vtk" else None
-    if polydata is not None:
-        return *triangulated(*polydata), {}
-    mesh = getattr(library("meshio"), suffix[1:]).read(path)
-    kinds = {block.type for block in mesh.cells} - {"vertex"}
-    if not kinds <= {*SIMPLICES.values(), *FLAT}:
-        raise InputError(f"cells {', '.join(sorted(kinds))}; expected tetrahedra, polygons, lines")
-    chosen = {"tetra"} & kinds or FLAT & kinds or kinds
-    rows = [row for block in mesh.cells if block.type in chosen for row in block.data]
-    if chosen & FLAT:
-        return *triangulated(mesh.points.astype(float), *concatenated(rows)), mesh.point_data
-    cells = torch.from_numpy(np.array(rows, dtype=np.int64)) if rows else None
-    return torch.from_numpy(mesh.points.astype(float)), cells, mesh.point_data
 
 
 def write(path: Path, points: np.ndarray, cells: np.ndarray, data: dict[str, np.ndarray]) -> None:
     """VTK's unstructured grid in three columns, or GIFTI, in float32 and int32 and by columns of the data."""
     if path.suffix.lower() in BY_MESHIO:
-        kind = SIMPLICES[cells.shape[1]] if len(cells) else "vertex"
         cells = cells if len(cells) else np.arange(len(points))[:, None]
         points = np.pad(points, ((0, 0), (0, 3 - points.shape[1])))
-        plain = {k: v.astype(np.uint8) if v.dtype == bool else v for k, v in data.items()}
-        library("meshio").write_points_cells(path, points, [(kind, cells)], point_data=plain)
-        return
+        data = {k: v.astype(np.uint8) if v.dtype == bool else v for k, v in data.items()}
+        blocks = [(CELLS[cells.shape[1] - 1], cells)]
+        return library("meshio").write_points_cells(path, points, blocks, point_data=data)
     nibabel, arrays = library("nibabel"), [("", "POINTSET", points), ("", "TRIANGLE", cells)]
     if path.name.lower().endswith((".func.gii", ".shape.gii")):
         arrays = []
@@ -99,4 +80,4 @@ def write(path: Path, points: np.ndarray, cells: np.ndarray, data: dict[str, np.
         values = values.astype(np.int32 if values.dtype.kind in "biu" else np.float32)
         array = array_of(values, f"NIFTI_INTENT_{intent}", meta={"Name": name})
         image.darrays += [array] if len(values) else []
-    nibabel.save(image, path)
+    return nibabel.save(image, path)

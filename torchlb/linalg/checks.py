@@ -35,9 +35,9 @@ def takes_arrays(function: Callable[P, T]) -> Callable[P, T]:
         mass = next((x.mass for x in given.values() if hasattr(x, "mass")), None)
         for name, x in given.items():
             if isinstance(x, np.ndarray):
-                x = x.filled(np.nan) if isinstance(x, np.ma.MaskedArray) else x
-                x = x.astype(x.dtype.newbyteorder("="))
-                given[name] = torch.tensor(x, device=getattr(mass, "device", None))
+                x = np.ma.filled(x, np.nan)
+                x = torch.tensor(x.astype(x.dtype.newbyteorder("=")))
+                given[name] = x.to(getattr(mass, "device", None))
         call: Any = function
         return call(**given).detach().cpu().numpy()
 

@@ -283,10 +283,7 @@ def _k_hop_neighborhoods(
 @njit(error_model="numpy")
 @no_type_check
 def _across(d_j: float, d_k: float, along: float, height: float, base: float) -> float:
-    """Distance from i, across jk, to the point at distances d_j and d_k from its ends; infinite where it misses jk.
-
-    `along` is the position of i along jk, from j, and `height` that across it.
-    """
+    """Distance from i, `height` over jk at `along`, to the point below at d_j and d_k; infinite if it misses jk."""
     source = (d_j**2 - d_k**2 + base**2) / (2 * base)
     depth = np.sqrt(max(d_j**2 - source**2, 0.0))
     share = (source * height + along * depth) / ((height + depth) * base)

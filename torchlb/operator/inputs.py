@@ -75,8 +75,7 @@ def check_mask(mask: ArrayLike, num_points: int, what: str = "mask") -> Bool[Ten
     mask = as_tensor(mask).detach().cpu()
     if mask.dtype != torch.bool or mask.shape != (num_points,):
         raise InputError(
-            f"{what}: expected a boolean mask of shape ({num_points},), such as labels != 0, got {mask.dtype} of shape "
-            f"{tuple(mask.shape)}"
+            f"{what}: expected a boolean mask of shape ({num_points},), as f > 0, got {mask.dtype} {tuple(mask.shape)}"
         )
     return mask
 
@@ -94,9 +93,7 @@ def check_corners(faces: ArrayLike, num_points: int) -> Int[Tensor, "F v"]:
     if len(faces) == 0:
         raise InputError("faces: got none; use LaplaceBeltrami.from_points for a cloud")
     if faces.is_floating_point() or faces.is_complex() or faces.dtype == torch.bool:
-        raise InputError(
-            f"faces: expected integers, got {faces.dtype}; vertices come first, faces second"
-        )
+        raise InputError(f"faces: expected integers, got {faces.dtype}; vertices come first")
     faces = faces.detach().to("cpu", torch.int64)
     bad = ((faces < 0) | (faces >= num_points)).any(1).nonzero()[:, 0]
     if len(bad):
