@@ -142,7 +142,7 @@ def test_a_missing_library_is_named_with_its_extra(name, library, tmp_path, monk
     monkeypatch.setitem(sys.modules, library, None)
     for call in (read_shape, read_point_data, lambda path: write_shape(path, VERTICES, FACES)):
         with pytest.raises(
-            InputError, match=f"{library} is needed for it: pip install {library}, or torchlb.files"
+            InputError, match=f"{library} is needed: pip install {library}, or torchlb.files"
         ):
             call(tmp_path / name)
 

@@ -185,6 +185,8 @@ def test_arrays_in_arrays_out(unchecked):
         assert torch.equal(torch.from_numpy(found), expected)
     moved = lb.at(VERTICES.clone().requires_grad_())
     assert np.array_equal(heat_flow(moved, X.numpy(), 0.1), heat_flow(lb, X, 0.1).numpy())
+    with pytest.raises(TypeError, match="too many positional"):
+        heat_flow(lb, X.numpy(), 0.1, "spectral")
     swapped = X.numpy().astype(">f4")[::-1]
     assert np.array_equal(lb(swapped), lb(X.float().flip(0)).numpy())
     values = lb.with_medium(density=kappa.numpy()).eigenbasis(3).eigenvalues

@@ -1,4 +1,4 @@
-"""`python -m torchlb`: what an operator has of one shape, a folder of them precomputed, what a file holds.
+"""`python -m torchlb`: compute on one shape, precompute a folder of them, see what a file holds.
 
 Exit codes: 0 if all went well, 1 for an error or a shape that failed, 2 for a wrong call. Errors are one message on
 stderr, without a traceback.

@@ -22,9 +22,7 @@ def library(name: str) -> Any:
     try:
         return import_module(name)
     except ImportError as error:
-        raise InputError(
-            f"{name} is needed for it: pip install {name}, or torchlb[files]"
-        ) from error
+        raise InputError(f"{name} is needed: pip install {name}, or torchlb[files]") from error
 
 
 def begins(path: Path, *starts: bytes) -> bool:

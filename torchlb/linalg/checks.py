@@ -23,7 +23,8 @@ def takes_arrays(function: Callable[P, T]) -> Callable[P, T]:
 
     Arrays go to the device of the operator or basis; masked values become NaN. Results have no gradients.
     """
-    names = list(inspect.signature(function).parameters)
+    signature = inspect.signature(function)
+    names = list(signature.parameters)
     place = next(i for i, name in enumerate(names) if name in DATA)
 
     @wraps(function)
@@ -31,7 +32,7 @@ def takes_arrays(function: Callable[P, T]) -> Callable[P, T]:
         data = args[place] if len(args) > place else options.get(names[place])
         if not isinstance(data, np.ndarray):
             return function(*args, **options)
-        given: dict[str, Any] = dict(zip(names, args, strict=False)) | options
+        given = signature.bind(*args, **options).arguments
         mass = next((x.mass for x in given.values() if hasattr(x, "mass")), None)
         for name, x in given.items():
             if isinstance(x, np.ndarray):
