@@ -46,6 +46,45 @@ def test_along_a_polygon():
     torch.testing.assert_close(geodesic_distance(lb, 0), steps * side)
 
 
+def test_each_source_has_a_column():
+    """Those by themselves, to the bit: points, and parcels as masks or indices."""
+    vertices, faces = Torus().mesh(500)
+    lb = LaplaceBeltrami.from_cotangent(vertices, faces)
+    parcels = [vertices[:, 0] > 1, [3, 5, 8], 7]
+    for sources in ([0, 100, 450], torch.tensor([4, 9]), parcels, [12]):
+        found = geodesic_distance(lb, sources, each=True)
+        alone = torch.stack([geodesic_distance(lb, source) for source in sources], 1)
+        assert torch.equal(found, alone)
+    assert geodesic_distance(lb, range(500), each=True).diagonal().abs().max() == 0
+    for wrong in ([], [[]], [500], torch.zeros(500, dtype=torch.bool), "all"):
+        with pytest.raises(InputError, match="sources"):
+            geodesic_distance(lb, wrong, each=True)
+
+
+@pytest.mark.parametrize("mesh", [Torus().mesh(800), "random"])
+def test_no_triangle_has_a_shorter_path(mesh):
+    """Distances over triangles are a fixed point: from the plane of no edge jk is a point nearer to the source."""
+    vertices, faces = _disk_of_random_points(500) if mesh == "random" else mesh
+    distance = geodesic_distance(LaplaceBeltrami.from_cotangent(vertices, faces), 0).numpy()
+    points, faces = np.asarray(vertices), np.asarray(faces)
+    for turn in range(3):
+        i, j, k = np.roll(faces, turn, axis=1).T
+        base, left, right = (
+            np.linalg.norm(points[a] - points[b], axis=1) for a, b in ((j, k), (i, j), (i, k))
+        )
+        place = (left**2 - right**2 + base**2) / (2 * base)
+        corner = place + 1j * np.sqrt(left**2 - place**2)
+        along = (distance[j] ** 2 - distance[k] ** 2 + base**2) / (2 * base)
+        depth = distance[j] ** 2 - along**2
+        source = along - 1j * np.sqrt(np.maximum(depth, 0))
+        straight = corner - source
+        crossing = source.real - straight.real * source.imag / straight.imag
+        met = (depth > 0) & (crossing >= 0) & (crossing <= base)
+        assert met.sum() > len(faces) / 4
+        assert (np.abs(straight) - distance[i])[met].min() > -1e-6 * base.mean()
+        assert (distance[j] + left - distance[i]).min() > -1e-6 * base.mean()
+
+
 @pytest.mark.parametrize("sources", [[], 300, [-1], torch.zeros(300, dtype=torch.bool)])
 def test_sources_that_are_none(sources):
     lb = LaplaceBeltrami.from_cotangent(*Sphere().mesh(300))

@@ -110,6 +110,8 @@ def test_import_loads_what_it_needs():
         "scipy.optimize",
         "torch._dynamo",
         "numba",
+        "nibabel",
+        "meshio",
     ]
     program = f"import sys, torchlb; print([name for name in {late} if name in sys.modules])"
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)

@@ -7,10 +7,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 import trimesh
 from click.testing import CliRunner
 
-from torchlb import LaplaceBeltrami, __version__, save_operator
+import torchlb
+from torchlb import LaplaceBeltrami, __version__, read_shape, save_operator
 from torchlb.__main__ import main
 from torchlb.surfaces import Ellipsoid
 
@@ -123,6 +125,8 @@ def test_info_of_a_shape_and_of_a_damaged_operator(mesh, tmp_path):
             "cotangent operator has no --order",
         ),
         (["precompute", "empty", "--out", "cache"], 1, "no shapes in it"),
+        (["curvature", "few.xyz", "--out", "a.npz"], 1, "3 points are fewer than the 4"),
+        (["modes", "few.xyz"], 2, "Missing option '--out'"),
         (["conquer"], 2, "No such command 'conquer'"),
     ],
 )
@@ -135,6 +139,39 @@ def test_a_wrong_call_ends_with_a_message(arguments, code, message, tmp_path, mo
     assert (done.exit_code, type(done.exception)) == (code, SystemExit)
     assert message in done.output
     assert not list(tmp_path.glob("*.png"))
+
+
+def test_commands_write_what_they_compute(mesh, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    vertices, faces = read_shape(mesh)
+    lb = LaplaceBeltrami.from_mesh(vertices, faces, order=2)
+    gaps = torch.where(vertices[:, 2] > 0, vertices[:, 0], torch.nan)
+    np.savez("maps.npz", f=vertices[:, 0].numpy(), gaps=gaps.numpy())
+    curvatures = lb.curvatures()
+    for arguments, expected in {
+        ("modes", "-k", "5"): {"modes": lb.eigenbasis(5).eigenvectors},
+        ("smooth", "--data", "maps.npz", "--fwhm", "0.4"): {
+            "f": torchlb.smooth(lb, vertices[:, 0], 0.4),
+            "gaps": torchlb.smooth(lb, gaps, 0.4, mask=~gaps.isnan()),
+        },
+        ("distance", "--source", "3", "--source", "7"): {
+            "distance": torchlb.geodesic_distance(lb, [3, 7])
+        },
+        ("distance", "--source", "3", "--source", "7", "--each"): {
+            "distance": torchlb.geodesic_distance(lb, [3, 7], each=True)
+        },
+        ("curvature",): {n: getattr(curvatures, n) for n in ("k1", "k2", "mean", "gaussian")},
+    }.items():
+        command, *options = arguments
+        call = [command, str(mesh), "--order", "2", *options, "--out", "out.npz"]
+        done = CliRunner().invoke(main, call)
+        assert done.exit_code == 0, done.output
+        assert "out.npz: 150 points in R^3, 296 faces" in done.output
+        found = torchlb.read_point_data("out.npz")
+        assert found.keys() == expected.keys()
+        for name, values in expected.items():
+            torch.testing.assert_close(found[name], values, equal_nan=True)
+        assert torch.equal(read_shape("out.npz")[1], faces)
 
 
 @pytest.mark.parametrize("command", [[], ["compare"], ["precompute"], ["info"]])

@@ -19,6 +19,7 @@ OTHERS = {
     "f": X,
     "g": X.flip(0),
     "vectors": VERTICES[:2].flip(0),
+    "fwhm": 0.3,
     "scales": [0.1],
     "k": 8,
     "v": torch.stack([X, X, X], 1),

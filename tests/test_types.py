@@ -2,6 +2,7 @@
 
 import copy
 
+import numpy as np
 import pytest
 import torch
 
@@ -155,14 +156,59 @@ def test_boundary_data_with_nan_are_refused_where_they_count():
         implicit_step(LB, X, 0.1, conductivity=kappa)
 
 
+def test_arrays_in_arrays_out(unchecked):
+    """Of the values that tensors have; what comes beside the data may be either."""
+    lb, t = LaplaceBeltrami.from_mesh(VERTICES, FACES, condition="dirichlet"), torch.tensor(0.1)
+    basis, pairs = lb.eigenbasis(6), torch.stack([X, Y], 1)
+    field, kappa = VERTICES[:, :, None] * pairs[:, None], (1 + X**2)
+    for call, data in (
+        (lb, pairs),
+        (lb.gradient, X),
+        (lb.local_gradient, pairs[None]),
+        (lb.divergence, field),
+        (lb.hessian, X),
+        (lambda f: lb.product("mass", f), pairs),
+        (lambda f: lb @ f, X),
+        (basis.to_basis, pairs),
+        (basis.from_basis, torch.arange(6.0)),
+        (lambda f: heat_flow(lb, f, t), X.float()),
+        (lambda f: heat_flow(lb, f, 0.1, method="spectral", k=4), pairs),
+        (lambda f: implicit_step(lb, f=f, t=np.array([0.1, 0.2]), boundary_values=f), pairs),
+        (lambda f: poisson_solve(f=f, lb=lb, conductivity=kappa), X),
+        (lambda f: poisson_solve(lb, f, conductivity=kappa.numpy()), X),
+        (lambda f: torchlb.spectral_wavelets(lb, f, [0.1], k=4), X),
+        (lambda f: torchlb.geodesic_distance(lb, f), X > 0.3),
+    ):
+        found, expected = call(data.numpy()), call(data)
+        assert isinstance(found, np.ndarray)
+        assert isinstance(expected, torch.Tensor)
+        assert torch.equal(torch.from_numpy(found), expected)
+    moved = lb.at(VERTICES.clone().requires_grad_())
+    assert np.array_equal(heat_flow(moved, X.numpy(), 0.1), heat_flow(lb, X, 0.1).numpy())
+    with pytest.raises(TypeError, match="too many positional"):
+        heat_flow(lb, X.numpy(), 0.1, "spectral")
+    swapped = X.numpy().astype(">f4")[::-1]
+    assert np.array_equal(lb(swapped), lb(X.float().flip(0)).numpy())
+    values = lb.with_medium(density=kappa.numpy()).eigenbasis(3).eigenvalues
+    assert torch.equal(values, lb.with_medium(density=kappa).eigenbasis(3).eigenvalues)
+
+
+def test_arrays_with_gaps_are_refused_with_the_points():
+    """NaN, and what NumPy masks."""
+    for gaps in (NAN.numpy(), np.ma.array(X.numpy(), mask=NAN.isnan().numpy())):
+        for call in (LB.eigenbasis(4).to_basis, lambda f: poisson_solve(LB, f)):
+            with pytest.raises(torchlb.InputError, match=r"at 2 of 300 points \(17, 167\)"):
+                call(gaps)
+
+
 def test_all_errors_of_types_are_torchlb_errors(unchecked):
     """Also a TypeError, for who expects one."""
-    f = X.numpy()
+    f = X.tolist()
     calls = [
         lambda: LB(f),
         lambda: LB @ f,
         lambda: LB.gradient(f),
-        lambda: LB.divergence(VERTICES.numpy()),
+        lambda: LB.divergence(VERTICES.tolist()),
         lambda: LB.hessian(f),
         lambda: LB.product("mass", f),
         lambda: LB.eigenbasis(4).to_basis(f),
@@ -171,6 +217,11 @@ def test_all_errors_of_types_are_torchlb_errors(unchecked):
         lambda: implicit_step(LB, X, 0.1, conductivity=f),
         lambda: LaplaceBeltrami.batch([LB, 1]),
         lambda: torchlb.load_or_build(VERTICES, FACES, cache=".", degree=2),
+        lambda: heat_flow(X, LB, 0.1),
+        lambda: heat_flow(X.numpy(), LB, 0.1),
+        lambda: torchlb.geodesic_distance(0, LB),
+        lambda: heat_flow(LB, X, "0.1"),
+        lambda: implicit_step(LB, X, None),
     ]
     for call in calls:
         with pytest.raises(torchlb.TorchlbError) as caught:

@@ -26,7 +26,7 @@ from torchlb.errors import (
     TorchlbError,
 )
 from torchlb.io.cache import load_operator, load_or_build, operator_key, save_operator
-from torchlb.io.files import read_shape
+from torchlb.io.files import read_point_data, read_shape, write_shape
 from torchlb.io.precompute import PrecomputeReport, ShapeResult, precompute_operators
 from torchlb.nn.diffusion import Diffusion
 from torchlb.nn.diffusion_net import DiffusionNet, DiffusionNetBlock
@@ -34,14 +34,14 @@ from torchlb.nn.gradient_features import GradientFeatures
 from torchlb.nn.implicit_diffusion import ImplicitDiffusion
 from torchlb.nn.poisson_block import PoissonBlock, PoissonFeatures
 from torchlb.nn.spectral_conv import SpectralConv
-from torchlb.operator.cleaning import clean_mesh, clean_points
+from torchlb.operator.cleaning import clean_mesh, clean_points, submesh
 from torchlb.operator.collate import collate
 from torchlb.operator.connection import Connection
 from torchlb.operator.curvature import Curvatures
 from torchlb.operator.laplace_beltrami import LaplaceBeltrami
 from torchlb.operator.report import StencilReport
 from torchlb.pde.geodesics import geodesic_distance
-from torchlb.pde.heat import heat_flow
+from torchlb.pde.heat import heat_flow, smooth
 from torchlb.pde.hodge import HodgeParts, hodge_decomposition
 from torchlb.pde.solves import implicit_step, poisson_solve
 from torchlb.pde.transport import logarithmic_map, parallel_transport, vector_heat_flow
@@ -104,12 +104,16 @@ __all__ = [
     "parallel_transport",
     "poisson_solve",
     "precompute_operators",
+    "read_point_data",
     "read_shape",
     "save_operator",
+    "smooth",
     "spectral_wavelets",
+    "submesh",
     "surfaces",
     "vector_heat_flow",
     "wave_kernel_signature",
+    "write_shape",
 ]
 
 

@@ -1,4 +1,4 @@
-"""`python -m torchlb`: look at the operator of one shape, precompute a folder of them, see what a file holds.
+"""`python -m torchlb`: compute on one shape, precompute a folder of them, see what a file holds.
 
 Exit codes: 0 if all went well, 1 for an error or a shape that failed, 2 for a wrong call. Errors are one message on
 stderr, without a traceback.
@@ -10,6 +10,7 @@ import sys
 import time
 import warnings
 from collections.abc import Callable
+from functools import wraps
 from pathlib import Path
 from typing import Any, get_args
 
@@ -20,11 +21,12 @@ from torchlb.errors import OperatorFileError
 from torchlb.fits.rules import WeightsName
 from torchlb.geometry.frames import Projection
 from torchlb.io.cache import load_with_header
-from torchlb.io.files import read_shape
+from torchlb.io.files import read_point_data, read_shape, write_shape
 from torchlb.io.precompute import concerns_the_shape, precompute_operators
 from torchlb.operator.cleaning import clean_mesh, cleaned
 from torchlb.operator.dispatch import Operator, build_operator
 from torchlb.operator.laplace_beltrami import LaplaceBeltrami
+from torchlb.pde import geodesics, heat
 from torchlb.plot.comparison import draw_comparison, spectra, spectrum_table
 from torchlb.version import __version__
 
@@ -84,6 +86,7 @@ def main() -> None:
     \b
     Examples:
       python -m torchlb compare bunny.ply
+      python -m torchlb smooth lh.pial --data lh.thickness --fwhm 10 --out smooth.func.gii
       python -m torchlb precompute shapes/ --out operators/ -k 128
       python -m torchlb info operators/0a1b….npz
     """
@@ -99,8 +102,7 @@ def main() -> None:
 def compare(mesh: Path, k: int, out: Path | None, clean: bool, **options: Any) -> None:
     """Report, stability and spectrum of MESH beside the cotangent operator's, and a picture.
 
-    MESH is a mesh (.ply .obj .off .stl .glb .npz) or a point cloud (.ply .pcd .xyz .txt .csv .npy .npz). A cloud has no
-    cotangent operator.
+    MESH is a mesh or a cloud, in any format of `read_shape`. A cloud has no cotangent operator.
 
     \b
     Examples:
@@ -200,6 +202,60 @@ def info(file: Path) -> None:
     pairs = lb.modes.left.shape[-1]
     click.echo(f"{pairs} eigenpairs stored")
     click.echo(f"{file.stat().st_size / 1e6:.1f} MB, written by torchlb {header['version']}")
+
+
+def _to_file(compute: Callable[..., dict[str, Any]]) -> Callable[..., None]:
+    """A command that writes SHAPE with what is computed of its operator, as data of the points."""
+
+    @main.command()
+    @_stencil_options
+    @click.option("--out", type=click.Path(path_type=Path), required=True, help="Where to write.")
+    @click.argument("shape", type=FILE)
+    @wraps(compute)
+    def run(shape: Path, out: Path, clean: bool, **own: Any) -> None:
+        vertices, faces = read_shape(shape)
+        vertices, faces = cleaned(vertices, faces) if clean else (vertices, faces)
+        options = {name: own.pop(name) for name in ("order", "projection", "weights", "certify")}
+        lb = build_operator(vertices, faces, **options)
+        write_shape(out, lb.points, lb.faces, **compute(lb, **own))
+        click.echo(f"{out}: {_size(lb.points, faces)}")
+
+    return run
+
+
+@_to_file
+@click.option("-k", type=COUNT, default=20, help="Number of eigenpairs.")
+def modes(lb: LaplaceBeltrami, k: int) -> dict[str, Any]:
+    """Write the eigenfunctions of SHAPE, orthonormal in the mass, and print the eigenvalues of −Δ."""
+    basis = lb.eigenbasis(k)
+    click.echo(" ".join(f"{value:.6g}" for value in basis.eigenvalues.tolist()))
+    return {"modes": basis.eigenvectors}
+
+
+@_to_file
+@click.option("--data", type=FILE, required=True, help="Maps, as read_point_data reads them.")
+@click.option("--fwhm", type=float, required=True, help="Full width at half maximum.")
+def smooth(lb: LaplaceBeltrami, data: Path, fwhm: float) -> dict[str, Any]:
+    """Write maps on SHAPE smoothed by a Gaussian; where they are NaN they count nothing and stay NaN."""
+    return {
+        name: heat.smooth(lb, f.double(), fwhm, mask=f.isfinite().view(len(f), -1).all(1))
+        for name, f in read_point_data(data).items()
+    }
+
+
+@_to_file
+@click.option("--source", type=int, multiple=True, required=True, help="Point; again for more.")
+@click.option("--each", is_flag=True, help="A column for each source, not the nearest of them.")
+def distance(lb: LaplaceBeltrami, source: tuple[int, ...], each: bool) -> dict[str, Any]:
+    """Write the geodesic distance on SHAPE to points."""
+    return {"distance": geodesics.geodesic_distance(lb, source, each=each)}
+
+
+@_to_file
+def curvature(lb: LaplaceBeltrami) -> dict[str, Any]:
+    """Write the principal, mean and Gaussian curvatures of SHAPE."""
+    found = lb.curvatures()
+    return {name: getattr(found, name) for name in ("k1", "k2", "mean", "gaussian")}
 
 
 def _size(vertices: Any, faces: Any) -> str:

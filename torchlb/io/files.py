@@ -1,4 +1,4 @@
-"""Shapes from files: polygons and points by `formats`, .stl and .glb through trimesh, arrays through NumPy."""
+"""Shapes from files and to files: by `formats`, by NumPy, and through trimesh, nibabel and meshio."""
 
 from __future__ import annotations
 
@@ -12,14 +12,18 @@ from torch import Tensor
 
 from torchlb.errors import InputError
 from torchlb.geometry.complex import edges_of
+from torchlb.io import libraries
 from torchlb.io.formats import READERS, numbers_of
 from torchlb.operator.cleaning import merged, proper_faces, triangles_of
-from torchlb.operator.inputs import as_tensor
+from torchlb.operator.inputs import ArrayLike, as_tensor, check_corners, check_points
 
-SUFFIXES = tuple(sorted([".glb", ".gltf", ".npy", ".npz", ".stl", *READERS]))
+OTHERS = (".gii", ".glb", ".gltf", ".npy", ".npz", ".stl", ".vtk", ".vtu")
+SUFFIXES = tuple(sorted([*OTHERS, *READERS]))
 """Endings of the files that `read_shape` takes."""
 STEPS = 4
 """Largest difference of coinciding corners in an .stl, in steps of float32 at the largest coordinate."""
+OF_THE_SHAPE = ("vertices", "points", "pos", "faces")
+"""Names in a .npz that are not of data."""
 Shape = tuple[Float[Tensor, "N n"], Int[Tensor, "F v"] | None]
 
 
@@ -43,19 +47,44 @@ def read_shape(path: str | Path) -> Shape:
     ----------
     path
         A mesh (.ply, .obj, .off, .stl, .glb, .gltf), whose polygons are split into triangles, along the shorter
-        diagonal of a quad; without faces it is a cloud. A cloud in .pcd, or a table of numbers (.xyz, .txt, .csv, .pts,
-        .asc) with the coordinates in the columns x, y, z, or in the first three. An array (N, n) of points in .npy; or
-        a .npz with `vertices` (or `points`, or `pos`) and, for a mesh, `faces`. The corners of an .stl, which has no
-        vertices, are merged where they coincide, and along open edges where they differ by rounding.
+        diagonal of a quad; without faces it is a cloud. A surface of GIFTI (.gii) or FreeSurfer (lh.pial, …), through
+        nibabel. An unstructured grid of VTK (.vtk, .vtu), through meshio: tetrahedra, else triangles, else lines. A
+        cloud in .pcd, or a table of numbers (.xyz, .txt, .csv, .pts, .asc) with the coordinates in the columns x, y, z,
+        or in the first three. An array (N, n) of points in .npy; or a .npz with `vertices` (or `points`, or `pos`) and,
+        for a mesh, `faces`. The corners of an .stl, which has no vertices, are merged where they coincide, and along
+        open edges where they differ by rounding.
 
     Raises
     ------
     FileNotFoundError
         If there is no such file.
     ValueError
-        If it is no shape; the message names the file.
+        If it is no shape, or the library is missing that reads it; the message names the file.
     """
-    path = Path(path).expanduser()
+    vertices, faces, data = _read(path)
+    if vertices is None:
+        names = f"neither vertices nor points among {list(data)}"
+        raise InputError(
+            f"{path}: not a mesh or cloud, {names}; torchlb.read_point_data reads data"
+        )
+    return vertices.double(), faces
+
+
+def read_point_data(path: str | Path) -> dict[str, Tensor]:
+    """Data of the points in a file by name, (N,) or (N, C), in the type and order of the file.
+
+    Arrays of a .npz besides the shape; those of .vtk and .vtu, through meshio; of .gii, and FreeSurfer's maps
+    (lh.thickness, lh.curv, …), through nibabel. Raises a ValueError for a file without data, else as `read_shape`.
+    """
+    data = _read(path)[2]
+    if not data:
+        raise InputError(f"{path}: no data of points; .npz, .vtk, .vtu, .gii, lh.curv, … hold some")
+    return {name: as_tensor(values) for name, values in data.items()}
+
+
+def _read(path: str | Path) -> libraries.Contents:
+    """The vertices, cells and data in a file, if any."""
+    path, data = Path(path).expanduser(), {}
     suffix = path.suffix.lower()
     if not path.is_file():
         raise FileNotFoundError(f"{path}: no such file")
@@ -63,29 +92,75 @@ def read_shape(path: str | Path) -> Shape:
         if suffix == ".npy":
             vertices, faces = as_tensor(np.load(path, allow_pickle=False)), None
         elif suffix == ".npz":
-            vertices, faces = _npz(path)
+            vertices, faces, data = _npz(path)
         elif suffix in READERS:
             vertices, faces = _triangulated(*READERS[suffix](path))
+        elif (found := libraries.read(path)) is not None:
+            vertices, faces, data = found
         else:
             import trimesh
 
             loaded = trimesh.load(path, process=False, maintain_order=True, skip_materials=True)
             vertices, faces = arrays_of(loaded)
-        if vertices.ndim != 2 or vertices.numel() == 0:
+            if suffix == ".stl" and faces is not None:
+                vertices, faces = _sewn(vertices, faces)
+        if vertices is not None and (vertices.ndim != 2 or vertices.numel() == 0):
             raise InputError(f"vertices of shape {tuple(vertices.shape)}, expected (N, n)")
     except Exception as error:  # each reader raises its own
         raise InputError(
-            f"{path}: not a mesh or cloud that can be read; {', '.join(SUFFIXES)} can ({error})"
+            f"{path}: not a mesh or cloud that can be read; {', '.join(SUFFIXES)} and FreeSurfer's surfaces can "
+            f"({error})"
         ) from error
-    if suffix == ".stl" and faces is not None:
-        vertices, faces = _sewn(vertices, faces)
-    return vertices.double(), faces
+    return vertices, faces, data
+
+
+def write_shape(
+    path: str | Path, points: ArrayLike, cells: ArrayLike | None = None, **point_data: ArrayLike
+) -> None:
+    """Write a mesh or cloud, with data of its points, in the format that the ending names.
+
+    .npz holds every shape; .vtk and .vtu, through meshio, those of R² and R³; .gii, through nibabel, triangles, in
+    single precision, and .func.gii and .shape.gii the data alone; .ply, .obj, .off, .stl and .glb, through trimesh,
+    triangles and points of R³ without data. `points` are (N, n), `cells` (F, 3) triangles, (F, 2) segments, (F, 4)
+    tetrahedra or None, and data (N,) or (N, C), by name: ``write_shape("a.vtu", lb.points, lb.faces, thickness=f)``.
+
+    Raises ValueError for data of another length, a format that does not hold them, and where its library is missing.
+    """
+    path, places = Path(path).expanduser(), check_points(points).numpy()
+    suffix, corners = path.suffix.lower(), np.zeros((0, 3), dtype=np.int64)
+    if cells is not None and len(cells):
+        corners = check_corners(cells, len(places)).numpy()
+    data = {name: as_tensor(f).detach().cpu().numpy() for name, f in point_data.items()}
+    for name, values in data.items():
+        if values.ndim not in (1, 2) or len(values) != len(places) or name in OF_THE_SHAPE:
+            raise InputError(
+                f"{name}: expected data of {len(places)} points, (N,) or (N, C), under another name than "
+                f"{', '.join(OF_THE_SHAPE)}; got shape {values.shape}"
+            )
+    flat = places.shape[1] == corners.shape[1] == 3
+    if suffix == ".npz":
+        np.savez(path, **{"vertices": places, "faces": corners, **data})
+    elif (suffix in libraries.BY_MESHIO and places.shape[1] < 4) or (suffix == ".gii" and flat):
+        libraries.write(path, places, corners, data)
+    elif suffix in (".ply", ".obj", ".off", ".stl", ".glb") and flat and not data:
+        import trimesh
+
+        mesh = trimesh.Trimesh(places, corners, process=False)
+        _ = (mesh if len(corners) else trimesh.PointCloud(places)).export(path)
+    else:
+        what = (
+            f"cells {corners.shape} on points {places.shape}{''.join(f', {name}' for name in data)}"
+        )
+        raise InputError(
+            f"{path}: this format does not hold {what}; .npz holds all, .vtk and .vtu all in R² and R³, .gii triangles "
+            "and data in R³, .ply, .obj, .off, .stl and .glb triangles and points of R³ without data"
+        )
 
 
 def may_be_shape(path: Path) -> bool:
     """Whether a file is taken for a shape, by its ending; .txt and .csv by three numbers in their first row."""
     if path.suffix.lower() not in (".csv", ".txt"):
-        return path.suffix.lower() in SUFFIXES
+        return path.suffix.lower() in SUFFIXES or libraries.begins(path, libraries.SURFACE)
     try:
         return len(next(numbers_of(path), ([], []))[1]) > 2
     except InputError:
@@ -132,11 +207,10 @@ def _sewn(vertices: Float[Tensor, "N 3"], faces: Int[Tensor, "F 3"]) -> tuple[Te
     return vertices[kept], number[faces]
 
 
-def _npz(path: Path) -> Shape:
+def _npz(path: Path) -> libraries.Contents:
     with np.load(path, allow_pickle=False) as archive:
-        names = [name for name in ("vertices", "points", "pos") if name in archive.files]
-        if not names:
-            raise InputError(f"neither vertices nor points among {archive.files}")
-        vertices = as_tensor(archive[names[0]])
-        faces = as_tensor(archive["faces"]).long() if "faces" in archive.files else None
-    return vertices, None if faces is None or faces.numel() == 0 else faces
+        arrays = dict(archive)
+    data = {name: array for name, array in arrays.items() if name not in OF_THE_SHAPE}
+    shape = [as_tensor(arrays[name]) for name in OF_THE_SHAPE if name in arrays]
+    faces = shape.pop().long() if "faces" in arrays and arrays["faces"].size else None
+    return shape[0] if shape else None, faces, data

@@ -1,11 +1,48 @@
-"""Validation of operators, and of functions on points: tensors of finite values."""
+"""Validation of operators, and of functions on points: tensors of finite values, or NumPy arrays in their place."""
 
 from __future__ import annotations
 
+import inspect
+from collections.abc import Callable
+from functools import wraps
+from typing import Any, ParamSpec, TypeVar
+
+import numpy as np
 import torch
 from torch import Tensor
 
 from torchlb.errors import InputError, InputTypeError, first_few
+
+P = ParamSpec("P")
+T = TypeVar("T")
+DATA = {"f", "v", "coefficients", "sources"}
+
+
+def takes_arrays(function: Callable[P, T]) -> Callable[P, T]:
+    """Let a function take arrays of NumPy: if its data, a parameter in `DATA`, are one, so is what it returns.
+
+    Arrays go to the device of the operator or basis; masked values become NaN. Results have no gradients.
+    """
+    signature = inspect.signature(function)
+    names = list(signature.parameters)
+    place = next(i for i, name in enumerate(names) if name in DATA)
+
+    @wraps(function)
+    def called(*args: P.args, **options: P.kwargs) -> T:
+        data = args[place] if len(args) > place else options.get(names[place])
+        if not isinstance(data, np.ndarray):
+            return function(*args, **options)
+        given = signature.bind(*args, **options).arguments
+        mass = next((x.mass for x in given.values() if hasattr(x, "mass")), None)
+        for name, x in given.items():
+            if isinstance(x, np.ndarray):
+                x = np.ma.filled(x, np.nan)
+                x = torch.tensor(x.astype(x.dtype.newbyteorder("=")))
+                given[name] = x.to(getattr(mass, "device", None))
+        call: Any = function
+        return call(**given).detach().cpu().numpy()
+
+    return called
 
 
 def check_tensor(f: object, what: str = "f") -> None:
@@ -61,5 +98,5 @@ def check_finite(f: Tensor, what: str = "f") -> None:
         raise InputError(
             f"{what}: expected finite values, got NaN or infinity at {len(bad)} of {f.shape[max(f.ndim - 2, 0)]} "
             f"points ({first_few(bad)}); give these points values, as torch.nan_to_num({what}) does, or build the "
-            "operator without them"
+            "operator without them (torchlb.submesh)"
         )

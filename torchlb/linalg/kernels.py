@@ -1,4 +1,4 @@
-"""Two loops without a fast form in NumPy, SciPy or torch, compiled by numba.
+"""Three loops without a fast form in NumPy, SciPy or torch, compiled by numba.
 
 Callers import them where they call them, so that importing the package does not load numba. Each is compiled for one
 signature only, and cached beside this file, or in the user's cache.
@@ -278,3 +278,55 @@ def _k_hop_neighborhoods(
         count[row] = _nearest_first(square, ball, total, size)
         for a in range(size):
             index[row, a] = ball[a] if a < count[row] else center
+
+
+@njit(error_model="numpy")
+@no_type_check
+def _across(d_j: float, d_k: float, along: float, height: float, base: float) -> float:
+    """Distance from i, `height` over jk at `along`, to the point below at d_j and d_k; infinite if it misses jk."""
+    source = (d_j**2 - d_k**2 + base**2) / (2 * base)
+    depth = np.sqrt(max(d_j**2 - source**2, 0.0))
+    share = (source * height + along * depth) / ((height + depth) * base)
+    return np.sqrt((source - along) ** 2 + (depth + height) ** 2) if 0 <= share <= 1 else np.inf
+
+
+@_kept(
+    "void(float64[::1], int64[::1], int64[::1], float64[:, ::1], int64[::1], int64[:, ::1], float64[:, ::1], "
+    "int64[::1], float64)"
+)
+@no_type_check
+def straighten(distance, foot, order, points, first, ends, sides, fell, enough):
+    """Lower distances by paths across triangles, in place, in sweeps until none falls by more than `enough`.
+
+    Those of point i are the rows first[i] … first[i + 1] − 1 of `ends`, their other corners (j, k), and of `sides`, the
+    lengths of ij, ik and jk, the height of i over jk and its place along it. The path to i starts at the source of j or
+    of k, its `foot`; if these differ, the distance of k from the source of j is unknown, and bounded below by the
+    straight line and by the distance of k. `order` is that of the sweeps, `fell` work space, ones: when each fell last.
+    """
+    most, clock = np.inf, 0
+    while most > enough:
+        most = 0.0
+        for i in order:
+            clock += 1
+            best, source = distance[i], foot[i]
+            for t in range(first[i], first[i + 1]):
+                j, k = ends[t, 0], ends[t, 1]
+                if max(fell[j], fell[k]) <= clock - len(order):  # nothing new since the last sweep
+                    continue
+                d_j, d_k = distance[j], distance[k]
+                by_j, by_k = d_j + sides[t, 0], d_k + sides[t, 1]
+                base, height, along = sides[t, 2], sides[t, 3], sides[t, 4]
+                if (d_j + d_k - base) / 2 + height < best:  # a lower bound of paths across
+                    line_j, line_k = 0.0, 0.0
+                    if foot[j] != foot[k]:
+                        for x in range(points.shape[1]):
+                            line_j += (points[foot[k], x] - points[j, x]) ** 2
+                            line_k += (points[foot[j], x] - points[k, x]) ** 2
+                        line_j, line_k = np.sqrt(line_j), np.sqrt(line_k)
+                        by_k = min(by_k, _across(max(d_j, line_j), d_k, along, height, base))
+                    by_j = min(by_j, _across(d_j, max(d_k, line_k), along, height, base))
+                if min(by_j, by_k) < best:
+                    best, source = min(by_j, by_k), foot[j] if by_j <= by_k else foot[k]
+            if best < distance[i]:
+                most, fell[i] = max(most, distance[i] - best), clock
+                distance[i], foot[i] = best, source

@@ -20,7 +20,7 @@ from torchlb.operator.cleaning import (
     proper_faces,
     turned_faces,
 )
-from torchlb.operator.inputs import ArrayLike, check_corners, check_points
+from torchlb.operator.inputs import ArrayLike, check_corners, check_mask, check_points
 
 MAX_EXTENT = 1e30
 """Largest extent of the points, and inverse of the smallest, for which all libraries called keep their digits."""
@@ -194,12 +194,7 @@ def check_boundary(boundary: Any, num_points: int) -> Bool[Tensor, " N"] | str |
         raise InputError(
             f"boundary: expected a mask of the points, 'detect' or None, got {boundary!r}"
         )
-    mask = torch.as_tensor(boundary).detach().cpu()
-    if mask.dtype != torch.bool or mask.shape != (num_points,):
-        raise InputError(
-            f"boundary: expected a boolean mask of shape ({num_points},), got {mask.dtype} of shape {tuple(mask.shape)}"
-        )
-    return mask
+    return check_mask(boundary, num_points, "boundary")
 
 
 def check_tolerance(tolerance: float | None) -> None:

@@ -14,7 +14,7 @@ from torch.nn.functional import pad
 from torchlb.errors import InputError
 from torchlb.geometry.complex import edges_of, two_orientations
 from torchlb.linalg.precision import ROUNDING
-from torchlb.operator.inputs import ArrayLike, as_tensor, check_corners, check_points
+from torchlb.operator.inputs import ArrayLike, as_tensor, check_corners, check_mask, check_points
 
 
 def coincident(
@@ -115,6 +115,29 @@ def clean_mesh(
     kept, renumbered = torch.unique(corners, return_inverse=True)
     kept = kept.to(vertices.device)
     return vertices[kept], renumbered.to(faces), kept
+
+
+def submesh(
+    vertices: ArrayLike, faces: ArrayLike, mask: ArrayLike
+) -> tuple[Tensor, Tensor, Tensor]:
+    """The part of a mesh whose faces have all corners in a mask (N,), such as a cortex without the medial wall.
+
+    Vertices of the mask that belong to no such face are left out. Returned are vertices, faces and `kept`, as
+    `clean_mesh` has them: `values[kept]` cuts data out, and ``whole[kept] = values`` puts them back. Where it is cut
+    the part has a boundary, with the condition given to `from_mesh`, ∂f/∂ν = 0 by default. Modes, heat and
+    distances are those of the part alone. Raises InputError for anything but a boolean mask, or without a face inside.
+
+    >>> square = torch.tensor([[0.0, 0], [1, 0], [1, 1], [0, 1]])
+    >>> submesh(square, [[0, 1, 2], [0, 2, 3]], [True, False, True, True])[1:]
+    (tensor([[0, 1, 2]]), tensor([0, 2, 3]))
+    """
+    inside = check_mask(mask, len(vertices))
+    whole = inside[check_corners(faces, len(vertices))].all(1)
+    if not whole.any():
+        raise InputError(
+            f"mask: no face has all its corners among its {int(inside.sum())} vertices"
+        )
+    return clean_mesh(vertices, as_tensor(faces)[whole])
 
 
 def cleaned(vertices: ArrayLike, faces: ArrayLike | None) -> tuple[Tensor, Tensor | None]:

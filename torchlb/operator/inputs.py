@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from torchlb.errors import InputError, first_few, warn
@@ -70,6 +70,16 @@ def check_points(points: ArrayLike, what: str = "points") -> Float[Tensor, "N n"
     return points
 
 
+def check_mask(mask: ArrayLike, num_points: int, what: str = "mask") -> Bool[Tensor, " N"]:
+    """A boolean mask of all points on the CPU; ValueError for anything else."""
+    mask = as_tensor(mask).detach().cpu()
+    if mask.dtype != torch.bool or mask.shape != (num_points,):
+        raise InputError(
+            f"{what}: expected a boolean mask of shape ({num_points},), as f > 0, got {mask.dtype} {tuple(mask.shape)}"
+        )
+    return mask
+
+
 def check_corners(faces: ArrayLike, num_points: int) -> Int[Tensor, "F v"]:
     """Faces as (F, d + 1) int64 on the CPU; ValueError for wrong shapes, types or indices."""
     try:
@@ -83,7 +93,7 @@ def check_corners(faces: ArrayLike, num_points: int) -> Int[Tensor, "F v"]:
     if len(faces) == 0:
         raise InputError("faces: got none; use LaplaceBeltrami.from_points for a cloud")
     if faces.is_floating_point() or faces.is_complex() or faces.dtype == torch.bool:
-        raise InputError(f"faces: expected integers, got {faces.dtype}")
+        raise InputError(f"faces: expected integers, got {faces.dtype}; vertices come first")
     faces = faces.detach().to("cpu", torch.int64)
     bad = ((faces < 0) | (faces >= num_points)).any(1).nonzero()[:, 0]
     if len(bad):

@@ -7,7 +7,6 @@ from dataclasses import replace
 from typing import Any, Literal
 
 import torch
-from torch import Tensor
 
 from torchlb.certified.certificate import Certificate
 from torchlb.cloud.surface import SurfaceSummary
@@ -303,9 +302,9 @@ class LaplaceBeltrami(StencilMethods, PairMethods):
 
     def with_medium(
         self,
-        conductivity: Tensor | float | None = None,
-        density: Tensor | float | None = None,
-        potential: Tensor | float | None = None,
+        conductivity: ArrayLike | float | None = None,
+        density: ArrayLike | float | None = None,
+        potential: ArrayLike | float | None = None,
     ) -> LaplaceBeltrami:
         """The operator of −div(A∇u) + cu = λρu, for eigenpairs, flows, solves, layers: another weak pair on the shape.
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+import numpy as np
 import torch
 from scipy import sparse
 from torch import Tensor
@@ -17,10 +18,11 @@ from torchlb.linalg.checks import check_tensor
 from torchlb.linalg.csr import Csr
 from torchlb.linalg.precision import ROOT_EPS
 from torchlb.linalg.sparse import to_scipy
+from torchlb.operator.inputs import ArrayLike
 from torchlb.operator.parts import MediumFields, PairMatrices
 from torchlb.operator.storage import OperatorStorage
 
-Given = Mapping[str, Tensor | float | None]
+Given = Mapping[str, ArrayLike | float | None]
 
 
 def elements_of(lb: Any) -> Forms:
@@ -47,7 +49,7 @@ def checked_fields(lb: OperatorStorage, given: Given) -> MediumFields:
         raise InputError("with_medium: this operator has no weak pair; build it with one")
     found = {}
     for name, x in fields.items():
-        if not isinstance(x, int | float):
+        if not isinstance(x, int | float | np.ndarray):
             check_tensor(x, name)
         x = torch.as_tensor(x, device=lb.device)
         x = x.expand(lb.num_points) if x.ndim == 0 else x
@@ -70,6 +72,7 @@ def split_fields(batch: Any, shapes: Sequence[Any], given: Given) -> list[dict[s
     counts = {len(batch.faces): [len(shape.faces) for shape in shapes]}
     counts[batch.num_points] = [shape.num_points for shape in shapes]
     for name, x in given.items():
+        x = torch.from_numpy(x) if isinstance(x, np.ndarray) else x
         parts: Any = [x] * len(shapes)
         if isinstance(x, Tensor) and x.ndim:
             if len(x) not in counts:

@@ -10,7 +10,7 @@ from scipy import sparse
 from torch import Tensor
 
 from torchlb.errors import InputError
-from torchlb.linalg.checks import check_rows
+from torchlb.linalg.checks import check_rows, takes_arrays
 from torchlb.linalg.csr import Csr
 from torchlb.linalg.sparse import csr_tensor, to_scipy
 from torchlb.linalg.threads import threads_for
@@ -79,7 +79,7 @@ class PairMethods(OperatorStorage):
 
     def _channel(self, name: str) -> tuple[Csr, int]:
         """The matrices that hold "laplacian", "stiffness", "mass" or "boundary_mass", and its channel in them."""
-        if name not in get_args(MatrixName):
+        if not isinstance(name, str) or name not in get_args(MatrixName):
             raise InputError(f"name: expected one of {list(get_args(MatrixName))}, got {name!r}")
         if name == "laplacian":
             return self.stencil, 0
@@ -89,6 +89,7 @@ class PairMethods(OperatorStorage):
             raise InputError("boundary_mass: the shape is closed")
         return self.weak, get_args(MatrixName).index(name) - 1
 
+    @takes_arrays
     def product(self, name: MatrixName, f: Tensor) -> Tensor:
         """A matrix of the operator times f, of the shape of f, differentiable in f any number of times.
 
@@ -109,6 +110,7 @@ class PairMethods(OperatorStorage):
         result = matrices.product(channel, f)
         return through_product(self, name, f, result)
 
+    @takes_arrays
     def integral(self, f: Tensor) -> Tensor:
         """∫f over the shape, by the weights `mass`: () for f (N,), (C,) for (N, C), (B, C) for (B, N, C).
 
@@ -124,6 +126,7 @@ class PairMethods(OperatorStorage):
         weights = self.mass.to(torch.promote_types(f.dtype, self.dtype))
         return self._summed((weights if f.ndim == 1 else weights[:, None]) * f)
 
+    @takes_arrays
     def inner(self, f: Tensor, g: Tensor) -> Tensor:
         """∫fg = fᵀMg for functions of equal shape, with the density of a medium if any; shapes as for `integral`."""
         if f.shape != g.shape:

@@ -8,7 +8,7 @@ from torch import Tensor
 
 from torchlb.errors import InputError
 from torchlb.geometry.boundary import boundary_faces
-from torchlb.linalg.checks import check_tensor
+from torchlb.linalg.checks import check_tensor, takes_arrays
 from torchlb.linalg.csr import tensors_of
 from torchlb.operator.curvature import Curvatures, curvatures_of, turned_frames
 from torchlb.operator.report import StencilReport
@@ -31,6 +31,7 @@ class StencilMethods(OperatorStorage):
         order, fields = self.options.get("order", 0), tensors_of(self._record)
         return StencilReport(order, self.dim, **fields, surface=self.surface)
 
+    @takes_arrays
     def forward(self, f: Float[Tensor, "*batch N C"] | Float[Tensor, " N"]) -> Tensor:
         """Δf, of the shape of f: (N,), (N, C) or (B, N, C) on one surface. Units of f by 1/ℓ².
 
@@ -43,6 +44,7 @@ class StencilMethods(OperatorStorage):
         """``lb @ f`` is ``lb(f)``."""
         return self(f)
 
+    @takes_arrays
     def local_gradient(self, f: Tensor) -> Tensor:
         """∇f in the frames, (N, d, C) for f (N, C), (N, d) for (N,), (B, N, d, C) for (B, N, C). Units of f by 1/ℓ."""
         check_tensor(f)
@@ -52,6 +54,7 @@ class StencilMethods(OperatorStorage):
         parts = [self.stencil.product(c, f) for c in range(1, 1 + self.dim)]
         return torch.stack(parts, dim=1 if f.ndim < 3 else 2)
 
+    @takes_arrays
     def gradient(self, f: Tensor) -> Tensor:
         """∇f as tangent vectors of space, (N, n, C) for f (N, C), (N, n) for (N,), (B, N, n, C) for (B, N, C).
 
@@ -68,6 +71,7 @@ class StencilMethods(OperatorStorage):
         frames = self.frames if frames is None else frames
         return torch.einsum(equation, frames.to(local.dtype), local)
 
+    @takes_arrays
     def divergence(self, v: Tensor) -> Tensor:
         """div v = Σ_c E_c · ∂_c v of space vectors v: (N,) for (N, n), (N, C) for (N, n, C), batches (B, N, C) too.
 
@@ -77,6 +81,7 @@ class StencilMethods(OperatorStorage):
         """
         return self._contracted(v, self.frames)
 
+    @takes_arrays
     def curl(self, v: Tensor) -> Tensor:
         """curl v = ν·(∇ × v) = div(v × ν) of space vectors v on a surface in R³ with normals ν; shapes as `divergence`.
 
@@ -105,6 +110,7 @@ class StencilMethods(OperatorStorage):
         local = self.local_gradient(v.flatten(-2)).unflatten(-1, v.shape[-2:])  # (…, N, d, n, C)
         return self._turned("ind,...idnc->...ic", local, frames)
 
+    @takes_arrays
     def hessian(self, f: Tensor) -> Tensor:
         """∇²f, covariant second derivatives E_b·∂_a(∇f) in the frames: (N, d, d) for f (N,), (N, d, d, C) for (N, C).
 

@@ -9,7 +9,7 @@ from typing import Any, ParamSpec, TypeVar, get_args
 import torch
 from torch import Tensor
 
-from torchlb.errors import InputError
+from torchlb.errors import InputError, InputTypeError
 from torchlb.linalg.checks import check_finite, check_operator, check_tensor
 from torchlb.operator.pair_methods import PairMethods, check_pair
 
@@ -47,7 +47,10 @@ def as_times(t: float | Tensor, x: Tensor, dtype: torch.dtype) -> Tensor:
     >>> as_times(0.5, torch.ones(4, 2), torch.float32)
     tensor([0.5000, 0.5000])
     """
-    time = torch.as_tensor(t, dtype=dtype, device=x.device)
+    try:
+        time = torch.as_tensor(t, dtype=dtype, device=x.device)
+    except (TypeError, ValueError, RuntimeError) as error:
+        raise InputTypeError(f"t: expected a number or numbers, got {t!r}") from error
     if time.shape not in ((), (1,), x.shape[-1:]):
         raise InputError(
             f"t: expected one time or one for each of {x.shape[-1]} channels, got {tuple(time.shape)}"

@@ -9,25 +9,31 @@ also as t → 0. "rational" needs no basis and is exact to the tolerance: the so
 from __future__ import annotations
 
 import math
+from numbers import Real
 from typing import Literal
 
 import torch
 from jaxtyping import Shaped
 from torch import Tensor
 
+from torchlb.errors import InputError
+from torchlb.linalg.checks import check_tensor, takes_arrays
 from torchlb.linalg.csr import shaped_like, side_by_side
 from torchlb.linalg.exponential import heat
 from torchlb.linalg.precision import ROOT_EPS
 from torchlb.linalg.sparse import compute_dtype
 from torchlb.operator.checks import check_tolerance
+from torchlb.operator.inputs import check_mask
+from torchlb.operator.laplace_beltrami import LaplaceBeltrami
 from torchlb.operator.pair_methods import PairMethods, check_pair
-from torchlb.pde.checks import as_columns, as_times, check_choice
+from torchlb.pde.checks import as_columns, as_times, check_choice, check_shape
 from torchlb.pde.pair_flow import pair_flow
 from torchlb.spectral.eigenbasis import Eigenbasis
 
 Method = Literal["deflated", "spectral", "rational"]
 
 
+@takes_arrays
 def heat_flow(
     lb: PairMethods,
     f: Shaped[Tensor, "*B N C"] | Shaped[Tensor, " N"],
@@ -80,6 +86,41 @@ def heat_flow(
         y = flow(lb, x.to(dtype), time, method, k, tolerance)
     y = y.to(x.dtype) if x.dtype.itemsize < 4 else y
     return y[:, 0] if f.ndim == 1 else y
+
+
+@takes_arrays
+def smooth(
+    lb: LaplaceBeltrami,
+    f: Shaped[Tensor, "*B N C"] | Shaped[Tensor, " N"],
+    fwhm: float,
+    *,
+    mask: Tensor | None = None,
+) -> Tensor:
+    """f smoothed along the surface by a Gaussian of a given full width at half maximum; differentiable in f.
+
+    `heat_flow` for the time t = σ²/2, where σ = fwhm/√(8 ln 2); in the plane it is the convolution with the Gaussian of
+    standard deviation σ. A width of less than two edges is not resolved. Errors are those of `heat_flow`.
+
+    Parameters
+    ----------
+    lb, f
+        Operator of one shape, or of a batch, and (N,), (N, C) or (B, N, C).
+    fwhm
+        Width ≥ 0 in ℓ, the unit of the points.
+    mask
+        (N,), true where f counts. With it the result is e^{tΔ}(mf)/e^{tΔ}m there, a weighted mean of the values inside,
+        and NaN elsewhere, where f may be NaN, too. Without it NaN are an error.
+    """
+    if not isinstance(fwhm, Real) or not 0 <= fwhm < math.inf:
+        raise InputError(f"fwhm: expected a length of at least 0, got {fwhm!r}")
+    time = float(fwhm) ** 2 / (16 * math.log(2))
+    if mask is None:
+        return heat_flow(lb, f, time)
+    check_tensor(f)
+    check_shape(f[:, None] if f.ndim == 1 else f, lb)
+    inside = check_mask(mask, lb.num_points).to(f.device).view((-1, 1) if f.ndim > 1 else -1)
+    whole = heat_flow(lb, torch.where(inside, f, 0), time)
+    return torch.where(inside, whole / heat_flow(lb, inside.to(whole), time), torch.nan)
 
 
 def flow(lb: PairMethods, x: Tensor, time: Tensor, method: str, k: int, tolerance: float) -> Tensor:

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from torchlb.errors import InputError
 from torchlb.galerkin.bilinear import BilinearForm
-from torchlb.linalg.checks import check_finite
+from torchlb.linalg.checks import check_finite, takes_arrays
 from torchlb.linalg.csr import shaped_like, side_by_side
 from torchlb.linalg.once import once_differentiable
 from torchlb.linalg.precision import SINGLE
@@ -26,6 +26,7 @@ TOLERANCE = 1e-10
 """Default relative error of solves: below the error of any mesh, and far above rounding."""
 
 
+@takes_arrays
 @uncompiled
 def implicit_step(
     lb: PairMethods,
@@ -87,6 +88,7 @@ def implicit_step(
     return shaped_like(u, f).to(x.dtype)
 
 
+@takes_arrays
 @uncompiled
 def poisson_solve(
     lb: PairMethods,

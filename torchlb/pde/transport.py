@@ -12,6 +12,7 @@ from torch import Tensor
 from torch.nn.functional import normalize
 
 from torchlb.errors import InputError
+from torchlb.linalg.checks import takes_arrays
 from torchlb.linalg.precision import LOW, ROOT_EPS, ROUNDING, TINY
 from torchlb.operator.laplace_beltrami import LaplaceBeltrami
 from torchlb.pde.geodesics import geodesic_distance, source_points
@@ -24,6 +25,7 @@ FARTHEST = -math.log(torch.finfo(torch.float32).tiny)
 """Largest distance over √t: what has decayed further is zero in float32, in which steps are preconditioned."""
 
 
+@takes_arrays
 def vector_heat_flow(
     lb: LaplaceBeltrami,
     v: Float[Tensor, "N n C"] | Float[Tensor, "N n"],
@@ -83,7 +85,7 @@ def parallel_transport(
     >>> bool((moved.norm(dim=1) - 1).abs().max() < 1e-12)
     True
     """
-    index = source_points(lb, sources)
+    index = torch.from_numpy(source_points(lb, sources)).to(lb.device)
     given = vectors[None] if vectors.ndim == 1 else vectors
     if given.ndim not in (2, 3) or given.shape[:2] != (len(index), lb.points.shape[1]):
         raise InputError(
@@ -108,6 +110,7 @@ def parallel_transport(
     return moved if given.ndim == 3 else moved[..., 0]
 
 
+@takes_arrays
 def logarithmic_map(
     lb: LaplaceBeltrami, sources: int | Sequence[int] | Int[Tensor, " S"]
 ) -> Float[Tensor, "N d"] | Float[Tensor, "N d S"]:
@@ -123,11 +126,11 @@ def logarithmic_map(
     >>> bool((x.norm(dim=1) - geodesic_distance(lb, 0)).abs().max() < 1e-9)
     True
     """
-    index, dim = source_points(lb, sources), lb.dim
+    index, dim = torch.from_numpy(source_points(lb, sources)).to(lb.device), lb.dim
     places = torch.arange(len(index)).to(index)
     start = torch.zeros(lb.num_points, dim, len(index), dim, dtype=torch.float64).to(index.device)
     start[index, :, places] = torch.eye(dim, dtype=torch.float64).to(start)
-    distance = torch.stack([geodesic_distance(lb, int(i)) for i in index], 1).double()
+    distance = geodesic_distance(lb, index, each=True).double()
     frame = _directions(lb, start.flatten(2), _time(lb, distance)).unflatten(2, (-1, dim))
     slope = lb.gradient(torch.where(distance.isfinite(), distance, 0.0).square() / 2)
     local = normalize(torch.einsum("insd,ins->ids", frame, slope), dim=1, eps=TINY)

@@ -11,7 +11,7 @@ from jaxtyping import Float, Shaped
 from torch import Tensor
 
 from torchlb.errors import InputError
-from torchlb.linalg.checks import check_finite, check_tensor
+from torchlb.linalg.checks import check_finite, check_tensor, takes_arrays
 
 
 def check_num_pairs(k: object) -> int:
@@ -85,6 +85,7 @@ class Eigenbasis:
         errors = None if self.relative_errors is None else self.relative_errors[..., :k]
         return Eigenbasis(*cut, sizes=self.sizes, relative_errors=errors)
 
+    @takes_arrays
     def to_basis(
         self, f: Shaped[Tensor, "*B N C"] | Shaped[Tensor, " N"]
     ) -> Float[Tensor, "*S k C"] | Float[Tensor, "*S k"]:
@@ -97,6 +98,7 @@ class Eigenbasis:
         check_finite(f)
         return coefficients
 
+    @takes_arrays
     def from_basis(
         self, coefficients: Shaped[Tensor, "*S k C"] | Shaped[Tensor, "*S k"]
     ) -> Float[Tensor, "*B N C"] | Float[Tensor, " N"]:

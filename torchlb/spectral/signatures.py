@@ -15,7 +15,7 @@ from jaxtyping import Float, Int, Shaped
 from torch import Tensor
 
 from torchlb.errors import EigenbasisError, InputError
-from torchlb.linalg.checks import check_operator
+from torchlb.linalg.checks import check_operator, takes_arrays
 from torchlb.spectral.eigenbasis import Eigenbasis, Spectral
 
 
@@ -134,6 +134,7 @@ def wave_kernel_signature(
     return basis.synthesise(basis.eigenvectors**2, weights)
 
 
+@takes_arrays
 def spectral_wavelets(
     lb: Spectral,
     f: Shaped[Tensor, "N C"] | Shaped[Tensor, " N"],
