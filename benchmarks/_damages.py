@@ -22,6 +22,7 @@ from torchlb.surfaces import Ellipsoid, Hemisphere, Sphere, StarShaped, Surface,
 
 WHERE = ["alone", "band", "cluster"]
 Damage = Callable[[np.random.Generator, np.ndarray, np.ndarray, np.ndarray], Mesh]
+CloudDamage = Callable[[np.random.Generator, np.ndarray, np.ndarray], tuple[np.ndarray, Mesh]]
 Take = Callable[[str, int], bool]
 
 
@@ -248,10 +249,8 @@ GLOBAL: dict[str, Damage] = {
     "1e-6 times as large": small,
 }
 SCALES = {"1e6 times as large": 1e6, "1e-6 times as large": 1e-6}
-SAME = {"none", "needles", "caps", "edges of no length", "faces of no area", "faces twice"} | set(
-    SCALES
-)
-SAME |= {"faces wound against others"}
+SAME = {"none", "needles", "caps", "edges of no length", "faces of no area"}
+SAME |= {"faces wound against others", *SCALES}
 
 
 def meshes(seed: int, take: Take) -> Iterator[Case]:
@@ -281,60 +280,60 @@ def used(vertices: np.ndarray, faces: np.ndarray) -> Mesh:
     return vertices[kept], renumbered.reshape(-1, 3)
 
 
-# Clouds
+# Clouds: a damage returns points, and the mesh that stands for them
 
 
-def outliers(random, points, mesh):
+def alike(change: Callable[[np.ndarray], np.ndarray]) -> CloudDamage:
+    return lambda random, points, faces: (change(points), (change(points), faces))
+
+
+def outliers(random, points, faces):
     away = points[random.integers(len(points), size=8)]
-    return np.concatenate([points, away * random.uniform(1.2, 1.5, (8, 1))]), None
+    return np.concatenate([points, away * random.uniform(1.2, 1.5, (8, 1))]), (points, faces)
 
 
-def without_cluster(random, points, mesh):
-    kept = np.linalg.norm(points - points[random.integers(len(points))], axis=1).argsort()[
-        len(points) // 20 :
-    ]
+def without_cluster(random, points, faces):
+    middle = points[random.integers(len(points))]
+    kept = np.linalg.norm(points - middle, axis=1).argsort()[len(points) // 20 :]
     kept.sort()
-    faces = None if mesh is None else np.searchsorted(kept, mesh[1][np.isin(mesh[1], kept).all(1)])
-    return points[kept], None if faces is None else (points[kept], faces)
+    inside = faces[np.isin(faces, kept).all(1)]
+    return points[kept], used(points, inside)
 
 
-def noisy(share: float):
-    def moved(random, points, mesh):
+def noisy(share: float) -> CloudDamage:
+    def moved(random, points, faces):
         found = KDTree(points).query(points, 7)[0][:, 1:]
         points = points + share * np.median(found) * random.normal(size=points.shape)
-        return points, None if mesh is None else (points, mesh[1])
+        return points, (points, faces)
 
     return moved
 
 
-def doubled(random, points, mesh):
+def doubled(random, points, faces):
     again = points[random.permutation(len(points))[: len(points) // 50]]
-    return np.concatenate([points, again + 1e-6 * random.normal(size=again.shape)]), None
+    again = again + 1e-6 * random.normal(size=again.shape)
+    return np.concatenate([points, again]), (points, faces)
 
 
-def unmoved(change: Callable[[np.ndarray], np.ndarray]):
-    return lambda random, points, mesh: (change(points), None)
-
-
-CLOUDS = {
-    "none": unmoved(lambda points: points),
+CLOUDS: dict[str, CloudDamage] = {
+    "none": alike(lambda points: points),
     "outliers": outliers,
     "a hole": without_cluster,
     "noise of 1 %": noisy(0.01),
     "noise of 5 %": noisy(0.05),
     "noise of 15 %": noisy(0.15),
     "near duplicates": doubled,
-    "float32": unmoved(lambda points: points.astype(np.float32).astype(float)),
-    "1e6 times as large": unmoved(lambda points: 1e6 * points),
-    "1e-6 times as large": unmoved(lambda points: 1e-6 * points),
+    "float32": alike(lambda points: points.astype(np.float32).astype(float)),
+    "1e6 times as large": alike(lambda points: 1e6 * points),
+    "1e-6 times as large": alike(lambda points: 1e-6 * points),
 }
 
 
-def uneven(surface: Surface, count: int) -> torch.Tensor:
+def uneven(surface: Surface, count: int, seed: int) -> torch.Tensor:
     """Random points, at one end fifty times as many in an area as at the other."""
-    points = surface.random_points(12 * count, seed=1)
+    points = surface.random_points(12 * count, seed)
     along = points[:, 0] - points[:, 0].min()
-    chance = torch.rand(len(points), generator=torch.Generator().manual_seed(0))
+    chance = torch.rand(len(points), generator=torch.Generator().manual_seed(seed))
     return points[chance < 50.0 ** -(along / along.max())][:count]
 
 
@@ -353,10 +352,8 @@ def clouds(seed: int, take: Take) -> Iterator[Case]:
             if (sample == "1:50" and not mild) or not take(title, place + 2 * turn):
                 continue
             known = values_of(surface) if known is None else known
-            points = samples[sample](2000)
-            mesh = None
-            if kind.startswith(("noise", "a hole")):
-                mesh = points.numpy(), surface.triangulate(points).numpy()
+            points = samples[sample](2000, seed=seed)
             random = np.random.default_rng([seed, place, turn])
-            moved, own = CLOUDS[kind](random, points.numpy(), mesh)
+            faces = surface.triangulate(points).numpy()
+            moved, own = CLOUDS[kind](random, points.numpy(), faces)
             yield Case(title, kind, moved, None, known / SCALES.get(kind, 1) ** 2, own)

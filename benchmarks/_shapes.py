@@ -141,7 +141,6 @@ def cortices() -> Iterator[tuple[str, Mesh]]:
 
 def whole() -> Iterator[tuple[str, Mesh, Callable[[], np.ndarray]]]:
     """(name, mesh, eigenvalues): exact ones, or those of a fine mesh of a smooth surface, or of the polyhedron."""
-    flat = np.pi**2 * np.sort(np.add.outer(np.arange(9) ** 2, np.arange(9) ** 2).ravel())[:PAIRS]
 
     def known(surface: Surface) -> Callable[[], np.ndarray]:
         return lambda: values_of(surface)
@@ -160,7 +159,7 @@ def whole() -> Iterator[tuple[str, Mesh, Callable[[], np.ndarray]]]:
         yield name, of_surface(surface, count), known(surface)
     for name, surface in ("sphere, random", Sphere()), ("ellipsoid, random", slim):
         yield name, of_surface(surface, 2000, even=False), known(surface)
-    yield "square, random", square(), lambda: flat
+    yield "square, random", (flat := square()), refined(flat)
     yield "body with limbs", limbs(3), lambda: eigenvalues(*limbs(5))
     yield "cube", (cube := subdivided(trimesh.creation.box(), 0.1)), refined(cube)
     cylinder = trimesh.creation.cylinder(0.5, 1.5, sections=32)
