@@ -256,7 +256,7 @@ SAME |= {"faces wound against others", *SCALES}
 def meshes(seed: int, take: Take) -> Iterator[Case]:
     """Every whole shape with every damage, and what packages ship, of which `take(name, number)` are wanted.
 
-    Numbers run across shapes and damages, so that every fifth of them has some of every shape and of every damage.
+    Numbers run across shapes and damages, so that every sixth of them has some of every shape and of every damage.
     """
     for place, (name, mesh, values) in enumerate(whole()):
         known = None
