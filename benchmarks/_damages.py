@@ -256,7 +256,7 @@ SAME |= {"faces wound against others", *SCALES}
 def meshes(seed: int, take: Take) -> Iterator[Case]:
     """Every whole shape with every damage, and what packages ship, of which `take(name, number)` are wanted.
 
-    Numbers run across shapes and damages, so that every sixth of them has some of every shape and of every damage.
+    Numbers run across shapes and damages, so that every fifth of them has some of every shape and of every damage.
     """
     for place, (name, mesh, values) in enumerate(whole()):
         known = None
@@ -288,8 +288,10 @@ def alike(change: Callable[[np.ndarray], np.ndarray]) -> CloudDamage:
 
 
 def outliers(random, points, faces):
-    away = points[random.integers(len(points), size=8)]
-    return np.concatenate([points, away * random.uniform(1.2, 1.5, (8, 1))]), (points, faces)
+    """Eight points off the surface."""
+    away = points[random.integers(len(points), size=8)] * random.uniform(1.2, 1.5, (8, 1))
+    away[:, 2] += np.where(away[:, 2] < 0, -0.3, 0.3)
+    return np.concatenate([points, away]), (points, faces)
 
 
 def without_cluster(random, points, faces):
