@@ -43,6 +43,7 @@ bench: .venv/installed-bench ## run the benchmarks, with SHAPES="a.npz b.npz" th
 		$(BIN)/python benchmarks/$$file.py || exit 1; done
 	@for file in $(if $(SHAPES),clouds conductivity limit_shapes) media time_to_accuracy; do \
 		$(BIN)/python benchmarks/$$file.py $(SHAPES) || exit 1; done
+	@$(BIN)/python benchmarks/reliability.py
 
 clean: ## remove .venv, caches and build products
 	rm -rf .venv build dist site .pytest_cache .ruff_cache

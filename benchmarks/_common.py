@@ -21,6 +21,8 @@ PACKAGES = {  # peers, and the names they are imported by
     "robust_laplacian": "robust_laplacian",
     "pcdiff": "pcdiff",
     "pycompadre": "pycompadre",
+    "lapy": "lapy",
+    "potpourri3d": "potpourri3d",
 }
 
 

@@ -71,6 +71,32 @@ def test_long_triangles_along_the_boundary_bind_nothing(mesh, median, worst):
                 torch.testing.assert_close(stiffness, expected, rtol=1e-9, atol=1e-9)
 
 
+def doubled(points, faces):
+    """The mesh with copies of some vertices towards one side, tied by edges of no length and triangles of no area."""
+    busy, added = set(), []
+    for row in (points[faces].mean(1)[:, 0] < 0.3).nonzero()[:, 0].tolist():
+        a, b, _ = faces[row].tolist()
+        pair = ((faces == a).any(1) & (faces == b).any(1)).nonzero()[:, 0].tolist()
+        if len(pair) < 2 or busy & set(pair):
+            continue
+        busy |= set(pair)
+        for face in pair:
+            added.append(torch.where(faces[face] == b, len(points), faces[face]))
+            faces[face] = torch.where(faces[face] == a, len(points), faces[face])
+        points = torch.cat([points, points[a : a + 1]])
+    return points, torch.cat([faces, torch.stack(added)])
+
+
+@pytest.mark.filterwarnings("ignore:vertices. .* share a place")
+def test_long_triangles_bind_nothing_behind_triangles_without_area():
+    """Random points of a square, a quarter of them twice: λ_1 to λ_19 are those of the mesh without copies."""
+    points = np.random.default_rng(0).random((1000, 2))
+    vertices, faces = in_the_plane(points, Delaunay(points).simplices)
+    exact = LaplaceBeltrami.from_mesh(vertices, faces).eigenbasis(20).eigenvalues[1:]
+    found = LaplaceBeltrami.from_mesh(*doubled(vertices, faces)).eigenbasis(20).eigenvalues[1:]
+    torch.testing.assert_close(found, exact, rtol=1e-2, atol=0.0)
+
+
 def test_a_few_slivers_along_the_boundary_cost_nothing():
     """λ = j'² of the unit disk, with vertices hardly inside of four boundary edges: median below 1e-3."""
     vertices, _ = UnitDisk().mesh(600)

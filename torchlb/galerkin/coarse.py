@@ -51,11 +51,14 @@ def coarse_triangles(
 def lying_triangles(
     points: Float[Tensor, "N n"], nodes: Nodes, free: Bool[Tensor, " E"]
 ) -> Bool[Tensor, " F"]:
-    """Triangles with an obtuse angle opposite a free boundary edge, or opposite an edge of another such triangle."""
+    """Triangles with an obtuse angle opposite a free boundary edge, or opposite an edge of another such triangle.
+
+    At an edge without length every angle counts as obtuse, so that triangles without area hand on what they meet.
+    """
     corners = at(points, nodes.cells)
     apex = corners.roll(-2, 1)  # across from the sides of `EDGES`
     one, other = corners - apex, corners.roll(-1, 1) - apex
-    obtuse = (one * other).sum(2) < -CREASE * one.norm(dim=2) * other.norm(dim=2)
+    obtuse = (one * other).sum(2) <= -CREASE * one.norm(dim=2) * other.norm(dim=2)
     met, lying = free.clone(), torch.zeros(len(nodes.cells), dtype=torch.bool)
     while True:
         new = (met[nodes.edge] & obtuse).any(1) & ~lying
