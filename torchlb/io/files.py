@@ -71,7 +71,7 @@ def read_shape(path: str | Path) -> Shape:
 
 
 def read_point_data(path: str | Path) -> dict[str, Tensor]:
-    """Data of the points in a file by name, (N,) or (N, C), in the type and order of the file.
+    """Data of the points in the file `path` by name, (N,) or (N, C), in the type and order of the file.
 
     Arrays of a .npz besides the shape; those of .vtk and .vtu, through meshio; of .gii, and FreeSurfer's maps
     (lh.thickness, lh.curv, …), through nibabel. Raises a ValueError for a file without data, else as `read_shape`.
@@ -117,12 +117,12 @@ def _read(path: str | Path) -> libraries.Contents:
 def write_shape(
     path: str | Path, points: ArrayLike, cells: ArrayLike | None = None, **point_data: ArrayLike
 ) -> None:
-    """Write a mesh or cloud, with data of its points, in the format that the ending names.
+    """Write a mesh or cloud, with data of its points, in the format that the ending of `path` names.
 
     .npz holds every shape; .vtk and .vtu, through meshio, those of R² and R³; .gii, through nibabel, triangles, in
     single precision, and .func.gii and .shape.gii the data alone; .ply, .obj, .off, .stl and .glb, through trimesh,
     triangles and points of R³ without data. `points` are (N, n), `cells` (F, 3) triangles, (F, 2) segments, (F, 4)
-    tetrahedra or None, and data (N,) or (N, C), by name: ``write_shape("a.vtu", lb.points, lb.faces, thickness=f)``.
+    tetrahedra or None, `point_data` (N,) or (N, C), by name: ``write_shape("a.vtu", points, faces, thickness=f)``.
 
     Raises ValueError for data of another length, a format that does not hold them, and where its library is missing.
     """

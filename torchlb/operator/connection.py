@@ -94,7 +94,7 @@ class Connection(PairMethods):
     def components(
         self, v: Float[Tensor, "N n C"] | Float[Tensor, "N n"]
     ) -> Float[Tensor, "rows C"] | Float[Tensor, " rows"]:
-        """Components in the frames, (N d, C) or (N d,), of the tangential part of a field of space vectors.
+        """Components in the frames, (N d, C) or (N d,), of the tangential part of the space vectors `v`.
 
         Raises InputError for another shape.
         """
@@ -109,7 +109,7 @@ class Connection(PairMethods):
     def vectors(
         self, c: Float[Tensor, "rows C"] | Float[Tensor, " rows"]
     ) -> Float[Tensor, "N n C"] | Float[Tensor, "N n"]:
-        """The tangent field of space vectors, (N, n, C) or (N, n), with components (N d, C) or (N d,)."""
+        """The tangent field of space vectors, (N, n, C) or (N, n), with components `c`, (N d, C) or (N d,)."""
         return torch.einsum("ind,id...->in...", self.frames.to(c), c.unflatten(0, (-1, self.dim)))
 
     @classmethod

@@ -138,15 +138,16 @@ def logarithmic_map(
     return (found if torch.as_tensor(sources).ndim else found[..., 0]).to(lb.points)
 
 
-def _time(lb: LaplaceBeltrami, distance: Tensor) -> float:
-    """Time of the shorter step, ℓ², by the spacing and the largest distance from a source."""
-    spacing = float(lb.mass.detach().double().mean()) ** (1 / lb.dim)
-    longest = float(distance[distance.isfinite()].max())
-    return max(SHORT * spacing**2, (longest / (1 - LOW) / FARTHEST) ** 2)
+def _time(lb: LaplaceBeltrami, distance: Tensor) -> Float[Tensor, ""]:
+    """Time of the shorter step, ℓ², by the spacing, or by the largest distance from a source where that is far."""
+    short = SHORT * lb.mass.double().mean() ** (2 / lb.dim)
+    longest = distance[distance.isfinite()].max().double()
+    far = (longest / (1 - LOW) / FARTHEST).square()
+    return far if bool(far > short) else short
 
 
 def _directions(
-    lb: LaplaceBeltrami, start: Float[Tensor, "N d C"], t: float
+    lb: LaplaceBeltrami, start: Float[Tensor, "N d C"], t: Float[Tensor, ""]
 ) -> Float[Tensor, "N n C"]:
     """Unit space vectors of the transport of each column from the points where it is not zero.
 
@@ -162,6 +163,6 @@ def _directions(
     return normalize(2 * one - two, dim=1, eps=TINY)
 
 
-def _step(fields: Any, b: Float[Tensor, "rows C"], t: float) -> Float[Tensor, "rows C"]:
+def _step(fields: Any, b: Float[Tensor, "rows C"], t: Float[Tensor, ""]) -> Float[Tensor, "rows C"]:
     """(M + tK)⁻¹b, as exact as rounding allows, since values far away are tiny."""
-    return solved(fields, b, b.new_full((b.shape[1],), t), torch.zeros_like(b), None, ROUNDING)
+    return solved(fields, b, t.to(b).expand(b.shape[1]), torch.zeros_like(b), None, ROUNDING)

@@ -1,0 +1,156 @@
+"""Transport of tangent vectors, the logarithmic map, curl, the Helmholtz–Hodge decomposition."""
+
+import pytest
+import torch
+
+from torchlb import (
+    DerivativeError,
+    InputError,
+    LaplaceBeltrami,
+    hodge_decomposition,
+    logarithmic_map,
+    parallel_transport,
+)
+from torchlb.surfaces import CliffordTorus, Hemisphere, Sphere, Torus
+
+
+@pytest.fixture(scope="module")
+def sphere():
+    return LaplaceBeltrami.from_mesh(*Sphere().mesh(1000))
+
+
+def along_great_circles(points, source, vector):
+    """A tangent vector of the unit sphere at `source`, turned with the great circles from there; and the distances."""
+    cosine = points @ source
+    away = torch.nn.functional.normalize(points - cosine[:, None] * source, dim=1)
+    angle = cosine.clamp(-1, 1).acos()
+    there = angle.cos()[:, None] * away - angle.sin()[:, None] * source
+    along = away @ vector
+    return vector - along[:, None] * away + along[:, None] * there, angle, away
+
+
+@pytest.mark.parametrize("build", [LaplaceBeltrami.from_mesh, LaplaceBeltrami.from_points])
+def test_transport_and_logarithm_on_the_sphere(build):
+    vertices, faces = Sphere().mesh(1000)
+    lb = build(vertices, faces) if build == LaplaceBeltrami.from_mesh else build(vertices)
+    source = torch.nn.functional.normalize(lb.points[3], dim=0)
+    tangent = lb.frames[3] - torch.outer(source, source @ lb.frames[3])
+    exact, angle, away = along_great_circles(lb.points, source, tangent[:, 0])
+    near = (angle < 2.5) & (angle > 0)
+    moved = parallel_transport(lb, 3, 2 * tangent[:, 0])
+    assert (moved / 2 - exact).norm(dim=1)[near].mean() < 1e-3
+    assert (moved.norm(dim=1) - 2).abs().max() < 1e-3
+    coordinates = logarithmic_map(lb, 3)
+    expected = angle[:, None] * (away @ tangent)
+    assert (coordinates - expected).norm(dim=1)[near].mean() < 0.02
+    both = logarithmic_map(lb, [3, 7])
+    torch.testing.assert_close(both[..., 0], coordinates, rtol=0, atol=1e-6)
+
+
+def test_the_nearest_source_decides(sphere):
+    """Lengths are between those of the sources, near one its own; channels are fields of their own."""
+    vectors = torch.stack([3 * sphere.frames[0, :, 0], sphere.frames[1, :, 1]])
+    moved = parallel_transport(sphere, [0, 1], vectors)
+    torch.testing.assert_close(
+        moved[:2].norm(dim=1), torch.tensor([3.0, 1.0]).double(), rtol=0.1, atol=0
+    )
+    assert moved.norm(dim=1).max() < 3 + 1e-9
+    assert moved.norm(dim=1).min() > 1 - 1e-9
+    several = parallel_transport(sphere, [0, 1], torch.stack([vectors, vectors.flip(1)], 2))
+    torch.testing.assert_close(several[..., 0], moved)
+
+
+def test_transport_has_the_derivative_of_differences():
+    torch.manual_seed(0)
+    lb = LaplaceBeltrami.from_mesh(*Hemisphere().mesh(100))
+    lb = lb.at(lb.points + 0.002 * torch.randn_like(lb.points))
+    way, weight = torch.randn_like(lb.points), torch.randn_like(lb.points)
+    vector, other = torch.randn(2, 3, dtype=torch.float64)
+
+    def value(points, v):
+        return (weight * parallel_transport(lb.at(points), [5], v[None])).sum()
+
+    x, v = lb.points.clone().requires_grad_(), vector.clone().requires_grad_()
+    one, two = torch.autograd.grad(value(x, v), (x, v))
+    ends = [float(value(lb.points + s * 1e-6 * way, vector + s * 1e-6 * other)) for s in (1, -1)]
+    found = float((one * way).sum() + (two * other).sum())
+    assert found == pytest.approx((ends[0] - ends[1]) / 2e-6, rel=1e-3)
+
+
+def test_the_curl_is_that_of_stokes(sphere):
+    """Of ν × ∇f it is Δf, of gradients 0; a normal part does not count."""
+    f = sphere.points[:, 0] * sphere.points[:, 1]
+    slope = sphere.gradient(f)
+    assert sphere.curl(slope).abs().max() < 1e-2
+    turned = torch.linalg.cross(sphere.normals, slope)
+    both = turned + sphere.points[:, :1] * sphere.normals
+    for v in (turned, both):
+        assert (sphere.curl(v) + 6 * f).abs().max() < 2e-2
+    columns = torch.stack([slope, turned], 2)
+    torch.testing.assert_close(sphere.curl(columns)[:, 1], sphere.curl(turned))
+    with pytest.raises(InputError, match="surface in R³"):
+        LaplaceBeltrami.from_mesh(*CliffordTorus().mesh(200)).curl(torch.zeros(200, 4))
+
+
+def test_hodge_parts_of_a_sphere_are_a_gradient_and_a_rotated_one(sphere):
+    x, y, z = sphere.points.unbind(1)
+    f, g = x * y + z, x * z
+    turned = torch.linalg.cross(sphere.normals, sphere.gradient(g))
+    parts = hodge_decomposition(sphere, sphere.gradient(f) + turned)
+    assert (parts.potential - f).abs().max() < 1e-3
+    assert (parts.stream - g).abs().max() < 1e-3
+    assert (parts.gradient - sphere.gradient(f)).abs().max() < 5e-3
+    assert (parts.rotated - turned).abs().max() < 5e-3
+    assert parts.harmonic.abs().max() < 5e-3
+
+
+def test_hodge_parts_add_up_and_are_orthogonal():
+    lb = LaplaceBeltrami.from_mesh(*Torus().mesh(2000))
+    x, y, z = lb.points.unbind(1)
+    field = torch.stack([y * z, x**2, x.sin()], 1) + torch.stack([-y, x, 0 * x], 1)
+    parts = hodge_decomposition(lb, field)
+    three = [parts.gradient, parts.rotated, parts.harmonic]
+    tangent = lb.connection.vectors(lb.connection.components(field))
+    torch.testing.assert_close(sum(three), tangent)
+    size = lb.inner(tangent, tangent).sum()
+    for one, other in ((0, 1), (0, 2), (1, 2)):
+        assert abs(lb.inner(three[one], three[other]).sum()) < 2e-6 * size
+    harmonic = lb.connection.components(parts.harmonic)
+    basis = lb.connection.hodge.eigenbasis(2)
+    inside = basis.from_basis(basis.to_basis(harmonic))
+    assert (inside - harmonic).norm() < 1e-2 * harmonic.norm()
+
+
+def test_hodge_parts_with_a_boundary():
+    """On a cap there is no harmonic field that is tangent to the boundary; w is zero there."""
+    lb = LaplaceBeltrami.from_mesh(*Hemisphere().mesh(2000))
+    x, y, z = lb.points.unbind(1)
+    turned = torch.linalg.cross(lb.normals, lb.gradient(z * (1 + x)))
+    parts = hodge_decomposition(lb, lb.gradient(x * y + z**2) + turned)
+    assert parts.stream[lb.boundary].abs().max() == 0
+    assert (parts.stream - z * (1 + x)).abs().max() < 5e-3
+    size = [float(lb.inner(v, v).sum()) for v in (parts.harmonic, parts.gradient)]
+    assert size[0] < 1e-3 * size[1]
+
+
+def test_hodge_parts_are_differentiable_in_the_field(sphere):
+    v = torch.randn_like(sphere.points).requires_grad_()
+    weight = torch.randn_like(sphere.points)
+    (g,) = torch.autograd.grad((weight * hodge_decomposition(sphere, v).rotated).sum(), v)
+    linear = (weight * hodge_decomposition(sphere, v.detach()).rotated).sum()
+    assert float((g * v).sum()) == pytest.approx(float(linear), rel=1e-6)
+    moved = sphere.at(sphere.points.clone().requires_grad_())
+    with pytest.raises(DerivativeError):
+        hodge_decomposition(moved, v).gradient.sum().backward()
+
+
+def test_bad_input_is_refused(sphere):
+    with pytest.raises(InputError, match="sources"):
+        parallel_transport(sphere, 1000, sphere.points[0])
+    with pytest.raises(InputError, match="vectors"):
+        parallel_transport(sphere, [0, 1], sphere.points[:3])
+    with pytest.raises(InputError, match="medium"):
+        hodge_decomposition(sphere.with_medium(density=2.0), sphere.points)
+    batch = LaplaceBeltrami.batch([sphere, sphere])
+    with pytest.raises(InputError, match="unbatch"):
+        hodge_decomposition(batch, batch.points)
