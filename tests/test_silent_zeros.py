@@ -22,6 +22,23 @@ OTHERS = {
     "v": torch.stack([X, X, X], 1),
     "name": "mass",
 }
+
+
+class OnFields(torch.nn.Module):
+    """A layer on tangent fields, of the gradients of x."""
+
+    def __init__(self, layer):
+        super().__init__()
+        self.layer = layer
+
+    def forward(self, x, lb):
+        u = lb.local_gradient(x)
+        if isinstance(self.layer, torchlb.TangentDiffusion):
+            return lb.connection.vectors(self.layer(u, lb).flatten(0, 1))
+        y, u = self.layer(x, u, lb)
+        return torch.cat([y, lb.connection.vectors(u.flatten(0, 1)).flatten(1)], 1)
+
+
 LAYERS = {
     "Diffusion": lambda: torchlb.Diffusion(2, k=8, method="spectral"),
     "DiffusionNet": lambda: torchlb.DiffusionNet(2, 3, width=4, num_blocks=1, k=8),
@@ -30,6 +47,8 @@ LAYERS = {
     "ImplicitDiffusion": lambda: torchlb.ImplicitDiffusion(2),
     "PoissonBlock": lambda: torchlb.PoissonBlock(2),
     "PoissonFeatures": lambda: torchlb.PoissonFeatures(2),
+    "TangentBlock": lambda: OnFields(torchlb.TangentBlock(2, k=8)),
+    "TangentDiffusion": lambda: OnFields(torchlb.TangentDiffusion(2)),
     "SpectralConv": lambda: torchlb.SpectralConv(2, 2, k=8),
 }
 OF_DATA = {"save_operator", "to_scipy", "unbatch", "check_points", "at", "with_medium"}
@@ -130,7 +149,7 @@ def test_every_layer_is_called():
     """A new layer is missing in LAYERS, or a new parameter in OTHERS, until it is added."""
     layers = [n for n in torchlb.__all__ if inspect.isclass(getattr(torchlb, n))]
     layers = [n for n in layers if issubclass(getattr(torchlb, n), torch.nn.Module)]
-    assert set(layers) - {"LaplaceBeltrami"} == set(LAYERS)
+    assert set(layers) - {"LaplaceBeltrami", "Connection"} == set(LAYERS)
     assert len(calls()) > 40
 
 

@@ -23,8 +23,8 @@ from torchlb.operator.storage import OperatorStorage
 Given = Mapping[str, Tensor | float | None]
 
 
-def elements_of(lb: Any) -> Forms:
-    """The elements of the weak pair of one shape, in the user's numbering, cached with the operator."""
+def elements_of(lb: Any) -> Any:
+    """The elements of the weak pair of one shape or its fields, in the user's numbering, cached with the operator."""
     if lb.cache.elements is None:
         points = lb.points.detach().cpu().double()
         linear = lb.source == "cotangent"
