@@ -257,8 +257,6 @@ def test_what_does_not_fit_is_refused(star):
         layer(u[..., :2], star)
     with pytest.raises(InputError, match="expected features of the type of the layer's parameters"):
         block(x, u.float(), star)
-    with pytest.raises(InputError, match="method: expected one of"):
-        TangentBlock(3, method="deflated")
     circle = LaplaceBeltrami.from_points(Circle().points(40))
     with pytest.raises(InputError, match="rotations need a surface, got dim=1"):
         block(*data(circle), circle)
