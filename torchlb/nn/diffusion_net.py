@@ -97,8 +97,8 @@ class DiffusionNet(nn.Module):
     block
         "diffusion", "implicit" or "poisson".
     outputs_at
-        "vertices", "edges", "faces" (means over the corners) or "global_mean" (over the surface, by mass); "tangent" is
-        for tangent fields at the vertices, with tangent=True.
+        "vertices", "edges", "faces" (means over the corners) or "global_mean" (over the surface, by mass); "tangent"
+        for tangent fields as space vectors at the vertices, with tangent=True.
     last_activation
         Applied to the output, such as ``lambda y: y.log_softmax(-1)``.
     hidden, dropout, gradient_features, rotations
@@ -106,8 +106,8 @@ class DiffusionNet(nn.Module):
     method, k
         Arguments of "diffusion" blocks.
     tangent
-        Whether blocks are `TangentBlock`, of which fields start as gradients of the first linear map: "diffusion"
-        with method="spectral", or "implicit".
+        Whether blocks are `TangentBlock`, whose fields start as gradients of the first linear map: "diffusion" blocks
+        with method="spectral", or "implicit" ones.
 
     Raises
     ------
@@ -158,10 +158,9 @@ class DiffusionNet(nn.Module):
             shared["gradient_features"] = gradient_features
         if block != "poisson":
             shared |= {"method": "implicit" if block == "implicit" else method, "k": k}
-        kind = PoissonBlock if block == "poisson" else DiffusionNetBlock
-        self.blocks = nn.ModuleList(
-            (TangentBlock if tangent else kind)(width, **shared) for _ in range(num_blocks)
-        )
+        plain = PoissonBlock if block == "poisson" else DiffusionNetBlock
+        kind = TangentBlock if tangent else plain
+        self.blocks = nn.ModuleList(kind(width, **shared) for _ in range(num_blocks))
         self.tangent, self.last_lin = tangent, nn.Linear(width, out_channels)
         if outputs_at == "tangent":
             self.last_lin = TangentMap(width, out_channels, rotations=rotations)
@@ -173,9 +172,7 @@ class DiffusionNet(nn.Module):
         faces: Int[Tensor, "F corners"] | None = None,
         edges: Int[Tensor, "E ends"] | None = None,
     ) -> Tensor:
-        """Outputs (…, N, out_channels), or (…, F, ·), (…, E, ·), (…, ·), according to `outputs_at`.
-
-        Tangent fields are space vectors, (…, N, n, out_channels).
+        """Outputs (…, N, out_channels), or (…, F, ·), (…, E, ·), (…, ·), (…, N, n, ·), according to `outputs_at`.
 
         Parameters
         ----------
@@ -190,10 +187,7 @@ class DiffusionNet(nn.Module):
         y = self.first_lin(x)
         u = linear(lb.local_gradient(x).to(x), self.first_lin.weight) if self.tangent else None
         for block in self.blocks:
-            if u is None:
-                y = block(y, lb)
-            else:
-                y, u = block(y, u, lb)
+            y, u = (block(y, lb), None) if u is None else block(y, u, lb)
         if u is not None and isinstance(self.last_lin, TangentMap):
             y = lb._turned("ind,...idc->...inc", self.last_lin.mapped(u))
         else:

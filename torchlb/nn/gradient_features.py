@@ -49,10 +49,8 @@ class TangentMap(nn.Module):
         """The image of tangent fields, given in the frames."""
         if not self.rotations:
             return self.A(v)
-        if v.shape[-2] != 2:
-            raise InputError(
-                f"rotations need a surface, got dim={v.shape[-2]}; use rotations=False"
-            )
+        if (dim := v.shape[-2]) != 2:
+            raise InputError(f"rotations need a surface, got dim={dim}; use rotations=False")
         # the complex z ↦ Az as a real map of real and imaginary parts, concatenated
         upper = torch.cat([self.A_re.weight, -self.A_im.weight], dim=1)
         lower = torch.cat([self.A_im.weight, self.A_re.weight], dim=1)

@@ -68,8 +68,10 @@ class ImplicitDiffusion(LearnedTimes):
         return f"{self.channels}, tolerance={self.tolerance}"
 
 
-def diffusion_by(method: Method | Literal["implicit"], channels: int, k: int) -> LearnedTimes:
+def diffusion_by(
+    method: Method | Literal["implicit"], channels: int, k: int, init_time: float = 0.01
+) -> LearnedTimes:
     """`ImplicitDiffusion`, or `Diffusion` by another method with k eigenpairs."""
     if method == "implicit":
-        return ImplicitDiffusion(channels)
-    return Diffusion(channels, method=method, k=k)
+        return ImplicitDiffusion(channels, init_time=init_time)
+    return Diffusion(channels, method=method, k=k, init_time=init_time)

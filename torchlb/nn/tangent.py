@@ -22,7 +22,7 @@ from torchlb.nn.pointwise import mlp
 from torchlb.operator.laplace_beltrami import LaplaceBeltrami
 from torchlb.pde.checks import check_choice
 
-TangentMethod = Literal["implicit", "spectral"]
+Method = Literal["implicit", "spectral"]
 Functions = Float[Tensor, "*B N C"]
 Fields = Float[Tensor, "*B N d C"]
 
@@ -32,12 +32,10 @@ class TangentDiffusion(nn.Module):
 
     Parameters
     ----------
-    channels
-        C.
-    method
+    channels, init_time
+        C, and the initial time, ℓ².
+    method, k
         "implicit" is one implicit step, as `ImplicitDiffusion`; "spectral" is `Diffusion` by the first k eigenfields.
-    k
-        Number of eigenfields.
 
     Examples
     --------
@@ -48,10 +46,12 @@ class TangentDiffusion(nn.Module):
     True
     """
 
-    def __init__(self, channels: int, *, method: TangentMethod = "implicit", k: int = 128) -> None:
+    def __init__(
+        self, channels: int, *, method: Method = "implicit", k: int = 128, init_time: float = 0.01
+    ) -> None:
         super().__init__()
-        check_choice("method", method, TangentMethod)
-        self.diffusion = diffusion_by(method, channels, k)
+        check_choice("method", method, Method)
+        self.diffusion = diffusion_by(method, channels, k, init_time)
 
     def forward(self, u: Fields, lb: LaplaceBeltrami) -> Fields:
         """The diffused fields, of the shape and type of u; InputError for another shape or type."""
@@ -68,17 +68,15 @@ class TangentDiffusion(nn.Module):
 class TangentBlock(nn.Module):
     """Functions x and tangent fields u diffuse to x' and u', act on each other, and are added to.
 
-    With m = A(u, u', ∇x') by a `TangentMap` a pointwise network of x, x', tanh⟨m, ∇x'⟩, tanh⟨m, u'⟩, tanh div u' and
-    tanh curl u' gives what is added to x, and gates g; (1 + g)m is added to u.
+    With m = A(u, u', ∇x') by a `TangentMap` a pointwise network of x, x', tanh⟨m, ∇x'⟩, tanh⟨m, u'⟩, tanh div u' and,
+    with rotations, tanh curl u' gives what is added to x, and gates g; (1 + g)m is added to u.
 
     Parameters
     ----------
     width
         Channels C of functions and of fields.
-    hidden, dropout
-        Of the pointwise network, see `DiffusionNetBlock`.
-    rotations
-        Whether A is complex, and the curl is there: see `TangentMap`. False takes any dimension.
+    hidden, dropout, rotations
+        As for `DiffusionNetBlock`; rotations of the fields by a complex A.
     method, k
         Of the diffusion of both: "spectral" by k eigenpairs of each, or "implicit".
 
@@ -98,7 +96,7 @@ class TangentBlock(nn.Module):
         hidden: Sequence[int] | None = None,
         dropout: bool = True,
         rotations: bool = True,
-        method: TangentMethod = "spectral",
+        method: Method = "spectral",
         k: int = 128,
     ) -> None:
         super().__init__()
