@@ -135,6 +135,7 @@ def main() -> None:
     parser.add_argument("--k", type=int, default=64)
     parser.add_argument("--width", type=int, default=32)
     parser.add_argument("--blocks", type=int, default=3)
+    parser.add_argument("--kinds", nargs="+", choices=KINDS, default=list(KINDS))
     options = parser.parse_args()
     if options.quick:
         options.points, options.epochs, options.k, options.width, options.seeds = 200, 2, 16, 8, 2
@@ -151,7 +152,7 @@ def main() -> None:
     )
     columns = ["network", "test", "training", "test, seed by seed", "parameters", "s an epoch"]
     print("| " + " | ".join(columns) + " |\n|:--|" + "--:|" * (len(columns) - 1), flush=True)
-    for kind in KINDS:
+    for kind in options.kinds:
         runs = [run(kind, shapes, seed, options) for seed in range(options.seeds)]
         cells = [kind]
         for name in ("test", "train"):
