@@ -54,7 +54,7 @@ class TangentDiffusion(nn.Module):
         self.diffusion = diffusion_by(method, channels, k, init_time)
 
     def forward(self, u: Fields, lb: LaplaceBeltrami) -> Fields:
-        """The diffused fields, of the shape and type of u; InputError for another shape or type."""
+        """Diffuse fields u on the shape or batch of `lb`; shape and type stay, and InputError is raised for others."""
         check_operator(lb)
         check_tensor(u, "u")
         if u.ndim not in (3, 4) or u.shape[-3:-1] != (lb.num_points, lb.dim):
@@ -107,7 +107,7 @@ class TangentBlock(nn.Module):
         self.mlp = mlp([(6 if rotations else 5) * width, *hidden, 2 * width], dropout)
 
     def forward(self, x: Functions, u: Fields, lb: LaplaceBeltrami) -> tuple[Functions, Fields]:
-        """Functions and fields of the shapes of x and u: (N, C) and (N, d, C), or (B, N, C) and (B, N, d, C).
+        """Functions x (…, N, C) and fields u (…, N, d, C) after the block, on the shape or batch of `lb`.
 
         Raises InputError for another shape or type, and for rotations where d is not 2.
         """
