@@ -27,6 +27,8 @@ COMMUNICATION = {
     "deflated": {"method": "deflated"},
     "implicit": {"block": "implicit"},
     "Poisson": {"block": "poisson"},
+    "tangent": {"tangent": True},
+    "tangent, implicit": {"tangent": True, "block": "implicit"},
 }
 """How the points of a network hear of each other."""
 

@@ -54,6 +54,7 @@ LAYERS = {
     "original net": lambda: DiffusionNet(CHANNELS, 5, method="spectral", **SMALL),
     "implicit net": lambda: DiffusionNet(CHANNELS, 5, block="implicit", **SMALL),
     "poisson net": lambda: DiffusionNet(CHANNELS, 5, block="poisson", **SMALL),
+    "tangent net": lambda: DiffusionNet(CHANNELS, 5, tangent=True, **SMALL),
     "classifier": lambda: DiffusionNet(CHANNELS, 5, outputs_at="global_mean", **SMALL),
 }
 every_layer = pytest.mark.parametrize("name", LAYERS)

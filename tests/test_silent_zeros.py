@@ -25,6 +25,23 @@ OTHERS = {
     "v": torch.stack([X, X, X], 1),
     "name": "mass",
 }
+
+
+class OnFields(torch.nn.Module):
+    """A layer on tangent fields, of the gradients of x."""
+
+    def __init__(self, layer):
+        super().__init__()
+        self.layer = layer
+
+    def forward(self, x, lb):
+        u = lb.local_gradient(x)
+        if isinstance(self.layer, torchlb.TangentDiffusion):
+            return lb.connection.vectors(self.layer(u, lb).flatten(0, 1))
+        y, u = self.layer(x, u, lb)
+        return torch.cat([y, lb.connection.vectors(u.flatten(0, 1)).flatten(1)], 1)
+
+
 LAYERS = {
     "Diffusion": lambda: torchlb.Diffusion(2, k=8, method="spectral"),
     "DiffusionNet": lambda: torchlb.DiffusionNet(2, 3, width=4, num_blocks=1, k=8),
@@ -33,6 +50,8 @@ LAYERS = {
     "ImplicitDiffusion": lambda: torchlb.ImplicitDiffusion(2),
     "PoissonBlock": lambda: torchlb.PoissonBlock(2),
     "PoissonFeatures": lambda: torchlb.PoissonFeatures(2),
+    "TangentBlock": lambda: OnFields(torchlb.TangentBlock(2, k=8)),
+    "TangentDiffusion": lambda: OnFields(torchlb.TangentDiffusion(2)),
     "SpectralConv": lambda: torchlb.SpectralConv(2, 2, k=8),
 }
 OF_DATA = {"save_operator", "to_scipy", "unbatch", "check_points", "at", "with_medium"}

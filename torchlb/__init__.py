@@ -34,6 +34,7 @@ from torchlb.nn.gradient_features import GradientFeatures
 from torchlb.nn.implicit_diffusion import ImplicitDiffusion
 from torchlb.nn.poisson_block import PoissonBlock, PoissonFeatures
 from torchlb.nn.spectral_conv import SpectralConv
+from torchlb.nn.tangent import TangentBlock, TangentDiffusion
 from torchlb.operator.cleaning import clean_mesh, clean_points, submesh
 from torchlb.operator.collate import collate
 from torchlb.operator.connection import Connection
@@ -85,6 +86,8 @@ __all__ = [
     "StabilityWarning",
     "StencilError",
     "StencilReport",
+    "TangentBlock",
+    "TangentDiffusion",
     "TorchlbError",
     "__version__",
     "clean_mesh",

@@ -8,12 +8,12 @@ import torch
 from torch import Tensor
 
 from torchlb.errors import InputError
-from torchlb.operator.laplace_beltrami import LaplaceBeltrami
+from torchlb.operator.pair_methods import PairMethods
 from torchlb.pde.checks import check_shape
 
 
 def check_features(
-    x: Tensor, lb: LaplaceBeltrami, channels: int, parameter: Tensor, k: int = 0
+    x: Tensor, lb: PairMethods, channels: int, parameter: Tensor, k: int = 0
 ) -> torch.dtype:
     """The type to compute in: that of features and parameters, at least float32; the operator is cast to it.
 
@@ -40,7 +40,7 @@ def check_features(
     return torch.promote_types(x.dtype, torch.float32)
 
 
-def unrounded(x: Tensor, lb: LaplaceBeltrami, channels: int, parameter: Tensor) -> Tensor:
+def unrounded(x: Tensor, lb: PairMethods, channels: int, parameter: Tensor) -> Tensor:
     """Features in the type of the parameters, where autocast rounded them, for layers that are differentiated.
 
     Rounding before a gradient grows by 1/h. Errors as for `check_features`.

@@ -12,7 +12,7 @@ from torch.nn.functional import softplus
 from torchlb.errors import InputError
 from torchlb.linalg.precision import ROOT_EPS
 from torchlb.nn.checks import check_features
-from torchlb.operator.laplace_beltrami import LaplaceBeltrami
+from torchlb.operator.pair_methods import PairMethods
 from torchlb.pde.checks import check_choice
 from torchlb.pde.heat import Method, flow
 
@@ -60,6 +60,7 @@ class Diffusion(LearnedTimes):
 
     Examples
     --------
+    >>> from torchlb import LaplaceBeltrami
     >>> theta = torch.arange(36) * torch.pi / 18
     >>> lb = LaplaceBeltrami.from_points(torch.stack([theta.cos(), theta.sin()], dim=1))
     >>> layer = Diffusion(3)
@@ -80,7 +81,7 @@ class Diffusion(LearnedTimes):
         check_choice("method", method, Method)
         self.method, self.k, self.tolerance = method, k, tolerance
 
-    def forward(self, x: Float[Tensor, "*B N C"], lb: LaplaceBeltrami) -> Float[Tensor, "*B N C"]:
+    def forward(self, x: Float[Tensor, "*B N C"], lb: PairMethods) -> Float[Tensor, "*B N C"]:
         """Diffuse features x, (N, C) or (B, N, C), on the shape or batch of `lb`; shape and type are those of x."""
         dtype = check_features(x, lb, self.channels, self.raw_time, self.used_k)
         with torch.autocast(x.device.type, enabled=False):

@@ -13,19 +13,21 @@ from typing import Literal
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor, nn
+from torch.nn.functional import linear
 
 from torchlb.errors import InputError
-from torchlb.nn.checks import check_features, unrounded
-from torchlb.nn.diffusion import Diffusion, raw_of_time
-from torchlb.nn.gradient_features import GradientFeatures
-from torchlb.nn.implicit_diffusion import ImplicitDiffusion
+from torchlb.nn.checks import unrounded
+from torchlb.nn.diffusion import raw_of_time
+from torchlb.nn.gradient_features import GradientFeatures, TangentMap
+from torchlb.nn.implicit_diffusion import diffusion_by
 from torchlb.nn.pointwise import mlp
 from torchlb.nn.poisson_block import PoissonBlock
+from torchlb.nn.tangent import TangentBlock
 from torchlb.operator.laplace_beltrami import LaplaceBeltrami
 from torchlb.pde.checks import check_choice
 from torchlb.pde.heat import Method
 
-Place = Literal["vertices", "edges", "faces", "global_mean"]
+Place = Literal["vertices", "edges", "faces", "global_mean", "tangent"]
 Block = Literal["diffusion", "implicit", "poisson"]
 LEAST_TIME = 1e-8
 """Least time in the original, which clamps its times to it before use, ℓ²."""
@@ -60,11 +62,7 @@ class DiffusionNetBlock(nn.Module):
         k: int = 128,
     ) -> None:
         super().__init__()
-        self.diffusion = (
-            ImplicitDiffusion(width)
-            if method == "implicit"
-            else Diffusion(width, method=method, k=k)
-        )
+        self.diffusion = diffusion_by(method, width, k)
         self.gradient_features = (
             GradientFeatures(width, rotations=rotations) if gradient_features else None
         )
@@ -99,18 +97,22 @@ class DiffusionNet(nn.Module):
     block
         "diffusion", "implicit" or "poisson".
     outputs_at
-        "vertices", "edges", "faces" (means over the corners) or "global_mean" (over the surface, by mass).
+        "vertices", "edges", "faces" (means over the corners) or "global_mean" (over the surface, by mass); "tangent"
+        for tangent fields as space vectors at the vertices, with tangent=True.
     last_activation
         Applied to the output, such as ``lambda y: y.log_softmax(-1)``.
     hidden, dropout, gradient_features, rotations
         Arguments of the blocks.
     method, k
         Arguments of "diffusion" blocks.
+    tangent
+        Whether blocks are `TangentBlock`, whose fields start as gradients of the first linear map: "diffusion" blocks
+        with method="spectral", or "implicit" ones.
 
     Raises
     ------
     InputError
-        For an unknown block, method or value of `outputs_at`.
+        For an unknown block, method or value of `outputs_at`, and for options that do not go with `tangent`.
 
     Examples
     --------
@@ -137,23 +139,31 @@ class DiffusionNet(nn.Module):
         rotations: bool = True,
         method: Method = "spectral",
         k: int = 128,
+        tangent: bool = False,
     ) -> None:
         super().__init__()
         check_choice("outputs_at", outputs_at, Place)
         check_choice("block", block, Block)
+        with_fields = block != "poisson" and gradient_features
+        if (outputs_at == "tangent" and not tangent) or (tangent and not with_fields):
+            raise InputError(
+                "tangent fields: expected tangent=True, gradient features and block 'diffusion' or 'implicit', got "
+                f"{tangent=}, {gradient_features=}, {block=}"
+            )
         self.in_channels, self.out_channels = in_channels, out_channels
         self.outputs_at, self.last_activation = outputs_at, last_activation
         self.first_lin = nn.Linear(in_channels, width)
         shared = {"hidden": hidden, "dropout": dropout, "rotations": rotations}
-        shared["gradient_features"] = gradient_features
-        diffusing = {"method": "implicit" if block == "implicit" else method, "k": k}
-        self.blocks = nn.ModuleList(
-            PoissonBlock(width, **shared)
-            if block == "poisson"
-            else DiffusionNetBlock(width, **shared, **diffusing)
-            for _ in range(num_blocks)
-        )
-        self.last_lin = nn.Linear(width, out_channels)
+        if not tangent:
+            shared["gradient_features"] = gradient_features
+        if block != "poisson":
+            shared |= {"method": "implicit" if block == "implicit" else method, "k": k}
+        plain = PoissonBlock if block == "poisson" else DiffusionNetBlock
+        kind = TangentBlock if tangent else plain
+        self.blocks = nn.ModuleList(kind(width, **shared) for _ in range(num_blocks))
+        self.tangent, self.last_lin = tangent, nn.Linear(width, out_channels)
+        if outputs_at == "tangent":
+            self.last_lin = TangentMap(width, out_channels, rotations=rotations)
 
     def forward(
         self,
@@ -162,7 +172,7 @@ class DiffusionNet(nn.Module):
         faces: Int[Tensor, "F corners"] | None = None,
         edges: Int[Tensor, "E ends"] | None = None,
     ) -> Tensor:
-        """Outputs (…, N, out_channels), or (…, F, ·), (…, E, ·), (…, ·), according to `outputs_at`.
+        """Outputs (…, N, out_channels), or (…, F, ·), (…, E, ·), (…, ·), (…, N, n, ·), according to `outputs_at`.
 
         Parameters
         ----------
@@ -173,14 +183,18 @@ class DiffusionNet(nn.Module):
         faces, edges
             For outputs at faces or edges; in a batch, the indices of shape s moved by ``lb.offsets[s]``.
         """
-        check_features(x, lb, self.in_channels, self.first_lin.weight)
+        x = unrounded(x, lb, self.in_channels, self.first_lin.weight)
         y = self.first_lin(x)
+        u = linear(lb.local_gradient(x).to(x), self.first_lin.weight) if self.tangent else None
         for block in self.blocks:
-            y = block(y, lb)
-        y = self.last_lin(y)
+            y, u = (block(y, lb), None) if u is None else block(y, u, lb)
+        if u is not None and isinstance(self.last_lin, TangentMap):
+            y = lb._turned("ind,...idc->...inc", self.last_lin.mapped(u))
+        else:
+            y = self.last_lin(y)
         if self.outputs_at == "global_mean":
             y = _global_mean(y, lb)
-        elif self.outputs_at != "vertices":
+        elif self.outputs_at in ("faces", "edges"):
             corners = faces if self.outputs_at == "faces" else edges
             y = y[..., _checked_corners(self.outputs_at, corners, lb), :].mean(-2)
         return y if self.last_activation is None else self.last_activation(y)

@@ -13,40 +13,48 @@ from torchlb.operator.laplace_beltrami import LaplaceBeltrami
 
 
 class TangentMap(nn.Module):
-    """A learned linear map of the gradients of C channels, Σ_j A_cj ∇x_j, that commutes with rotations of the frames.
+    """A learned linear map of C tangent fields, Σ_j A_cj v_j, that commutes with rotations of the frames.
 
     Parameters
     ----------
     channels
         C.
+    out_channels
+        Number of the fields that it gives; C by default.
     rotations
-        Whether A is complex, so that it also rotates gradients in the tangent plane; that needs a surface whose normals
+        Whether A is complex, so that it also rotates vectors in the tangent plane; that needs a surface whose normals
         are oriented consistently (a mesh, or a cloud with oriented normals). A real A takes any dimension.
     """
 
-    def __init__(self, channels: int, *, rotations: bool = True) -> None:
+    def __init__(
+        self, channels: int, out_channels: int | None = None, *, rotations: bool = True
+    ) -> None:
         super().__init__()
         self.channels, self.rotations = channels, rotations
+        out = channels if out_channels is None else out_channels
         if rotations:
-            self.A_re = nn.Linear(channels, channels, bias=False)
-            self.A_im = nn.Linear(channels, channels, bias=False)
+            self.A_re = nn.Linear(channels, out, bias=False)
+            self.A_im = nn.Linear(channels, out, bias=False)
         else:
-            self.A = nn.Linear(channels, channels, bias=False)
+            self.A = nn.Linear(channels, out, bias=False)
 
     def gradients(self, x: Tensor, lb: LaplaceBeltrami) -> tuple[Tensor, Tensor]:
         """∇x in the frames, and its image under the map, (…, N, d, C); x of (N, C) or (B, N, C)."""
         dtype = check_features(x, lb, self.channels, next(self.parameters()))
-        if self.rotations and lb.dim != 2:
-            raise InputError(f"rotations need a surface, got dim={lb.dim}; use rotations=False")
         rows = [lb.stencil.product(1 + c, x, dtype=dtype) for c in range(lb.dim)]
         gradient = torch.stack(rows, dim=-2)
+        return gradient, self.mapped(gradient)
+
+    def mapped(self, v: Float[Tensor, "*B N d C"]) -> Float[Tensor, "*B N d D"]:
+        """The image of tangent fields, given in the frames."""
         if not self.rotations:
-            return gradient, self.A(gradient)
+            return self.A(v)
+        if (dim := v.shape[-2]) != 2:
+            raise InputError(f"rotations need a surface, got dim={dim}; use rotations=False")
         # the complex z ↦ Az as a real map of real and imaginary parts, concatenated
         upper = torch.cat([self.A_re.weight, -self.A_im.weight], dim=1)
         lower = torch.cat([self.A_im.weight, self.A_re.weight], dim=1)
-        mapped = linear(gradient.flatten(-2), torch.cat([upper, lower]))
-        return gradient, mapped.view_as(gradient)
+        return linear(v.flatten(-2), torch.cat([upper, lower])).unflatten(-1, (2, -1))
 
 
 class GradientFeatures(TangentMap):

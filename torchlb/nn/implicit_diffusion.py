@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+from typing import Literal
+
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
 from torchlb.linalg.precision import SINGLE
 from torchlb.nn.checks import check_features
-from torchlb.nn.diffusion import LearnedTimes
-from torchlb.operator.laplace_beltrami import LaplaceBeltrami
+from torchlb.nn.diffusion import Diffusion, LearnedTimes
+from torchlb.operator.pair_methods import PairMethods
+from torchlb.pde.heat import Method
 from torchlb.pde.solves import TOLERANCE, implicit_step
 
 
@@ -36,6 +39,7 @@ class ImplicitDiffusion(LearnedTimes):
 
     Examples
     --------
+    >>> from torchlb import LaplaceBeltrami
     >>> from torchlb.surfaces import Sphere
     >>> vertices, faces = Sphere().mesh(300)
     >>> lb = LaplaceBeltrami.from_mesh(vertices.float(), faces)
@@ -49,7 +53,7 @@ class ImplicitDiffusion(LearnedTimes):
         super().__init__(channels, init_time)
         self.tolerance = tolerance
 
-    def forward(self, x: Float[Tensor, "*B N C"], lb: LaplaceBeltrami) -> Float[Tensor, "*B N C"]:
+    def forward(self, x: Float[Tensor, "*B N C"], lb: PairMethods) -> Float[Tensor, "*B N C"]:
         """Diffuse features x, (N, C) or (B, N, C), on the shape or batch of `lb`; shape and type are those of x."""
         dtype = check_features(x, lb, self.channels, self.raw_time)
         with torch.autocast(x.device.type, enabled=False):
@@ -62,3 +66,12 @@ class ImplicitDiffusion(LearnedTimes):
     def extra_repr(self) -> str:
         """Channels, tolerance."""
         return f"{self.channels}, tolerance={self.tolerance}"
+
+
+def diffusion_by(
+    method: Method | Literal["implicit"], channels: int, k: int, init_time: float = 0.01
+) -> LearnedTimes:
+    """`ImplicitDiffusion`, or `Diffusion` by another method with k eigenpairs."""
+    if method == "implicit":
+        return ImplicitDiffusion(channels, init_time=init_time)
+    return Diffusion(channels, method=method, k=k, init_time=init_time)

@@ -26,7 +26,7 @@ Given = Mapping[str, ArrayLike | float | None]
 
 
 def elements_of(lb: Any) -> Any:
-    """The elements of the weak pair of one shape, `Forms` in the user's numbering, cached with the operator."""
+    """The elements of the weak pair of one shape or its fields, in the user's numbering, cached with the operator."""
     if lb.cache.elements is None:
         points = lb.points.detach().cpu().double()
         linear = lb.source == "cotangent"

@@ -39,8 +39,8 @@ from torchlb.linalg.two_grid import Matrix, absolute_row_sums, two_grid, without
 from torchlb.spectral.components import constants
 from torchlb.spectral.eigenbasis import Eigenbasis
 
-SHARE = 6
-"""If more than a sixth of the spectrum is wanted, a dense solve is as fast."""
+SHARE = 9
+"""If more than a ninth of the spectrum is wanted, a dense solve is as fast."""
 SHIFT = 10.0
 """Shift of the factor times the size of a component: about half of its first eigenvalue, were it a disk."""
 START = 0.003
