@@ -152,10 +152,9 @@ def test_float32_operators_have_float32_fields(sphere):
 
 
 SHAPES = {
-    "closed": lambda: LaplaceBeltrami.from_mesh(*Ellipsoid().mesh(120)),
-    "open": lambda: LaplaceBeltrami.from_mesh(*Hemisphere().mesh(120)),
-    "held": lambda: LaplaceBeltrami.from_mesh(*Hemisphere().mesh(120), condition="dirichlet"),
-    "cloud": lambda: LaplaceBeltrami.from_points(Sphere().mesh(150)[0]),
+    "closed": lambda: LaplaceBeltrami.from_mesh(*Ellipsoid().mesh(60)),
+    "held": lambda: LaplaceBeltrami.from_mesh(*Hemisphere().mesh(70), condition="dirichlet"),
+    "cloud": lambda: LaplaceBeltrami.from_points(Sphere().mesh(80)[0]),
 }
 
 

@@ -64,7 +64,6 @@ def geodesic_distance(
     >>> bool((distance - exact).abs().mean() < 0.02)
     True
     """
-    check_operator(lb)
     some: Any = sources if each and len(sources) else [sources]  # pyright: ignore[reportArgumentType]
     starts = [source_points(lb, one) for one in some]
     points = np.ascontiguousarray(lb.points.detach().cpu().double().numpy())
@@ -96,6 +95,7 @@ def _distance(
 
 def source_points(lb: LaplaceBeltrami, sources: Any) -> Int[np.ndarray, " S"]:
     """Indices of the sources; InputError where there are none, or one is out of range."""
+    check_operator(lb)
     try:
         index = torch.as_tensor(sources)
     except (TypeError, ValueError, RuntimeError):

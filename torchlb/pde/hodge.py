@@ -11,6 +11,7 @@ from torch import Tensor
 
 from torchlb.errors import InputError
 from torchlb.galerkin.weak_gradient import WeakGradient
+from torchlb.linalg.checks import check_operator
 from torchlb.linalg.csr import Csr
 from torchlb.operator.curvature import check_surface
 from torchlb.operator.laplace_beltrami import LaplaceBeltrami
@@ -58,6 +59,7 @@ def hodge_decomposition(
     >>> bool((parts.potential - lb.points[:, 2]).abs().max() < 1e-3)
     True
     """
+    check_operator(lb)
     check_surface(lb, "hodge_decomposition")
     if lb.sizes is not None or lb._in_medium:
         raise InputError(

@@ -12,7 +12,7 @@ from torch import Tensor
 from torch.nn.functional import normalize
 
 from torchlb.errors import InputError
-from torchlb.linalg.checks import takes_arrays
+from torchlb.linalg.checks import check_operator, takes_arrays
 from torchlb.linalg.precision import LOW, ROOT_EPS, ROUNDING, TINY
 from torchlb.operator.laplace_beltrami import LaplaceBeltrami
 from torchlb.pde.geodesics import geodesic_distance, source_points
@@ -53,6 +53,7 @@ def vector_heat_flow(
     >>> bool((vector_heat_flow(lb, v, 0.5) - torch.exp(torch.tensor(-0.5)) * v).abs().max() < 1e-3)
     True
     """
+    check_operator(lb)
     fields = lb.connection
     return fields.vectors(heat_flow(fields, fields.components(v), t, tolerance=tolerance))
 
