@@ -201,6 +201,10 @@ GALLERY = {  # options of a small run, and what it prints
         ["--points", "150", "--steps", "3", "--k", "8"],
         "0 of 296 triangles flipped",
     ),
+    "vector_fields": (
+        ["--points", "300", "--sphere", "200", "--torus", "300"],
+        "torus: harmonic part of norm 4.1",
+    ),
     "diffusion_maps": (["--points", "400"], "correlation of coordinate 2 with cos(π width): 0.99"),
     "train_pyg": (["--points", "150", "--epochs", "2"], "right on a shape never seen: "),
     "spectral_gallery": (["--points", "400", "--k", "40"], "Eigenbasis(40 pairs of 400 points"),
