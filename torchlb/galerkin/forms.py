@@ -1,4 +1,4 @@
-"""Stiffness and mass of a complex from its elements, in any medium, and bilinear forms of both (`method.md`, 17)."""
+"""Stiffness and mass of a complex from its elements, in any medium, and bilinear forms of both (`method.md`, 14)."""
 
 from __future__ import annotations
 

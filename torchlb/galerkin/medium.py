@@ -1,4 +1,4 @@
-"""Media: the conductivity A, density ρ and potential c of −div(A∇u) + cu = λρu (`method.md`, section 17)."""
+"""Media: the conductivity A, density ρ and potential c of −div(A∇u) + cu = λρu (`method.md`, section 14)."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Tangent fields on the elements: the connection Laplacian by matrices of functions (`method.md`, section 18).
+"""Tangent fields on the elements: the connection Laplacian by matrices of functions (`method.md`, section 15).
 
 A tangent field has the components c in the frames E of the vertices, and is the vector field Ec of space, prolonged
 component by component. With the projector Π onto the tangent plane its covariant derivative is Π∇ũ, so that

@@ -1,4 +1,4 @@
-"""The gradient of functions against tangent fields in the weak form, and its adjoint (`method.md`, section 18)."""
+"""The gradient of functions against tangent fields in the weak form, and its adjoint (`method.md`, section 15)."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The connection Laplacian: tangent fields in the place of functions (`method.md`, section 18)."""
+"""The connection Laplacian: tangent fields in the place of functions (`method.md`, section 15)."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Derivatives of eigenpairs in points and medium (`method.md`, section 16)."""
+"""Derivatives of eigenpairs in points and medium (`method.md`, section 14)."""
 
 from __future__ import annotations
 

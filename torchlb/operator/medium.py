@@ -1,4 +1,4 @@
-"""The weak pair of an operator in a medium: what a medium may be, and its matrices (`method.md`, section 17)."""
+"""The weak pair of an operator in a medium: what a medium may be, and its matrices (`method.md`, section 14)."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The Helmholtz–Hodge decomposition of a tangent field on a surface (`method.md`, section 18)."""
+"""The Helmholtz–Hodge decomposition of a tangent field on a surface (`method.md`, section 15)."""
 
 from __future__ import annotations
 

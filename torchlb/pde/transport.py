@@ -1,4 +1,4 @@
-"""Tangent fields: their heat flow, parallel transport, and the logarithmic map (`method.md`, section 18)."""
+"""Tangent fields: their heat flow, parallel transport, and the logarithmic map (`method.md`, section 15)."""
 
 from __future__ import annotations
 
