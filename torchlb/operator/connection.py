@@ -29,7 +29,6 @@ class _TangentPlan(NamedTuple):
     """What the pair of tangent fields on a shape follows from, with the operator of functions there."""
 
     lb: Any
-
     hodge: bool
 
     def bilinear(self, *given: Any) -> Float[Tensor, ""]:
