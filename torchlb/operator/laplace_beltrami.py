@@ -346,7 +346,7 @@ class LaplaceBeltrami(StencilMethods, PairMethods):
     def connection(self) -> Connection:
         """The tangent fields of the shape, or of a batch: `Connection`, with stiffness, mass matrix, eigenbasis.
 
-        Made where it is asked for first, in about three times the time of a build. Raises InputError without a weak pair.
+        Made where it is asked for first, in about three times the time of a build. InputError without a weak pair.
 
         >>> from torchlb.surfaces import Sphere
         >>> lb = LaplaceBeltrami.from_mesh(*Sphere().mesh(500))
