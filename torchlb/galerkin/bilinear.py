@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any, Literal, NamedTuple
+from typing import Literal, NamedTuple
 
 import torch
 from jaxtyping import Float, Int
@@ -27,11 +27,6 @@ class BilinearForm(NamedTuple):
     u: Float[Tensor, "N C"]
     c: Float[Tensor, " C"]
     along: tuple[int, int] | None = None
-
-    @property
-    def entry(self) -> tuple[Any, ...]:
-        """Index of Π_kl in projectors (…, n, n)."""
-        return (..., *(self.along or ()))
 
 
 def outer(

@@ -203,9 +203,14 @@ class Forms:
             found.append(cell_mean(inside, corners))
         return found
 
-    def projectors(self) -> list[Tensor]:
-        """Π onto the tangent plane, (…, n, n), where `values` has those of a field."""
-        return [frame @ frame.mT for frame in self.tangents()]
+    def factors(
+        self, forms: Sequence[BilinearForm], medium: Medium, prolong: Linear | None = None
+    ) -> dict[str, list[Tensor]]:
+        """`values` of the fields of a medium, and the projectors Π onto the tangent plane, if a form has them."""
+        found = {name: self.values(field, prolong) for name, field in medium.items()}
+        if any(form.along for form in forms):
+            found["projectors"] = [frame @ frame.mT for frame in self.tangents()]
+        return found
 
     def tangents(self) -> list[Tensor]:
         """Orthonormal tangent vectors, (…, n, d), oriented as the cells are, where `values` has those of a field."""
@@ -273,9 +278,7 @@ class Forms:
 
     def bilinear(self, forms: Sequence[BilinearForm], medium: Medium) -> Float[Tensor, ""]:
         """Σ of bilinear forms, differentiable in the medium; of "lumped" and "boundary", which depend on none, 0."""
-        values = {name: self.values(field) for name, field in medium.items()}
-        if any(form.along for form in forms):
-            values["projectors"] = self.projectors()
+        values = self.factors(forms, medium)
         total = [torch.zeros((), dtype=torch.float64)]
         # a function that stands in two forms is one
         prolong = cache(partial(times, self.prolongation))
@@ -294,7 +297,10 @@ class Forms:
         coefficient = None if values is None else values[0]
         coefficient = self.on_curved(coefficient) if stiffness else coefficient
         own = density(self.metric, self.element, outer(self.nodes, nodes, c), coefficient)
-        own = own * (1.0 if form.along is None else medium["projectors"][0][form.entry])
+        across = None
+        if form.along is not None:
+            across = [x[(..., *form.along)] for x in medium["projectors"]]
+            own = across[0] * own
         total = [own.sum() if self.shares is None else (self.shares[:, None] * own).sum()]
         for number, flat in enumerate(self.flats, 1):
             shape = simplex(self.element.dim, 1)
@@ -307,8 +313,7 @@ class Forms:
                 blocks = own.mean(1, keepdim=True).expand_as(blocks)
             mean = None if mean is None else spread(mean, shape)
             own = density(metric, shape, blocks, mean)
-            if form.along is not None:
-                own = own * medium["projectors"][number][form.entry][:, None]
+            own = own if across is None else across[number][:, None] * own
             total.append(flat.share * own.sum())
         return torch.stack(total).sum()
 

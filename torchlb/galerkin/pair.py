@@ -32,6 +32,7 @@ from torchlb.galerkin.prolongation import prolonged
 from torchlb.geometry.local_fits import FitPlan, LocalFits
 from torchlb.geometry.numbering import Numbering
 from torchlb.linalg.precision import LOW
+from torchlb.linalg.sparse import values_on
 
 
 @dataclass(frozen=True)
@@ -105,14 +106,11 @@ class Pattern:
         for value, part in zip(values, (upper.data.real, upper.data.imag), strict=True):
             np.take(part.copy(), self.order, out=value, mode="clip")  # this mode is not buffered
         values[0, self.diagonal] -= np.add.reduceat(values[0], self.crow.numpy()[:-1])
-        for other in others:
-            line: Any = sparse.coo_array((other + other.T) / 2)
-            first, second = (self.given[place].astype(np.int64) for place in line.coords)
-            count, crow = len(self.given), self.crow.numpy()
-            places = np.arange(count).repeat(np.diff(crow)) * count + self.col.numpy()
-            extra = np.zeros((1, len(places)))
-            extra[0, np.searchsorted(places, first * count + second)] = line.data
-            values = np.concatenate([values, extra])
+        if others:
+            place = self.crow.numpy(), self.col.numpy()
+            number = self.given.astype(np.int64)
+            extra = [values_on(*place, (other + other.T) / 2, number) for other in others]
+            values = np.concatenate([values, np.stack(extra)])
         return SparsePair(self.crow, self.col, torch.from_numpy(values))
 
 
@@ -191,9 +189,7 @@ class PairPlan:
         mesh = self.curving.at(fits.points, self.fits, fits)
         elements = self.forms(fits, mesh, prolong=False)
         prolong = partial(prolonged, self.fits, fits, self.curving, mesh)
-        values = {name: elements.values(field, prolong) for name, field in medium.items()}
-        if any(form.along for form in forms):
-            values["projectors"] = elements.projectors()
+        values = elements.factors(forms, medium, prolong)
         flat = self.curving.bent.index_fill(0, self.lowered, False)
         total = []
         for lumped, curving in ((False, self.curving), (True, replace(self.curving, bent=flat))):

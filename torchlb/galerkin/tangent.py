@@ -36,7 +36,7 @@ from torchlb.galerkin.medium import orthonormal
 from torchlb.galerkin.pair import Pattern
 from torchlb.geometry.vectors import at
 from torchlb.linalg.csr import Csr
-from torchlb.linalg.sparse import on_one_pattern
+from torchlb.linalg.sparse import on_one_pattern, values_on
 
 
 def in_space(forms: Sequence[BilinearForm], frames: Float[Tensor, "N n d"]) -> list[BilinearForm]:
@@ -185,14 +185,8 @@ def _on_one_pattern(matrices: list[Any]) -> tuple[Any, Float[Tensor, "c nnz"]]:
         return matrices[0], torch.from_numpy(np.stack([m.data.astype(float) for m in matrices]))
     joint: Any = sparse.csr_array(sum(abs(matrix) for matrix in matrices))
     joint.sort_indices()
-    row, col = sparse.coo_array(joint).coords
-    keys = row.astype(np.int64) * joint.shape[1] + col
-    values = torch.zeros(len(matrices), len(keys), dtype=torch.float64)
-    for value, matrix in zip(values, matrices, strict=True):
-        row, col = sparse.coo_array(matrix).coords
-        place = np.searchsorted(keys, row.astype(np.int64) * joint.shape[1] + col)
-        value[place] = torch.from_numpy(matrix.data.astype(float))
-    return joint, values
+    values = [values_on(joint.indptr, joint.indices, matrix) for matrix in matrices]
+    return joint, torch.from_numpy(np.stack(values))
 
 
 def _by_rows(crow: Tensor, col: Tensor, blocks: Float[Tensor, "c nnz d d"]) -> Csr:

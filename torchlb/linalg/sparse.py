@@ -121,6 +121,23 @@ def on_one_pattern(one: sparse.csr_array, other: sparse.csr_array) -> bool:
     return np.array_equal(one.indptr, other.indptr) and np.array_equal(one.indices, other.indices)
 
 
+def values_on(
+    crow: np.ndarray, col: np.ndarray, matrix: Any, number: np.ndarray | None = None
+) -> np.ndarray:
+    """Values of a scipy matrix on a CSR pattern that has its entries, in rows and columns renumbered by `number`.
+
+    >>> one = sparse.csr_array([[0.0, 2.0], [0.0, 0.0]])
+    >>> values_on(np.array([0, 2, 3]), np.array([0, 1, 1]), one).tolist()
+    [0.0, 2.0, 0.0]
+    """
+    entries: Any = sparse.coo_array(matrix)
+    row, column = (x.astype(np.int64) if number is None else number[x] for x in entries.coords)
+    count, values = len(crow) - 1, np.zeros(len(col))
+    places = np.arange(count).repeat(np.diff(crow)) * count + col
+    values[np.searchsorted(places, row * count + column)] = entries.data
+    return values
+
+
 def symmetric_product(
     crow: Int[Tensor, " N_plus_1"],
     col: Int[Tensor, " nnz"],

@@ -63,11 +63,6 @@ class Connection(PairMethods):
         self._is_hodge = False
 
     @property
-    def dim(self) -> int:
-        """Dimension d of the manifold."""
-        return self.frames.shape[-1]
-
-    @property
     def plan(self) -> Any:
         """What the matrices follow from."""
         return _TangentPlan(self._lb[0], self._is_hodge)

@@ -69,8 +69,10 @@ def hodge_decomposition(
     fields, boundary, found = _constant(lb.connection), lb._boundary_points(), []
     c = fields.components(columns.double())
     elements, normals = elements_of(lb), lb.normals.detach().cpu().double()
-    for turned, held in ((None, boundary[:0]), (normals, boundary)):
-        functions, form = _constant(lb, held), WeakGradient.of(elements, turned)
+    free = _constant(lb)
+    held = _constant(lb, boundary) if bool(boundary.any()) else free
+    for turned, functions in ((None, free), (normals, held)):
+        form = WeakGradient.of(elements, turned)
         right = form.divergence(fields.vectors(c).cpu()).to(c)
         u = solved(functions, right, None, torch.zeros_like(right), None, TOLERANCE)
         slope = fields.components(form.gradient(u.cpu()).to(c))
@@ -89,7 +91,7 @@ def _constant(lb: Any, held: Tensor | None = None) -> Any:
     own = lb._alias()
     own._cache, own._carries = None, False
     own.points, own.frames, own.mass = lb.points.detach(), lb.frames.detach(), lb.mass.detach()
-    own._on_boundary = lb._on_boundary[:0] if held is None or not bool(held.any()) else held
+    own._on_boundary = lb._on_boundary[:0] if held is None else held
     own.options = {**lb.options, "condition": "dirichlet"}
     near = lb.weak.linear
     near = Csr(near.crow, near.col, near.values[:2]) if near.num_rows else None
