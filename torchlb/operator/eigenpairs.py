@@ -64,16 +64,16 @@ def _of_shape(
     Inside the span of the m known eigenvectors it takes differences of eigenvalues, broadened where they agree to
     rounding; outside, a solve for each vector (Nelson 1976).
     """
-    phi, lam = whole.eigenvectors.cpu().double(), whole.eigenvalues.cpu().double()
+    phi, lam = whole.eigenvectors.double(), whole.eigenvalues.double()
     count = min(of_values.shape[0], len(lam))
     more, own = (0, len(lam) - count), of_values[:count] * phi[:, :count]
     w, v = pad(own, more), pad(-lam[:count] * own, more)
     if not (of_vectors.any() or of_left.any()):
         return w, v, phi
     solver = pair_system(lb)
-    left = solver.inside(of_left[:, :count].to(lb.device))  # MΦ is zero at Dirichlet points
-    v += pad(left.cpu(), more)
-    gradient = of_vectors[:, :count] + solver.mass_product(left).cpu()
+    left = solver.inside(of_left[:, :count])  # MΦ is zero at Dirichlet points
+    v += pad(left, more)
+    gradient = of_vectors[:, :count] + solver.mass_product(left)
     inside = pad(phi.T @ gradient, more)  # φ_jᵀḡ_i
     gap = lam - lam[:, None]
     gap = gap / (gap.square() + (ROOT_EPS * lam[-1]) ** 2)
@@ -83,8 +83,7 @@ def _of_shape(
     free = lb.num_points if lb.fixed is None else int((~lb.fixed).sum())
     if len(lam) >= free:
         return w, v, phi
-    given = (x.to(lb.device) for x in (gradient, lam[:count], phi, lam[-1]))
-    outside = solver.solve_beyond(*given).cpu()
+    outside = solver.solve_beyond(gradient, lam[:count], phi, lam[-1])
     w -= pad(outside, more)
     v += pad(lam[:count] * outside, more)
     return w, v, phi

@@ -165,9 +165,9 @@ class PairMethods(OperatorStorage):
     ) -> Eigenbasis:
         """The k smallest eigenpairs of −Δ: real, ascending, orthonormal in the mass; min(k, N) of them.
 
-        Solved once, in float64 on the CPU (`method.md`, sections 7 and 10), and kept: a smaller k is a slice of the
-        stored basis, a larger k or a smaller tolerance is solved anew. In a batch each shape has its own basis, solved
-        where that shape has too few pairs.
+        Solved once, in float64 on the device of the operator (`method.md`, sections 7 and 10), and kept: a smaller k is
+        a slice of the stored basis, a larger k or a smaller tolerance is solved anew. In a batch each shape has its own
+        basis, solved where that shape has too few pairs.
 
         Parameters
         ----------
@@ -253,7 +253,7 @@ class PairMethods(OperatorStorage):
             basis = pencil_eigenbasis(
                 k_of,
                 m_of,
-                self.mass[block].detach().cpu().double(),
+                self.mass[block].detach().double(),
                 k,
                 dim=self.dim,
                 linear=None if near is None else (near[0], near[1]),

@@ -154,7 +154,7 @@ class _Known(torch.autograd.Function):
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, *grads: Tensor) -> tuple[Any, ...]:  # pyright: ignore[reportIncompatibleMethodOverride]
-        forms = ctx.forms(*(g.cpu().double() for g in grads))
+        forms = ctx.forms(*(g.double() for g in grads))
         return None, None, None, *[None] * ctx.count, *ctx.found.gradient(forms)
 
 

@@ -20,10 +20,12 @@ from jaxtyping import Bool, Float
 from scipy import linalg, sparse
 from scipy.sparse import csgraph
 from torch import Tensor
+from torch.nn.functional import pad
 
 from torchlb.errors import EigenbasisError, warn
 from torchlb.geometry.thresholds import FACTOR
-from torchlb.linalg.lanczos import BLOCK, Inverse, lanczos_of_pair
+from torchlb.linalg.conjugate_gradients import Linear
+from torchlb.linalg.lanczos import BLOCK, lanczos_of_pair
 from torchlb.linalg.precision import (
     DENSE,
     EPS,
@@ -34,8 +36,8 @@ from torchlb.linalg.precision import (
     SMALL,
     TINY,
 )
-from torchlb.linalg.sparse import multiply, on_one_pattern
-from torchlb.linalg.two_grid import Matrix, absolute_row_sums, two_grid, without_small_entries
+from torchlb.linalg.sparse import multiply, on_device, on_one_pattern
+from torchlb.linalg.two_grid import absolute_row_sums, two_grid, without_small_entries
 from torchlb.spectral.components import constants
 from torchlb.spectral.eigenbasis import Eigenbasis
 
@@ -55,7 +57,7 @@ SAFETY = 4.0
 
 Sparse = sparse.csr_array
 Pair = tuple[Sparse, Sparse]
-Blocks = tuple[np.ndarray, ...]  # U, KU, MU
+Blocks = tuple[Tensor, ...]  # U, KU, MU
 
 
 class _Part(NamedTuple):
@@ -85,7 +87,8 @@ def pencil_eigenbasis(
     Parameters
     ----------
     stiffness, mass_matrix, mass
-        K, positive semidefinite, M, positive definite, (N, N), and the diagonal mass, stored with the basis.
+        K, positive semidefinite, M, positive definite, (N, N), and the diagonal mass, in float64, on the device of the
+        solve.
     dim
         d, from which the unit of a length follows: K is in ℓ^{d−2}, M in ℓ^d.
     linear
@@ -124,7 +127,7 @@ def pencil_eigenbasis(
     elif tolerance is None:
         tolerance = min(ROOT_EPS * k**2, SMALL)
     parts = _parts(whole, near, fixed, component, pattern, areas) if zeros < k else []
-    found = [_pairs(part, k, tolerance) for part in parts]
+    found = [_pairs(part, k, tolerance, mass.device) for part in parts]
     null = constants(component, areas, zeros)
     return _merged(parts, found, (null, whole[1] @ null), mass, k, tolerance, (length**2, units[1]))
 
@@ -187,26 +190,30 @@ def _joined(one: Sparse, other: Sparse) -> Sparse:
     return sparse.csr_array(abs(one) + abs(other))
 
 
-def _pairs(part: _Part, k: int, tolerance: float) -> tuple[np.ndarray, ...]:
+def _pairs(part: _Part, k: int, tolerance: float, device: torch.device) -> tuple[Tensor, ...]:
     """Eigenvalues of a component without 0, relative errors, U and MU: the k smallest, with groups whole, or all."""
     size, zero = len(part.points), int(part.conserving)
     count = min(k + BLOCK, size)
+    mass = partial(multiply, *on_device(part.mass_matrix, device))
     if size <= max(DENSE, SHARE * count):
         dense = (part.stiffness.toarray(), part.mass_matrix.toarray())
-        values, u = linalg.eigh(*dense, subset_by_index=(0, count - 1))
-        errors, mu = np.zeros(count), part.mass_matrix @ u
+        found = linalg.eigh(*dense, subset_by_index=(0, count - 1))
+        values, u = (torch.from_numpy(x).to(device) for x in found)
+        errors, mu = torch.zeros_like(values), mass(u)
     else:
         k1, m1 = part.linear or (part.stiffness, part.mass_matrix)
-        null = np.full(size, float(m1.sum()) ** -0.5) if zero else None
+        null = None
+        if zero:
+            null = torch.full((size,), float(m1.sum()) ** -0.5, dtype=torch.float64, device=device)
         accuracy = ROOT_EPS if part.linear is None else START
-        settings = {"tolerance": accuracy, "more": BLOCK, "null": null}
+        settings = {"tolerance": accuracy, "more": BLOCK, "null": null, "device": device}
         solve, (values, u) = lanczos_of_pair(
             k1, m1, k - zero, SHIFT / float(abs(m1).sum()), **settings
         )
         if null is not None:
-            values, u = np.append(0.0, values), np.column_stack([null.astype(u.dtype), u])
+            values, u = pad(values, (1, 0)), torch.cat([null.to(u)[:, None], u], dim=1)
         if part.linear is None:
-            errors, mu = np.full(len(values), tolerance), part.mass_matrix @ u
+            errors, mu = torch.full_like(values, tolerance), mass(u)
         else:
             swept = _swept(part, u, k, solve, tolerance)
             if swept is None:
@@ -215,70 +222,71 @@ def _pairs(part: _Part, k: int, tolerance: float) -> tuple[np.ndarray, ...]:
                     "as where spacings change abruptly. Factors of the whole pair take over, at many times the memory "
                     "and time; a larger `tolerance` does without"
                 )
-                return _pairs(part._replace(linear=None), k, EPS)
+                return _pairs(part._replace(linear=None), k, EPS, device)
             values, errors, u, mu = swept
-    if zero:
-        values[0] = 0.0
-    if (values[zero:] <= 0).any():
+    values[:zero] = 0.0
+    if bool((values[zero:] <= 0).any()):
         raise EigenbasisError(
-            f"eigenbasis: the stiffness has the eigenvalue {values[zero:].min():.3g} on a component of {size} points, "
-            "where it should be positive"
+            f"eigenbasis: the stiffness has the eigenvalue {float(values[zero:].min()):.3g} on a component of {size} "
+            "points, where it should be positive"
         )
     keep = _closed(values, k, tolerance)
     return values[zero:keep], errors[zero:keep], u[:, zero:keep], mu[:, zero:keep]
 
 
-def _closed(values: np.ndarray, k: int, tolerance: float) -> int:
+def _closed(values: Tensor, k: int, tolerance: float) -> int:
     """The least number of pairs, k or more, that splits no group of equal eigenvalues; all if there is none."""
-    gaps = np.append(np.diff(values) > max(ROOT_EPS, tolerance) * values[1:], True)
+    gaps = pad(values.diff() > max(ROOT_EPS, tolerance) * values[1:], (0, 1), value=True)
     gaps[: min(k, len(values)) - 1] = False
-    return int(gaps.argmax()) + 1
+    return int(gaps.int().argmax()) + 1
 
 
 def _swept(
-    part: _Part, u: np.ndarray, k: int, solve: Inverse, tolerance: float
-) -> tuple[np.ndarray, ...] | None:
+    part: _Part, u: Tensor, k: int, solve: Linear, tolerance: float
+) -> tuple[Tensor, ...] | None:
     """Sweep from the P1 eigenvectors until the first k eigenvalues are accurate; None if that takes too many sweeps."""
     assert part.linear is not None
-    whole = part.stiffness, part.mass_matrix
-    *single, on_linear_mass = (_product(m) for m in (*whole, part.linear[1]))
-    cycle = _two_levels(part.stiffness, solve)
+    matrices = [on_device(m, u.device) for m in (part.stiffness, part.mass_matrix, part.linear[1])]
+    whole = [partial(multiply, *matrix) for matrix in matrices[:2]]
+    *single, on_linear_mass = (partial(multiply, c, i, v.float()) for c, i, v in matrices)
+    rough = without_small_entries(*matrices[0])
+    sums = absolute_row_sums(rough[0], rough[2])
+    cycle = two_grid(partial(multiply, *rough), sums, solve)
 
-    def shifted(p: np.ndarray, shifts: np.ndarray) -> np.ndarray:
-        return single[0](p) - on_linear_mass(p) * shifts
+    def shifted(p: Tensor, shifts: Tensor) -> Tensor:
+        return single[0](p).sub_(on_linear_mass(p).mul_(shifts))
 
     count, zero = u.shape[1], int(part.conserving)
-    u = np.ascontiguousarray(u, dtype=np.float32)
+    u = u.float().contiguous()
     values, known = _ritz((u, *(on(u) for on in single)), count)
     for sweep in range(ROUNDS + 1):
         keep = _closed(values, k, tolerance) if sweep else count
-        (u, ku, mu), shifts = known, values[:keep].astype(known[0].dtype)
-        residual = ku[:, :keep] - mu[:, :keep] * shifts
-        size = np.maximum(linalg.norm(residual, axis=0), TINY)
-        r = (residual / size).astype(np.float32)
+        (u, ku, mu), shifts = known, values[:keep].to(known[0])
+        residual = torch.addcmul(ku[:, :keep], mu[:, :keep], shifts, value=-1)
+        size = residual.norm(dim=0).clamp_min(TINY)
+        r = (residual / size).float()
         z = cycle(r)
-        scale = SAFETY * size**2 / np.maximum(np.abs(values[:keep]), TINY)
-        errors = scale * np.abs(_dots(r, z))
+        scale = SAFETY * size.double() ** 2 / values[:keep].abs().clamp_min(TINY)
+        errors = scale * _dots(r, z).abs()
         errors[:zero] = 0.0
-        if sweep and errors.max() <= tolerance:
+        if sweep and float(errors.max()) <= tolerance:
             return values[:keep], errors, u[:, :keep], mu[:, :keep]
-        rough = errors[:k].max() > ASTRAY
-        active = np.flatnonzero(errors > tolerance) if sweep else np.arange(keep)
+        coarse = float(errors[:k].max()) > ASTRAY
+        active = (errors > tolerance if sweep else torch.ones_like(errors)).nonzero()[:, 0]
         # each step leaves a quarter of the energy or less, so the last one takes off FACTOR times what is left
-        enough = FACTOR * np.maximum(SMALL * errors, tolerance) / np.maximum(scale, TINY)
-        small = (u.astype(np.float32), mu.astype(np.float32))
-        right = (r, z, shifts.astype(np.float32), enough)
-        right = tuple(x.take(active, -1) for x in right)
-        w = _correction(shifted, cycle, small, right, 1 if rough else LONGEST).astype(np.float64)
+        enough = FACTOR * (SMALL * errors).clamp_min(tolerance) / scale.clamp_min(TINY)
+        right = [x.float().index_select(-1, active) for x in (r, z, shifts, enough)]
+        small = u.float(), mu.float()
+        w = _correction(shifted, cycle, small, right, 1 if coarse else LONGEST).double()
         if sweep:
             w -= u @ (mu.T @ w)
-        elif rough:
-            w = np.column_stack([u, w])
+        elif coarse:
+            w = torch.cat([u, w], dim=1)
         else:
             w = u - w * size
-        new = (w, *(a @ w for a in whole))
+        new = (w, *(on(w) for on in whole))
         if sweep:
-            new = tuple(np.column_stack(both) for both in zip(known, new, strict=True))
+            new = tuple(torch.cat(both, dim=1) for both in zip(known, new, strict=True))
         values, known = _ritz(new, count)
     if len(part.points) > LARGEST_FACTORED:
         raise EigenbasisError(
@@ -289,82 +297,62 @@ def _swept(
 
 
 def _correction(
-    shifted: Callable[[np.ndarray, np.ndarray], np.ndarray],
-    cycle: Inverse,
-    known: tuple[np.ndarray, np.ndarray],
-    right: tuple[np.ndarray, ...],
+    shifted: Callable[[Tensor, Tensor], Tensor],
+    cycle: Linear,
+    known: tuple[Tensor, Tensor],
+    right: list[Tensor],
     steps: int,
-) -> np.ndarray:
+) -> Tensor:
     """Conjugate gradients for every column of (K − λM)w = r, M-orthogonal to U; of [U, MU] and [r, cycle(r), λ, ε].
 
     A column ends with the step that reduces its energy by less than ε, or with the last step.
     """
     (u, mu), (r, z, shifts, enough) = known, right
-    w, p, square = np.zeros_like(r), np.zeros_like(r), np.ones(r.shape[1], r.dtype)
-    at, found = np.arange(r.shape[1]), []
+    w, p, square = torch.zeros_like(r), torch.zeros_like(r), torch.ones_like(enough)
+    at, found = torch.arange(r.shape[1], device=r.device), []
     for step in range(steps):
         z = z - u @ (mu.T @ z)
-        before, square = square, np.maximum(_dots(r, z), 0)  # negative only by rounding
-        p = z + p * np.divide(square, before, out=np.zeros_like(square), where=before > 0)
+        before, square = square, _dots(r, z).clamp_min(0)  # negative only by rounding
+        p = torch.addcmul(z, p, torch.where(before > 0, square / before, 0.0))
         product = shifted(p, shifts)
         curvature = _dots(p, product)
-        length = np.where(curvature > 0, square / np.where(curvature > 0, curvature, 1), 0)
-        w += p * length
+        length = torch.where(curvature > 0, square / curvature, 0.0)
+        w.addcmul_(p, length)
         goes_on = (length * square > enough) & (step < steps - 1)
-        ends, stays = np.flatnonzero(~goes_on), np.flatnonzero(goes_on)
-        found.append((at[ends], w.take(ends, 1)))
+        ends, stays = (where.nonzero()[:, 0] for where in (~goes_on, goes_on))
+        if len(ends):
+            found.append((at[ends], w.index_select(1, ends)))
+            parts = r, product, length, w, p, at, square, shifts, enough
+            r, product, length, w, p, at, square, shifts, enough = (
+                x.index_select(-1, stays) for x in parts
+            )
         if len(stays) == 0:
             break
-        parts = r - product * length, w, p, at, square, shifts, enough
-        r, w, p, at, square, shifts, enough = (x.take(stays, -1) for x in parts)
+        r = torch.addcmul(r, product, length, value=-1)
         z = cycle(r)
-    order, w = (np.concatenate(x, -1) for x in zip(*found, strict=True))
-    return w.take(order.argsort(), 1)
+    order, w = (torch.cat(parts, -1) for parts in zip(*found, strict=True))
+    return w.index_select(1, order.argsort())
 
 
-def _two_levels(stiffness: Sparse, coarse: Inverse) -> Inverse:
-    """An approximate inverse of K, the two-grid cycle around a coarse solve, in float32."""
-    rough = without_small_entries(*_tensors(stiffness))
-    cycle = two_grid(
-        partial(multiply, *rough),
-        absolute_row_sums(rough[0], rough[2]),
-        lambda r: torch.from_numpy(coarse(r.numpy())),
-    )
-    return lambda r: cycle(torch.from_numpy(r)).numpy()
+def _dots(x: Tensor, y: Tensor) -> Tensor:
+    return torch.linalg.vecdot(x, y, dim=0)
 
 
-def _product(matrix: Sparse) -> Inverse:
-    """The product with a matrix in float32."""
-    crow, col, values = _tensors(matrix)
-    values = values.float()
-    return lambda x: multiply(crow, col, values, torch.from_numpy(x)).numpy()
-
-
-def _tensors(matrix: Sparse) -> Matrix:
-    """The arrays of a matrix as tensors, in the same memory."""
-    crow, col, values = map(torch.from_numpy, (matrix.indptr, matrix.indices, matrix.data))
-    return crow, col, values
-
-
-def _dots(x: np.ndarray, y: np.ndarray) -> np.ndarray:
-    return np.einsum("ij,ij->j", x, y)
-
-
-def _ritz(space: Blocks, count: int) -> tuple[np.ndarray, Blocks]:
+def _ritz(space: Blocks, count: int) -> tuple[Tensor, Blocks]:
     """Rayleigh–Ritz on the span of U, from (U, KU, MU): the smallest values, ascending, and these for their vectors."""
-    a, b = ((space[0].T @ x).astype(np.float64) for x in space[1:])
-    scale = np.where(b.diagonal() > 0, b.diagonal(), np.inf) ** -0.5  # drop vectors without mass
-    squares, q = linalg.eigh(b * scale * scale[:, None])
-    q = (scale[:, None] * q / np.sqrt(np.maximum(squares, TINY)))[:, squares > ROUNDING]
-    values, y = linalg.eigh(q.T @ a @ q)  # all of them: faster than a subset
-    y = (q @ y[:, :count]).astype(space[0].dtype)
+    a, b = ((space[0].T @ x).double() for x in space[1:])
+    scale = torch.where(b.diagonal() > 0, b.diagonal(), np.inf) ** -0.5  # drop vectors without mass
+    squares, q = torch.linalg.eigh(b * scale * scale[:, None])
+    q = (scale[:, None] * q / squares.clamp_min(TINY).sqrt())[:, squares > ROUNDING]
+    values, y = torch.linalg.eigh(q.T @ a @ q)
+    y = (q @ y[:, :count]).to(space[0])
     u, ku, mu = (x @ y for x in space)
     return values[:count], (u, ku, mu)
 
 
 def _merged(
     parts: list[_Part],
-    found: list[tuple[np.ndarray, ...]],
+    found: list[tuple[Tensor, ...]],
     null: tuple[np.ndarray, np.ndarray],
     mass: Tensor,
     k: int,
@@ -373,26 +361,23 @@ def _merged(
 ) -> Eigenbasis:
     """Constants Φ and MΦ followed by the other pairs of the components, ascending, in units of `mass`."""
     zeros = null[0].shape[1]
-    values, errors = (np.concatenate([np.zeros(zeros), *(f[i] for f in found)]) for i in (0, 1))
-    order = np.arange(len(values))
-    order[zeros:] = zeros + np.argsort(values[zeros:], kind="stable")
+    start = mass.new_zeros(zeros)
+    values, errors = (torch.cat([start, *(f[i] for f in found)]) for i in (0, 1))
+    order = values.sort(stable=True).indices
     values = values[order]
     keep = _closed(values, k, tolerance) if len(values) else 0
-    values, errors = values[:keep], errors[order[:keep]]
-    phi, left = np.zeros((2, len(mass), keep))
-    phi[:, :zeros], left[:, :zeros] = null
+    values, errors, order = values[:keep], errors[order[:keep]], order[:keep]
+    phi, left = mass.new_zeros(2, len(mass), keep)
+    phi[:, :zeros], left[:, :zeros] = (torch.from_numpy(x).to(mass) for x in null)
     at = zeros
     for part, (own, _, *vectors) in zip(parts, found, strict=True):
-        mine = order[:keep] - at
-        here = np.flatnonzero((mine >= 0) & (mine < len(own)))
+        points = torch.from_numpy(part.points).to(mass.device)
+        here = ((order >= at) & (order < at + len(own))).nonzero()[:, 0]
         for whole, columns in zip((phi, left), vectors, strict=True):
-            whole[part.points[:, None], here] = columns.take(mine[here], 1)
+            whole[points[:, None], here] = columns[:, order[here] - at].to(whole)
         at += len(own)
     square, unit = units  # of 1/λ, and of M
-    signs = np.where(-phi.min(0) > phi.max(0), -1.0, 1.0)  # the largest entry is positive
+    signs = 1 - 2 * (-phi.amin(0) > phi.amax(0)).to(phi)  # the largest entry is positive
     phi *= signs / unit**0.5
     left *= signs * unit**0.5
-    arrays = (values / square, phi, left, errors)
-    eigenvalues, eigenvectors, left, errors = (torch.from_numpy(x) for x in arrays)
-    mass = mass.detach().cpu().double()
-    return Eigenbasis(eigenvalues, eigenvectors, mass, left, relative_errors=errors)
+    return Eigenbasis(values / square, phi, mass, left, relative_errors=errors)
