@@ -10,13 +10,13 @@ import torch
 from jaxtyping import Float
 from scipy import sparse
 from torch import Tensor
-from torch.linalg import LinAlgError  # pyright: ignore[reportPrivateImportUsage]
+from torch.linalg import LinAlgError  # pyright: ignore
 from torch.nn.functional import pad
 
 from torchlb.errors import EigenbasisError
 from torchlb.linalg.conjugate_gradients import Linear
 from torchlb.linalg.factor import Factor
-from torchlb.linalg.precision import EPS, LOW, ROUNDS, SMALL
+from torchlb.linalg.precision import AT_ONCE, EPS, LOW, ROUNDS, SMALL
 from torchlb.linalg.sparse import multiply, on_device
 
 BLOCK = 16
@@ -105,8 +105,9 @@ def lanczos(
             if (bound := max(1 / float(theta[k - 1]) - shift, least)) < LOW * shift:
                 raise ShiftTooLarge(bound)
             if bool(((r @ y[-BLOCK:, :k]).norm(dim=0) <= tolerance * theta[:k]).all()):
-                kind = torch.float32 if rough else torch.float64
-                return 1 / theta - shift, basis[first:end].to(kind).T @ y.to(kind)
+                y = y.to(torch.float32 if rough else torch.float64)
+                parts = basis[first:end].split(AT_ONCE, dim=1)
+                return 1 / theta - shift, torch.cat([part.to(y).T @ y for part in parts])
             look = end + CHECK * BLOCK
         if end + BLOCK > len(basis):
             basis = torch.cat([basis, torch.empty_like(basis)])

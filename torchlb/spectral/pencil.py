@@ -1,16 +1,11 @@
-r"""Eigenpairs of a symmetric weak pair K u = λ M u (`method.md`, section 10).
+"""Eigenpairs of a symmetric weak pair K u = λ M u (`method.md`, section 10), component by component.
 
 Block Lanczos for the P1 pair (K₁, M₁), whose factor is 20 times sparser than that of K; Rayleigh–Ritz in (K, M); then
-Jacobi–Davidson sweeps. A sweep corrects each eigenvector u by some conjugate-gradient steps for (K − λM)w = Ku − λMu on
-the complement of the known vectors. Rayleigh–Ritz follows: first among all u − w, mostly enough, or among all u and w
-where an error is large; in later sweeps among the u and the w that are needed. The steps, taken in float32, give only
-directions, so that no digits are lost. Their preconditioner is a two-grid cycle, Chebyshev smoothing in K around a
-solve with that factor.
+Jacobi–Davidson sweeps (`sweeps`). All run on the device of the operator; small components are solved densely.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from functools import partial
 from typing import NamedTuple
 
@@ -23,23 +18,18 @@ from torch import Tensor
 from torch.nn.functional import pad
 
 from torchlb.errors import EigenbasisError, warn
-from torchlb.geometry.thresholds import FACTOR
-from torchlb.linalg.conjugate_gradients import Linear
 from torchlb.linalg.lanczos import BLOCK, lanczos_of_pair
 from torchlb.linalg.precision import (
     DENSE,
     EPS,
-    LARGEST_FACTORED,
     ROOT_EPS,
-    ROUNDING,
     ROUNDS,
     SMALL,
-    TINY,
 )
 from torchlb.linalg.sparse import multiply, on_device, on_one_pattern
-from torchlb.linalg.two_grid import absolute_row_sums, two_grid, without_small_entries
 from torchlb.spectral.components import constants
 from torchlb.spectral.eigenbasis import Eigenbasis
+from torchlb.spectral.sweeps import closed, swept
 
 SHARE = 9
 """If more than a ninth of the spectrum is wanted, a dense solve is as fast."""
@@ -47,17 +37,10 @@ SHIFT = 10.0
 """Shift of the factor times the size of a component: about half of its first eigenvalue, were it a disk."""
 START = 0.003
 """Relative residual of the eigenpairs of the P1 pair, whose distance from (K, M) is of that order."""
-LONGEST = 24
-"""Maximal number of conjugate-gradient steps in a sweep."""
-ASTRAY = 0.5
-"""Estimated error above which a sweep takes one step only, and the first one keeps the old vectors beside the new."""
-SAFETY = 4.0
-"""Factor on the estimated errors, which are too small where K is softer than its preconditioner."""
 
 
 Sparse = sparse.csr_array
 Pair = tuple[Sparse, Sparse]
-Blocks = tuple[Tensor, ...]  # U, KU, MU
 
 
 class _Part(NamedTuple):
@@ -215,139 +198,24 @@ def _pairs(part: _Part, k: int, tolerance: float, device: torch.device) -> tuple
         if part.linear is None:
             errors, mu = torch.full_like(values, tolerance), mass(u)
         else:
-            swept = _swept(part, u, k, solve, tolerance)
-            if swept is None:
+            matrices = [on_device(m, device) for m in (part.stiffness, part.mass_matrix, m1)]
+            found = swept(matrices, u, k, solve, tolerance, zero)
+            if found is None:
                 warn(
                     f"eigenbasis: after {ROUNDS} sweeps some of {k} eigenvalues are not accurate to {tolerance:.1g}, "
                     "as where spacings change abruptly. Factors of the whole pair take over, at many times the memory "
                     "and time; a larger `tolerance` does without"
                 )
                 return _pairs(part._replace(linear=None), k, EPS, device)
-            values, errors, u, mu = swept
+            values, errors, u, mu = found
     values[:zero] = 0.0
     if bool((values[zero:] <= 0).any()):
         raise EigenbasisError(
             f"eigenbasis: the stiffness has the eigenvalue {float(values[zero:].min()):.3g} on a component of {size} "
             "points, where it should be positive"
         )
-    keep = _closed(values, k, tolerance)
+    keep = closed(values, k, tolerance)
     return values[zero:keep], errors[zero:keep], u[:, zero:keep], mu[:, zero:keep]
-
-
-def _closed(values: Tensor, k: int, tolerance: float) -> int:
-    """The least number of pairs, k or more, that splits no group of equal eigenvalues; all if there is none."""
-    gaps = pad(values.diff() > max(ROOT_EPS, tolerance) * values[1:], (0, 1), value=True)
-    gaps[: min(k, len(values)) - 1] = False
-    return int(gaps.int().argmax()) + 1
-
-
-def _swept(
-    part: _Part, u: Tensor, k: int, solve: Linear, tolerance: float
-) -> tuple[Tensor, ...] | None:
-    """Sweep from the P1 eigenvectors until the first k eigenvalues are accurate; None if that takes too many sweeps."""
-    assert part.linear is not None
-    matrices = [on_device(m, u.device) for m in (part.stiffness, part.mass_matrix, part.linear[1])]
-    whole = [partial(multiply, *matrix) for matrix in matrices[:2]]
-    *single, on_linear_mass = (partial(multiply, c, i, v.float()) for c, i, v in matrices)
-    rough = without_small_entries(*matrices[0])
-    sums = absolute_row_sums(rough[0], rough[2])
-    cycle = two_grid(partial(multiply, *rough), sums, solve)
-
-    def shifted(p: Tensor, shifts: Tensor) -> Tensor:
-        return single[0](p).sub_(on_linear_mass(p).mul_(shifts))
-
-    count, zero = u.shape[1], int(part.conserving)
-    u = u.float().contiguous()
-    values, known = _ritz((u, *(on(u) for on in single)), count)
-    for sweep in range(ROUNDS + 1):
-        keep = _closed(values, k, tolerance) if sweep else count
-        (u, ku, mu), shifts = known, values[:keep].to(known[0])
-        residual = torch.addcmul(ku[:, :keep], mu[:, :keep], shifts, value=-1)
-        size = residual.norm(dim=0).clamp_min(TINY)
-        r = (residual / size).float()
-        z = cycle(r)
-        scale = SAFETY * size.double() ** 2 / values[:keep].abs().clamp_min(TINY)
-        errors = scale * _dots(r, z).abs()
-        errors[:zero] = 0.0
-        if sweep and float(errors.max()) <= tolerance:
-            return values[:keep], errors, u[:, :keep], mu[:, :keep]
-        coarse = float(errors[:k].max()) > ASTRAY
-        active = (errors > tolerance if sweep else torch.ones_like(errors)).nonzero()[:, 0]
-        # each step leaves a quarter of the energy or less, so the last one takes off FACTOR times what is left
-        enough = FACTOR * (SMALL * errors).clamp_min(tolerance) / scale.clamp_min(TINY)
-        right = [x.float().index_select(-1, active) for x in (r, z, shifts, enough)]
-        small = u.float(), mu.float()
-        w = _correction(shifted, cycle, small, right, 1 if coarse else LONGEST).double()
-        if sweep:
-            w -= u @ (mu.T @ w)
-        elif coarse:
-            w = torch.cat([u, w], dim=1)
-        else:
-            w = u - w * size
-        new = (w, *(on(w) for on in whole))
-        if sweep:
-            new = tuple(torch.cat(both, dim=1) for both in zip(known, new, strict=True))
-        values, known = _ritz(new, count)
-    if len(part.points) > LARGEST_FACTORED:
-        raise EigenbasisError(
-            f"eigenbasis: after {ROUNDS} sweeps the estimated relative error of some of {k} eigenvalues is above "
-            f"{tolerance:.1g}; ask for a larger tolerance"
-        )
-    return None
-
-
-def _correction(
-    shifted: Callable[[Tensor, Tensor], Tensor],
-    cycle: Linear,
-    known: tuple[Tensor, Tensor],
-    right: list[Tensor],
-    steps: int,
-) -> Tensor:
-    """Conjugate gradients for every column of (K − λM)w = r, M-orthogonal to U; of [U, MU] and [r, cycle(r), λ, ε].
-
-    A column ends with the step that reduces its energy by less than ε, or with the last step.
-    """
-    (u, mu), (r, z, shifts, enough) = known, right
-    w, p, square = torch.zeros_like(r), torch.zeros_like(r), torch.ones_like(enough)
-    at, found = torch.arange(r.shape[1], device=r.device), []
-    for step in range(steps):
-        z = z - u @ (mu.T @ z)
-        before, square = square, _dots(r, z).clamp_min(0)  # negative only by rounding
-        p = torch.addcmul(z, p, torch.where(before > 0, square / before, 0.0))
-        product = shifted(p, shifts)
-        curvature = _dots(p, product)
-        length = torch.where(curvature > 0, square / curvature, 0.0)
-        w.addcmul_(p, length)
-        goes_on = (length * square > enough) & (step < steps - 1)
-        ends, stays = (where.nonzero()[:, 0] for where in (~goes_on, goes_on))
-        if len(ends):
-            found.append((at[ends], w.index_select(1, ends)))
-            parts = r, product, length, w, p, at, square, shifts, enough
-            r, product, length, w, p, at, square, shifts, enough = (
-                x.index_select(-1, stays) for x in parts
-            )
-        if len(stays) == 0:
-            break
-        r = torch.addcmul(r, product, length, value=-1)
-        z = cycle(r)
-    order, w = (torch.cat(parts, -1) for parts in zip(*found, strict=True))
-    return w.index_select(1, order.argsort())
-
-
-def _dots(x: Tensor, y: Tensor) -> Tensor:
-    return torch.linalg.vecdot(x, y, dim=0)
-
-
-def _ritz(space: Blocks, count: int) -> tuple[Tensor, Blocks]:
-    """Rayleigh–Ritz on the span of U, from (U, KU, MU): the smallest values, ascending, and these for their vectors."""
-    a, b = ((space[0].T @ x).double() for x in space[1:])
-    scale = torch.where(b.diagonal() > 0, b.diagonal(), np.inf) ** -0.5  # drop vectors without mass
-    squares, q = torch.linalg.eigh(b * scale * scale[:, None])
-    q = (scale[:, None] * q / squares.clamp_min(TINY).sqrt())[:, squares > ROUNDING]
-    values, y = torch.linalg.eigh(q.T @ a @ q)
-    y = (q @ y[:, :count]).to(space[0])
-    u, ku, mu = (x @ y for x in space)
-    return values[:count], (u, ku, mu)
 
 
 def _merged(
@@ -365,7 +233,7 @@ def _merged(
     values, errors = (torch.cat([start, *(f[i] for f in found)]) for i in (0, 1))
     order = values.sort(stable=True).indices
     values = values[order]
-    keep = _closed(values, k, tolerance) if len(values) else 0
+    keep = closed(values, k, tolerance) if len(values) else 0
     values, errors, order = values[:keep], errors[order[:keep]], order[:keep]
     phi, left = mass.new_zeros(2, len(mass), keep)
     phi[:, :zeros], left[:, :zeros] = (torch.from_numpy(x).to(mass) for x in null)

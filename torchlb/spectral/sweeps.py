@@ -1,0 +1,203 @@
+"""Jacobi–Davidson sweeps for the eigenpairs of K u = λ M u (`method.md`, section 10).
+
+A sweep corrects each eigenvector u by some conjugate-gradient steps for (K − λM)w = Ku − λMu on the complement of the
+known vectors. Rayleigh–Ritz follows: first among all u − w, mostly enough, or among all u and w where an error is
+large; in later sweeps among the u and the w that are needed. The steps, taken in float32, give only directions, so that
+no digits are lost. Their preconditioner is a two-grid cycle, Chebyshev smoothing in K around a solve with the factor of
+the P1 pair.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from functools import partial
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+from torch.nn.functional import pad
+
+from torchlb.errors import EigenbasisError
+from torchlb.geometry.thresholds import FACTOR
+from torchlb.linalg.conjugate_gradients import Linear
+from torchlb.linalg.lanczos import BLOCK
+from torchlb.linalg.precision import LARGEST_FACTORED, ROOT_EPS, ROUNDING, ROUNDS, SMALL, TINY
+from torchlb.linalg.sparse import multiply
+from torchlb.linalg.two_grid import Matrix, absolute_row_sums, two_grid, without_small_entries
+
+LONGEST = 24
+"""Maximal number of conjugate-gradient steps in a sweep."""
+ASTRAY = 0.5
+"""Estimated error above which a sweep takes one step only, and the first one keeps the old vectors beside the new."""
+CHUNK = 16 * BLOCK
+"""Columns that are corrected together: more take memory, and no less time."""
+SAFETY = 4.0
+"""Factor on the estimated errors, which are too small where K is softer than its preconditioner."""
+
+Matrices = Sequence[Matrix]  # K, M, M₁
+Blocks = tuple[Tensor, ...]  # U, KU, MU
+
+
+def closed(values: Tensor, k: int, tolerance: float) -> int:
+    """The least number of pairs, k or more, that splits no group of equal eigenvalues; all if there is none."""
+    gaps = pad(values.diff() > max(ROOT_EPS, tolerance) * values[1:], (0, 1), value=True)
+    gaps[: min(k, len(values)) - 1] = False
+    return int(gaps.int().argmax()) + 1
+
+
+class _Maps(NamedTuple):
+    """Products with K and M, in float64 and in float32, with K − λM₁, and an approximate inverse of K."""
+
+    whole: tuple[Linear, Linear]
+    single: tuple[Linear, Linear]
+    shifted: Callable[[Tensor, Tensor], Tensor]
+    cycle: Linear
+
+    @classmethod
+    def of(cls, matrices: Matrices, solve: Linear) -> _Maps:
+        """The maps of K, M and M₁; the inverse is the two-grid cycle around `solve`, that of the P1 pair."""
+        k, m, m1 = matrices
+        single = [partial(multiply, crow, col, v.float()) for crow, col, v in (k, m, m1)]
+        rough = without_small_entries(*k)
+        cycle = two_grid(partial(multiply, *rough), absolute_row_sums(rough[0], rough[2]), solve)
+
+        def shifted(p: Tensor, shifts: Tensor) -> Tensor:
+            return single[0](p).sub_(single[2](p).mul_(shifts))
+
+        return cls(
+            (partial(multiply, *k), partial(multiply, *m)), (single[0], single[1]), shifted, cycle
+        )
+
+
+def swept(
+    matrices: Matrices, u: Float[Tensor, "N m"], k: int, solve: Linear, tolerance: float, zero: int
+) -> tuple[Tensor, ...] | None:
+    """Sweep from the P1 eigenvectors until the first k eigenvalues are accurate; None if that takes too many sweeps.
+
+    Of K, M and M₁, and a product with the inverse of K₁ + σM₁; `zero` is the number of eigenvalues 0 among the m. The
+    result has the eigenvalues, estimates of their relative errors, U and MU.
+    """
+    maps, count = _Maps.of(matrices, solve), u.shape[1]
+    u = u.float().contiguous()
+    values, known = _ritz([[u], *([on(u)] for on in maps.single)], count)
+    for sweep in range(ROUNDS + 1):
+        keep = closed(values, k, tolerance) if sweep else count
+        size, estimates, r, z = _residuals(maps, known, values[:keep])
+        scale = SAFETY * size.double() ** 2 / values[:keep].abs().clamp_min(TINY)
+        errors = scale * estimates.abs()
+        errors[:zero] = 0.0
+        if sweep and float(errors.max()) <= tolerance:
+            u, _, mu = (x[:, :keep] for x in known)
+            return values[:keep], errors, u, mu
+        coarse = float(errors[:k].max()) > ASTRAY
+        active = (errors > tolerance if sweep else torch.ones_like(errors)).nonzero()[:, 0]
+        # each step leaves a quarter of the energy or less, so the last one takes off FACTOR times what is left
+        enough = FACTOR * (SMALL * errors).clamp_min(tolerance) / scale.clamp_min(TINY)
+        right = [x.float()[..., active] for x in (r, z, values[:keep], enough)]
+        del r, z
+        small = known[0].float(), known[2].float()
+        w = _corrections(maps, small, right, 1 if coarse else LONGEST).double()
+        del right, small
+        if sweep:
+            w -= known[0] @ (known[2].T @ w)
+        elif coarse:
+            w = torch.cat([known[0], w], dim=1)
+        else:
+            w = known[0] - w * size
+        space = [[w], *([on(w)] for on in maps.whole)]
+        if sweep:
+            space = [[old, *new] for old, new in zip(known, space, strict=True)]
+        w, known = None, ()
+        values, known = _ritz(space, count)
+    if len(u) > LARGEST_FACTORED:
+        raise EigenbasisError(
+            f"eigenbasis: after {ROUNDS} sweeps the estimated relative error of some of {k} eigenvalues is above "
+            f"{tolerance:.1g}; ask for a larger tolerance"
+        )
+    return None
+
+
+def _residuals(maps: _Maps, known: Blocks, values: Tensor) -> tuple[Tensor, ...]:
+    """The norms of Ku − λMu, their energies in units of these, the residuals of norm one, and the cycle of these."""
+    found = []
+    for columns in torch.arange(len(values), device=values.device).split(CHUNK):
+        ku, mu = (x.index_select(1, columns) for x in known[1:])
+        residual = torch.addcmul(ku, mu, values[columns].to(ku), value=-1)
+        size = residual.norm(dim=0).clamp_min(TINY)
+        r = (residual / size).float()
+        z = maps.cycle(r)
+        found.append((size, _dots(r, z), r, z))
+    return tuple(torch.cat(parts, -1) for parts in zip(*found, strict=True))
+
+
+def _corrections(
+    maps: _Maps, known: tuple[Tensor, Tensor], right: list[Tensor], steps: int
+) -> Tensor:
+    """`_correction` of all columns, some at once, to bound the memory."""
+    parts = zip(*(x.split(CHUNK, -1) for x in right), strict=True)
+    return torch.cat([_correction(maps, known, part, steps) for part in parts], dim=1)
+
+
+def _correction(
+    maps: _Maps, known: tuple[Tensor, Tensor], right: tuple[Tensor, ...], steps: int
+) -> Tensor:
+    """Conjugate gradients for every column of (K − λM)w = r, M-orthogonal to U; of [U, MU] and [r, cycle(r), λ, ε].
+
+    A column ends with the step that reduces its energy by less than ε, or with the last step.
+    """
+    (u, mu), (r, z, shifts, enough) = known, right
+    w, p, square = torch.zeros_like(r), torch.zeros_like(r), torch.ones_like(enough)
+    at, found = torch.arange(r.shape[1], device=r.device), []
+    for step in range(steps):
+        z = z - u @ (mu.T @ z)
+        before, square = square, _dots(r, z).clamp_min(0)  # negative only by rounding
+        p = torch.addcmul(z, p, torch.where(before > 0, square / before, 0.0))
+        product = maps.shifted(p, shifts)
+        curvature = _dots(p, product)
+        length = torch.where(curvature > 0, square / curvature, 0.0)
+        w.addcmul_(p, length)
+        goes_on = (length * square > enough) & (step < steps - 1)
+        ends, stays = (where.nonzero()[:, 0] for where in (~goes_on, goes_on))
+        if len(ends):
+            found.append((at[ends], w.index_select(1, ends)))
+            parts = r, product, length, w, p, at, square, shifts, enough
+            r, product, length, w, p, at, square, shifts, enough = (
+                x.index_select(-1, stays) for x in parts
+            )
+        if len(stays) == 0:
+            break
+        r = torch.addcmul(r, product, length, value=-1)
+        z = maps.cycle(r)
+    order, w = (torch.cat(parts, -1) for parts in zip(*found, strict=True))
+    return w.index_select(1, order.argsort())
+
+
+def _dots(x: Tensor, y: Tensor) -> Tensor:
+    return torch.linalg.vecdot(x, y, dim=0)
+
+
+def _ritz(space: list[list[Tensor]], count: int) -> tuple[Tensor, Blocks]:
+    """Rayleigh–Ritz on the span of U, from the columns of (U, KU, MU): the smallest values and their (U, KU, MU).
+
+    Each is given as a list of blocks of columns, which are let go one by one.
+    """
+    a, b = (
+        torch.cat([torch.cat([(u.T @ x).double() for x in product], 1) for u in space[0]])
+        for product in space[1:]
+    )
+    scale = torch.where(b.diagonal() > 0, b.diagonal(), np.inf) ** -0.5  # drop vectors without mass
+    squares, q = torch.linalg.eigh(b * scale * scale[:, None])
+    q = (scale[:, None] * q / squares.clamp_min(TINY).sqrt())[:, squares > ROUNDING]
+    values, y = torch.linalg.eigh(q.T @ a @ q)
+    y = (q @ y[:, :count]).to(space[0][0])
+    found = []
+    while space:
+        blocks = space.pop(0)
+        first, *rest = y.split([x.shape[1] for x in blocks])
+        result = blocks.pop(0) @ first
+        for part in rest:
+            result.addmm_(blocks.pop(0), part)
+        found.append(result)
+    return values[:count], tuple(found)
