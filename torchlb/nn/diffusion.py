@@ -45,7 +45,7 @@ class Diffusion(LearnedTimes):
         C.
     method
         "deflated" (exact at every scale), "spectral" (as in the original DiffusionNet: Φe^{−λt}Φᵀπ, which drops
-        everything beyond the basis), "rational" (no basis; solves on the CPU).
+        everything beyond the basis), "rational" (no basis, but solves).
     k
         Number of eigenpairs for the first two.
     init_time
