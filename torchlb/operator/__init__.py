@@ -7,6 +7,6 @@ and how they travel; `parts`: the weak pair and the eigenbasis among them. `batc
 `build_cloud`: the same by a complex through a cloud.
 `stencil_methods`: Δf, ∇f and curvature at a point; `curvature`: principal curvatures. `connection`: tangent fields.
 `medium`: the weak pair in a medium. `systems`: linear systems of the pair, and their factors. `through`: derivatives
-in points and medium; `eigenpairs`: those of eigenpairs. `pair_methods`: the pair's matrices, the eigenbasis.
+in points and medium. `pair_methods`: the pair's matrices, the eigenbasis.
 `laplace_beltrami`: the class. `dispatch`: any operator by name and options. `collate`: samples of a `DataLoader`.
 """
