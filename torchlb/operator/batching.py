@@ -110,10 +110,9 @@ def _joined_certificate(certificates: Sequence[dict[str, Any] | None]) -> dict[s
     known = [each for each in certificates if each is not None]
     if len(known) < len(certificates):
         return None
-    worst = {
-        "holds": all(each["holds"] for each in known),
-        "min_pi": min(each["min_pi"] for each in known),
-        "max_s": max((each["max_s"] for each in known), key=lambda s: (isnan(s), s)),
-        "rounds": max(each["rounds"] for each in known),
-    }
-    return {key: worst[key] if key in worst else sum(c[key] for c in known) for key in known[0]}
+    how: dict[str, Any] = {"holds": all, "min_pi": min, "max_s": _largest, "rounds": max}
+    return {key: how.get(key, sum)([each[key] for each in known]) for key in known[0]}
+
+
+def _largest(values: Sequence[float]) -> float:
+    return max(values, key=lambda x: (isnan(x), x))

@@ -204,25 +204,3 @@ def check_tolerance(tolerance: float | None) -> None:
     """
     if tolerance is not None and not 0 < tolerance < 1:
         raise InputError(f"tolerance: expected a number between 0 and 1, got {tolerance}")
-
-
-def check_same_points(points: Tensor, built: Float[Tensor, "N n"]) -> None:
-    """Raise InputError unless the points are those an operator was built from, to float32 rounding."""
-    if points.shape != built.shape:
-        raise InputError(
-            f"points: expected the {tuple(built.shape)} that the operator was built from, got "
-            f"{tuple(points.shape)}; build it again after points are added, left out or projected"
-        )
-    theirs, ours = points.detach().to(built.device).double(), built.double()
-    rounding = max(
-        torch.finfo(torch.promote_types(t, torch.float16)).eps for t in (points.dtype, built.dtype)
-    )
-    most = 4 * max(rounding, torch.finfo(torch.float32).eps) * float(ours.abs().amax())
-    distance = (theirs - ours).abs().amax(1)
-    moved = (~(distance <= most)).nonzero()[:, 0]
-    if len(moved):
-        raise InputError(
-            f"points: {len(moved)} of {len(points)} are not where they were when the operator was built "
-            f"({first_few(moved)}; by up to {float(distance.amax()):.3g}); build it again after scaling, turning "
-            "or deforming a shape"
-        )

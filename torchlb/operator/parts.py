@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-from collections import OrderedDict
 from collections.abc import Sequence
 from typing import Any
-from weakref import finalize
 
 import torch
 from jaxtyping import Bool, Float
@@ -221,16 +219,15 @@ class OperatorCache:
     ----------
     values
         Values of the weak pair that the results belong to; an operator with other values gets a new cache.
-    systems, elements, connection
-        Linear systems with their factors; elements of the weak pair, made for the first medium; tangent fields.
+    system, elements, connection
+        The linear system with its factors; elements of the weak pair, made for the first medium; tangent fields.
     shapes
         Shapes of a batch, whose caches serve it, each with the values that it had.
     """
 
     def __init__(self, values: Tensor) -> None:
         self.values = values
-        self.connection: Any = None
-        self.systems: OrderedDict[Any, Any] = OrderedDict()
+        self.system: Any = None
         self.elements: Any = None
+        self.connection: Any = None
         self.shapes: tuple[tuple[Any, Tensor], ...] = ()
-        finalize(self, self.systems.clear)  # cholespy reports factors that outlive Python as leaks

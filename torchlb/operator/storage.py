@@ -13,9 +13,8 @@ from torch import Tensor
 
 from torchlb.certified.certificate import Certificate
 from torchlb.cloud.surface import SurfaceSummary
-from torchlb.errors import InputError, warn
+from torchlb.errors import InputError, first_few, warn
 from torchlb.linalg.csr import Csr, Record, Tensors, tensors_of
-from torchlb.operator.checks import check_same_points
 from torchlb.operator.parts import DecidedAt, MediumFields, Modes, OperatorCache, PairMatrices
 from torchlb.spectral.eigenbasis import Eigenbasis
 from torchlb.stencils.conditions import Condition, condition_of, kind_of
@@ -213,7 +212,23 @@ class OperatorStorage(Tensors):
 
         An operator does not follow its points: after scaling, turning, or taking a part of them it is another one.
         """
-        check_same_points(points, self.points)
+        built = self.points
+        if points.shape != built.shape:
+            raise InputError(
+                f"points: expected the {tuple(built.shape)} that the operator was built from, got "
+                f"{tuple(points.shape)}; build it again after points are added, left out or projected"
+            )
+        theirs, ours = points.detach().to(built.device).double(), built.double()
+        types = (torch.promote_types(t, torch.float16) for t in (points.dtype, built.dtype))
+        rounding = max(torch.finfo(t).eps for t in (*types, torch.float32))
+        distance = (theirs - ours).abs().amax(1)
+        moved = (~(distance <= 4 * rounding * float(ours.abs().amax()))).nonzero()[:, 0]
+        if len(moved):
+            raise InputError(
+                f"points: {len(moved)} of {len(points)} are not where they were when the operator was built "
+                f"({first_few(moved)}; by up to {float(distance.amax()):.3g}); build it again after scaling, turning "
+                "or deforming a shape"
+            )
 
     def __repr__(self) -> str:
         """N, d, n, source and options."""
