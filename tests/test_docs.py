@@ -266,4 +266,5 @@ def test_the_site_builds_without_a_network(tmp_path):
         assert not fetched, (page.name, fetched)
     reference = (tmp_path / "api" / "operators.html").read_text("utf-8")
     assert "from_points" in reference
+    assert 'id="torchlb.LaplaceBeltrami.eigenbasis"' in reference  # of a base class
     assert "Raises" in reference

@@ -14,8 +14,8 @@ from torchlb import (
     heat_flow,
     implicit_step,
 )
+from torchlb.nn.diffusion import ImplicitDiffusion
 from torchlb.nn.gradient_features import TangentMap
-from torchlb.nn.implicit_diffusion import ImplicitDiffusion
 from torchlb.nn.tangent import _divergence_and_curl
 from torchlb.surfaces import Circle, Ellipsoid, Sphere, StarShaped, Torus, UnitDisk
 

@@ -28,19 +28,18 @@ from torchlb.errors import (
 from torchlb.io.cache import load_operator, load_or_build, operator_key, save_operator
 from torchlb.io.files import read_point_data, read_shape, write_shape
 from torchlb.io.precompute import PrecomputeReport, ShapeResult, precompute_operators
-from torchlb.nn.diffusion import Diffusion
+from torchlb.nn.diffusion import Diffusion, ImplicitDiffusion
 from torchlb.nn.diffusion_net import DiffusionNet, DiffusionNetBlock
 from torchlb.nn.gradient_features import GradientFeatures
-from torchlb.nn.implicit_diffusion import ImplicitDiffusion
 from torchlb.nn.poisson_block import PoissonBlock, PoissonFeatures
 from torchlb.nn.spectral_conv import SpectralConv
 from torchlb.nn.tangent import TangentBlock, TangentDiffusion
 from torchlb.operator.cleaning import clean_mesh, clean_points, submesh
 from torchlb.operator.collate import collate
 from torchlb.operator.connection import Connection
-from torchlb.operator.curvature import Curvatures
 from torchlb.operator.laplace_beltrami import LaplaceBeltrami
 from torchlb.operator.report import StencilReport
+from torchlb.operator.stencil_methods import Curvatures
 from torchlb.pde.geodesics import geodesic_distance
 from torchlb.pde.heat import heat_flow, smooth
 from torchlb.pde.hodge import HodgeParts, hodge_decomposition

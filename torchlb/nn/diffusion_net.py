@@ -16,11 +16,9 @@ from torch import Tensor, nn
 from torch.nn.functional import linear
 
 from torchlb.errors import InputError
-from torchlb.nn.checks import unrounded
-from torchlb.nn.diffusion import raw_of_time
-from torchlb.nn.gradient_features import GradientFeatures, TangentMap
-from torchlb.nn.implicit_diffusion import diffusion_by
-from torchlb.nn.pointwise import mlp
+from torchlb.nn.diffusion import diffusion_by, raw_of_time
+from torchlb.nn.gradient_features import GradientBlock, TangentMap
+from torchlb.nn.pointwise import unrounded
 from torchlb.nn.poisson_block import PoissonBlock
 from torchlb.nn.tangent import TangentBlock
 from torchlb.operator.laplace_beltrami import LaplaceBeltrami
@@ -33,7 +31,7 @@ LEAST_TIME = 1e-8
 """Least time in the original, which clamps its times to it before use, ℓ²."""
 
 
-class DiffusionNetBlock(nn.Module):
+class DiffusionNetBlock(GradientBlock):
     """Diffusion, gradient features of the result, a pointwise network of x and both, and a skip connection.
 
     Parameters
@@ -61,23 +59,8 @@ class DiffusionNetBlock(nn.Module):
         method: Method | Literal["implicit"] = "spectral",
         k: int = 128,
     ) -> None:
-        super().__init__()
-        self.diffusion = diffusion_by(method, width, k)
-        self.gradient_features = (
-            GradientFeatures(width, rotations=rotations) if gradient_features else None
-        )
-        inputs = 3 if gradient_features else 2
-        hidden = [width, width] if hidden is None else hidden
-        self.mlp = mlp([inputs * width, *hidden, width], dropout)
-
-    def forward(self, x: Float[Tensor, "*B N C"], lb: LaplaceBeltrami) -> Float[Tensor, "*B N C"]:
-        """Features of x, (N, width) or (B, N, width), on the shape or batch of `lb`, in the shape of x."""
-        width, parameter = self.diffusion.channels, self.diffusion.raw_time
-        diffused = self.diffusion(unrounded(x, lb, width, parameter), lb)
-        features = [x, diffused]
-        if self.gradient_features is not None:
-            features.append(self.gradient_features(diffused, lb))
-        return x + self.mlp(torch.cat(features, dim=-1))
+        layer = diffusion_by(method, width, k)
+        super().__init__("diffusion", layer, hidden, dropout, gradient_features, rotations)
 
 
 class DiffusionNet(nn.Module):
@@ -193,7 +176,8 @@ class DiffusionNet(nn.Module):
         else:
             y = self.last_lin(y)
         if self.outputs_at == "global_mean":
-            y = _global_mean(y, lb)
+            area = lb.integral(torch.ones_like(lb.mass))[..., None]
+            y = (lb.integral(y) / area).to(y.dtype)
         elif self.outputs_at in ("faces", "edges"):
             corners = faces if self.outputs_at == "faces" else edges
             y = y[..., _checked_corners(self.outputs_at, corners, lb), :].mean(-2)
@@ -269,12 +253,3 @@ def _checked_corners(place: str, corners: Tensor | None, lb: LaplaceBeltrami) ->
             f"indices up to {last} leave some shapes without {place}, or join two of them"
         )
     return corners
-
-
-def _global_mean(y: Tensor, lb: LaplaceBeltrami) -> Tensor:
-    """Σ π y / Σ π over the surface, for each shape of a batch."""
-    mass = lb.mass.to(torch.promote_types(y.dtype, torch.float32))[:, None]
-    sizes = lb.sizes or len(mass)
-    parts = zip(mass.split(sizes), y.split(sizes, dim=-2), strict=True)
-    means = torch.stack([(m / m.sum() * part).sum(-2) for m, part in parts], dim=-2).to(y.dtype)
-    return means[..., 0, :] if lb.sizes is None else means

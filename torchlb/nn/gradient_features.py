@@ -1,6 +1,8 @@
-"""Features of gradients that do not depend on the choice of tangent frames."""
+"""Features of gradients that do not depend on the choice of tangent frames, and blocks that end in them."""
 
 from __future__ import annotations
+
+from typing import Any
 
 import torch
 from jaxtyping import Float
@@ -8,7 +10,7 @@ from torch import Tensor, nn
 from torch.nn.functional import linear
 
 from torchlb.errors import InputError
-from torchlb.nn.checks import check_features
+from torchlb.nn.pointwise import Widths, check_features, mlp, unrounded
 from torchlb.operator.laplace_beltrami import LaplaceBeltrami
 
 
@@ -77,3 +79,24 @@ class GradientFeatures(TangentMap):
         """Features of x, (N, C) or (B, N, C), on the shape or batch of `lb`, in the shape and type of x."""
         gradient, mapped = self.gradients(x, lb)
         return torch.tanh((gradient * mapped).sum(-2))
+
+
+class GradientBlock(nn.Module):
+    """A named layer, gradient features of its result, a pointwise network of x and both, and a skip connection."""
+
+    def __init__(
+        self, name: str, layer: Any, hidden: Widths, dropout: bool, gradients: bool, rotations: bool
+    ) -> None:
+        super().__init__()
+        self.add_module(name, layer)
+        self._layer, width = name, layer.channels
+        self.gradient_features = GradientFeatures(width, rotations=rotations) if gradients else None
+        self.mlp = mlp((3 if gradients else 2) * width, hidden, width, dropout)
+
+    def forward(self, x: Float[Tensor, "*B N C"], lb: LaplaceBeltrami) -> Float[Tensor, "*B N C"]:
+        """Features of x, (N, width) or (B, N, width), on the shape or batch of `lb`, in the shape of x."""
+        layer: Any = getattr(self, self._layer)
+        features = [x, layer(unrounded(x, lb, layer.channels, next(layer.parameters())), lb)]
+        if self.gradient_features is not None:
+            features.append(self.gradient_features(features[1], lb))
+        return x + self.mlp(torch.cat(features, dim=-1))

@@ -14,9 +14,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from torchlb.nn.checks import check_features, unrounded
-from torchlb.nn.gradient_features import GradientFeatures, TangentMap
-from torchlb.nn.pointwise import mlp
+from torchlb.nn.gradient_features import GradientBlock, TangentMap
+from torchlb.nn.pointwise import check_features
 from torchlb.operator.laplace_beltrami import LaplaceBeltrami
 from torchlb.pde.solves import potential
 
@@ -70,7 +69,7 @@ class PoissonFeatures(nn.Module):
         return u.to(x.dtype)
 
 
-class PoissonBlock(nn.Module):
+class PoissonBlock(GradientBlock):
     """Poisson features, gradient features of them, a pointwise network of these and x, and a skip connection.
 
     Parameters
@@ -106,21 +105,5 @@ class PoissonBlock(nn.Module):
         fields: bool = False,
         tolerance: float | None = None,
     ) -> None:
-        super().__init__()
-        self.features = PoissonFeatures(
-            width, fields=fields, rotations=rotations, tolerance=tolerance
-        )
-        self.gradient_features = (
-            GradientFeatures(width, rotations=rotations) if gradient_features else None
-        )
-        hidden = [width, width] if hidden is None else hidden
-        self.mlp = mlp([(3 if gradient_features else 2) * width, *hidden, width], dropout)
-
-    def forward(self, x: Float[Tensor, "*B N C"], lb: LaplaceBeltrami) -> Float[Tensor, "*B N C"]:
-        """Features of x, (N, width) or (B, N, width), on the shape or batch of `lb`, in the shape of x."""
-        width, parameter = self.features.channels, self.features.source.weight
-        solved = self.features(unrounded(x, lb, width, parameter), lb)
-        features = [x, solved]
-        if self.gradient_features is not None:
-            features.append(self.gradient_features(solved, lb))
-        return x + self.mlp(torch.cat(features, dim=-1))
+        layer = PoissonFeatures(width, fields=fields, rotations=rotations, tolerance=tolerance)
+        super().__init__("features", layer, hidden, dropout, gradient_features, rotations)

@@ -10,7 +10,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from torchlb.linalg.exponential import chebyshev_vectors
-from torchlb.nn.checks import check_features
+from torchlb.nn.pointwise import check_features
 from torchlb.operator.laplace_beltrami import LaplaceBeltrami
 
 

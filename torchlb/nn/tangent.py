@@ -15,10 +15,9 @@ from torch import Tensor, nn
 
 from torchlb.errors import InputError
 from torchlb.linalg.checks import check_operator, check_tensor
-from torchlb.nn.checks import unrounded
+from torchlb.nn.diffusion import diffusion_by
 from torchlb.nn.gradient_features import TangentMap
-from torchlb.nn.implicit_diffusion import diffusion_by
-from torchlb.nn.pointwise import mlp
+from torchlb.nn.pointwise import mlp, unrounded
 from torchlb.operator.laplace_beltrami import LaplaceBeltrami
 from torchlb.pde.checks import check_choice
 
@@ -104,7 +103,7 @@ class TangentBlock(nn.Module):
         self.diffusion = diffusion_by(method, width, k)
         self.map = TangentMap(3 * width, width, rotations=rotations)
         hidden = [width, width] if hidden is None else hidden
-        self.mlp = mlp([(6 if rotations else 5) * width, *hidden, 2 * width], dropout)
+        self.mlp = mlp((6 if rotations else 5) * width, hidden, 2 * width, dropout)
 
     def forward(self, x: Functions, u: Fields, lb: LaplaceBeltrami) -> tuple[Functions, Fields]:
         """Functions x (…, N, C) and fields u (…, N, d, C) after the block, on the shape or batch of `lb`.

@@ -3,10 +3,10 @@
 `inputs`: points and faces as tensors. `options`: a user's choices. `cleaning`: duplicates, quads, orientation.
 `checks`: bad input is refused, with the remedy. `report`: the order reached at each point. `storage`: the tensors,
 and how they travel; `parts`: the weak pair and the eigenbasis among them. `batching`: several shapes as one operator.
-`assembled`: a finished operator before it is stored. `plan`: the decisions behind an operator, and their evaluation
-at given points. `build`: both from checked input; `build_cloud`: the same by a complex through a cloud.
-`stencil_methods`: Δf, ∇f and curvature at a point; `curvature`: principal curvatures. `connection`: tangent fields.
+`plan`: the decisions behind an operator, and its parts by them at given points. `build`: both from checked input;
+`build_cloud`: the same by a complex through a cloud.
+`stencil_methods`: Δf, ∇f and curvatures at a point. `connection`: tangent fields.
 `medium`: the weak pair in a medium. `systems`: linear systems of the pair, and their factors. `through`: derivatives
-in points and medium; `eigenpairs`: those of eigenpairs. `pair_methods`: the pair's matrices, the eigenbasis.
+in points and medium. `pair_methods`: the pair's matrices, the eigenbasis.
 `laplace_beltrami`: the class. `dispatch`: any operator by name and options. `collate`: samples of a `DataLoader`.
 """

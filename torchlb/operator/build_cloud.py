@@ -16,8 +16,6 @@ from torchlb.cloud.complexes import Complex
 from torchlb.cloud.doubts import (
     on_rim,
     warn_of_buried,
-    warn_of_doubts,
-    warn_of_joins,
     warn_of_layers,
     warn_of_near_duplicates,
 )
@@ -25,13 +23,12 @@ from torchlb.cloud.reconstruction import reconstruct
 from torchlb.cloud.surface import CloudSurface
 from torchlb.errors import InputError, renumbered
 from torchlb.galerkin.flips import flipped
-from torchlb.galerkin.pair import mesh_pair
 from torchlb.geometry.neighbors import nearest_neighbors
 from torchlb.geometry.numbering import Numbering
 from torchlb.geometry.thresholds import NEAREST
+from torchlb.linalg.precision import SINGLE
 from torchlb.linalg.threads import threads_for
-from torchlb.operator.assembled import AssembledOperator
-from torchlb.operator.build import finished, on_cells, with_plan
+from torchlb.operator.build import finished, on_cells
 from torchlb.operator.checks import (
     check_boundary,
     check_dimension,
@@ -43,6 +40,7 @@ from torchlb.operator.checks import (
 )
 from torchlb.operator.inputs import ArrayLike, check_points
 from torchlb.operator.options import Options
+from torchlb.operator.plan import Parts, Plan, evaluate
 from torchlb.operator.storage import OperatorStorage
 from torchlb.stencils.conditions import condition_of
 from torchlb.stencils.shape import surface_shape
@@ -60,7 +58,7 @@ def build_cloud(
     boundary: ArrayLike | str | None,
     reconstruction: Reconstruction | None,
     progress: bool,
-) -> AssembledOperator:
+) -> Parts:
     """Build an operator on a point cloud; arguments as for `LaplaceBeltrami.from_points`."""
     points = check_points(points)
     check_scale(points)
@@ -98,8 +96,7 @@ def build_cloud(
         if mask is not None and found.shares is None:
             warn_of_buried(found.cells, mask)
         if isinstance(found, CloudSurface):
-            built = _on_surface(here, found, options, mask, numbering, progress)
-            return built.restored(numbering, points, built.faces)
+            return _on_surface(here, found, options, mask, numbering, progress)
         if d == 1:
             warn_of_near_duplicates(here, nearest_neighbors(here, min(NEAREST, len(here))), 1)
     cells, edge = numbering.given[found.cells], None
@@ -137,14 +134,12 @@ def _on_surface(
     boundary: Bool[Tensor, " N"] | None,
     numbering: Numbering,
     progress: bool,
-) -> AssembledOperator:
+) -> Parts:
     """Build an operator on a cloud in R² or R³ by the surface through it."""
-    ambient = points.shape[1]
     warn_of_near_duplicates(points, surface.neighbors, 2)
-    if ambient == 3:
+    if points.shape[1] == 3:
         warn_of_layers(points)
     surface = replace(surface, cells=flipped(surface.points, surface.cells))
-    degree, degrees = options.elements
     shape = surface_shape(
         points,
         surface,
@@ -152,48 +147,41 @@ def _on_surface(
         num_neighbors=options.num_neighbors,
         boundary=boundary,
         condition=options.held(numbering),
-        fit_degrees=degrees,
+        fit_degrees=options.elements[1],
         progress=progress,
     )
-    pair = plan = None
-    if degree > 0:
-        assert shape.plan is not None
-        assert shape.fits is not None
-        own = surface.cells, shape.plan.fits, shape.fits, degree, degrees
-        rest = surface.stars, shape.held
-        plan, pair = mesh_pair(shape.points, *own, *rest, numbering=numbering)
-        assert pair.mass is not None
-        shape = replace(shape, areas=pair.mass)
-        warn_of_doubts(surface, plan.fits, pair.mass)
-    warn_of_joins(surface)
-    built = finished(shape, "points", options, progress, pair, plan)
-    faces = numbering.given[surface.cells]
-    built = replace(built, faces=faces, surface=surface.summary)
-    every = torch.arange(len(faces))
-    return with_plan(built, shape, plan, options, numbering, every, moved=every[:0])
+    faces, every = numbering.given[surface.cells], torch.arange(len(surface.cells))
+    places = numbering.restored(points), faces, every, every[:0]
+    rest = "points", options, numbering, progress
+    return finished(shape, surface.cells, places, *rest, surface)
 
 
-def built_again(lb: OperatorStorage) -> AssembledOperator:
-    """Build an operator on a mesh or a cloud again from its stored points, faces and options.
+def plan_again(lb: OperatorStorage) -> Plan:
+    """Decide on a mesh or a cloud again, from the points of the decisions, faces and options.
 
     Raises InputError where the result differs: where points of a noisy curve were moved, or where cells through a cloud
     came from normals or from a user's function.
     """
-    points, options = lb.points.detach().cpu().double(), Options(**lb.options)
+    points, options = lb._decided_points, Options(**lb.options)
     boundary, cells = None if lb.boundary is None else lb.boundary.cpu(), lb.faces.cpu()
     if lb.surface is None and (lb.source == "mesh" or lb.dim < 3 or lb.points.shape[1] == 3):
         built = on_cells(points, points, cells, options, boundary, lb.source, progress=False)
     else:
         rest: Any = dict.fromkeys(("normals", "reconstruction"))
         built = build_cloud(points, lb.dim, options, boundary=boundary, progress=False, **rest)
-    ours, theirs = (faces.sort(1).values.numpy() for faces in (built.faces, cells))
+    ours, theirs = (faces.sort(1).values.numpy() for faces in (built["faces"], cells))
     rows = [torch.from_numpy(np.lexsort(faces.T)) for faces in (ours, theirs)]
     same = np.array_equal(ours[rows[0]], theirs[rows[1]])
-    if not same or not torch.allclose(built.mass, lb.mass.cpu().double(), atol=0):
+    place = torch.empty_like(rows[0]).index_copy(0, *rows)  # index of each face among the user's
+    plan, mass = built["_plan"], built["mass"]
+    if same:
+        plan = replace(plan, faces=cells, order=place[plan.order])
+        if not torch.equal(points.to(lb.points), lb.points):  # moved since
+            mass = evaluate(plan, lb.points.detach().cpu().double())["mass"]
+    rtol = max(SINGLE, torch.finfo(lb.dtype).eps)
+    if not same or not torch.allclose(mass, lb.mass.cpu().double(), rtol=rtol, atol=0):
         raise InputError(
             "plan: it was not kept, and what is decided anew by the points alone is not what the operator is of, where "
             "`normals`, `reconstruct`, noise of a curve, rounding or another version had a part; build it again"
         )
-    place = torch.empty_like(rows[0]).index_copy(0, *rows)  # index of each face among the user's
-    plan = replace(built.plan, faces=cells, order=place[built.plan.order])
-    return replace(built, faces=cells, plan=plan)
+    return plan

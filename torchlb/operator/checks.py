@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import operator
 from typing import Any
 
 import torch
@@ -11,7 +10,6 @@ from scipy.spatial import KDTree
 from torch import Tensor
 
 from torchlb.errors import InputError, first_few, warn
-from torchlb.fits.polynomials import num_monomials
 from torchlb.linalg.precision import NEGLIGIBLE, ROUNDING, SMALL
 from torchlb.operator.cleaning import (
     are_quads,
@@ -206,77 +204,3 @@ def check_tolerance(tolerance: float | None) -> None:
     """
     if tolerance is not None and not 0 < tolerance < 1:
         raise InputError(f"tolerance: expected a number between 0 and 1, got {tolerance}")
-
-
-def _check_integer(name: str, number: Any) -> None:
-    try:
-        operator.index(number)
-    except TypeError as error:
-        raise InputError(f"{name}: expected an integer, got {number!r}") from error
-
-
-def check_options(
-    num_points: int,
-    ambient_dim: int,
-    dim: int,
-    order: int,
-    normal_order: int,
-    num_neighbors: int | None,
-    **choices: tuple[str, list[str]],
-) -> None:
-    """Raise ValueError for options out of range, and for fewer points than a stencil has polynomials."""
-    for name, (value, allowed) in choices.items():
-        if value not in allowed:
-            raise InputError(f"{name}: expected one of {allowed}, got {value!r}")
-    numbers = {"dim": dim, "order": order, "normal_order": normal_order}
-    for name, number in {**numbers, "num_neighbors": num_neighbors or 0}.items():
-        _check_integer(name, number)
-    if not 1 <= dim <= ambient_dim:
-        raise InputError(
-            f"dim: expected 1 … {ambient_dim} for points in R^{ambient_dim}, got {dim}"
-        )
-    if order < 1:
-        raise InputError(f"order: expected an integer ≥ 1, got {order}")
-    if normal_order < 0:
-        raise InputError(
-            f"normal_order: expected an integer ≥ 1, or 0 to keep the initial frames, got {normal_order}"
-        )
-    needed = num_monomials(dim, order + 1)
-    if num_neighbors is not None and num_neighbors < needed:
-        raise InputError(
-            f"num_neighbors: order {order} in {dim} dimensions has {needed} polynomials and needs at least as many "
-            f"neighbours (1.6 times as many, {-(-16 * needed // 10)}, is the default); got {num_neighbors}"
-        )
-    if num_neighbors is not None and num_neighbors > num_points:
-        raise InputError(
-            f"num_neighbors: {num_neighbors} are more than the {num_points} points; lower it, or leave it out"
-        )
-    of_surface = dim == 2 and ambient_dim == 3
-    least = min(needed, 4) if of_surface else needed
-    if num_points < least:
-        what = "a surface in R^3 needs" if of_surface else f"a stencil of order {order} needs"
-        fits = [p for p in range(1, order) if num_monomials(dim, p + 1) <= num_points]
-        remedy = f"lower `order` to {max(fits)}" if fits else "add points"
-        raise InputError(f"{num_points} points are fewer than the {least} that {what}; {remedy}")
-
-
-def check_same_points(points: Tensor, built: Float[Tensor, "N n"]) -> None:
-    """Raise InputError unless the points are those an operator was built from, to float32 rounding."""
-    if points.shape != built.shape:
-        raise InputError(
-            f"points: expected the {tuple(built.shape)} that the operator was built from, got "
-            f"{tuple(points.shape)}; build it again after points are added, left out or projected"
-        )
-    theirs, ours = points.detach().to(built.device).double(), built.double()
-    rounding = max(
-        torch.finfo(torch.promote_types(t, torch.float16)).eps for t in (points.dtype, built.dtype)
-    )
-    most = 4 * max(rounding, torch.finfo(torch.float32).eps) * float(ours.abs().amax())
-    distance = (theirs - ours).abs().amax(1)
-    moved = (~(distance <= most)).nonzero()[:, 0]
-    if len(moved):
-        raise InputError(
-            f"points: {len(moved)} of {len(points)} are not where they were when the operator was built "
-            f"({first_few(moved)}; by up to {float(distance.amax()):.3g}); build it again after scaling, turning "
-            "or deforming a shape"
-        )

@@ -57,15 +57,8 @@ def clean_points(points: ArrayLike, tolerance: float = 0.0) -> tuple[Tensor, Ten
     places, points = check_points(points), as_tensor(points)
     if not 0 <= tolerance < torch.inf:
         raise InputError(f"tolerance: expected a length of 0 or more, got {tolerance}")
-    kept = merged(places, tolerance).unique() if tolerance else torch.arange(len(points))
-    while len(kept):
-        _, other, twins = coincident(places[kept])
-        if len(twins) == 0:
-            break
-        stays = torch.ones(len(kept), dtype=torch.bool)
-        stays[twins[other[twins] < twins]] = False
-        kept = kept[stays]
-    kept = kept.to(points.device)
+    reach = max(tolerance, ROUNDING * float(places.abs().max()))
+    kept = merged(places, reach).unique().to(points.device)
     return points[kept], kept
 
 

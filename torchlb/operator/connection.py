@@ -12,17 +12,11 @@ from torch import Tensor
 from torchlb.errors import DerivativeError, InputError
 from torchlb.galerkin.tangent import in_space, tangent_matrices
 from torchlb.linalg.checks import check_tensor
-from torchlb.linalg.csr import Csr, tensors_of
+from torchlb.linalg.csr import Csr
 from torchlb.operator.batching import remember_shapes, shapes_of
 from torchlb.operator.medium import elements_of, plain
 from torchlb.operator.pair_methods import PairMethods, check_pair
 from torchlb.operator.parts import Modes, PairMatrices
-
-
-class FieldMatrices(PairMatrices):
-    """The weak pair of tangent fields: no constants are in the kernel of its stiffness."""
-
-    of_functions = False
 
 
 class _TangentPlan(NamedTuple):
@@ -130,27 +124,22 @@ def connection_of(lb: Any) -> Connection:
 
 
 def _of_shape(lb: Any, *, hodge: bool = False) -> Connection:
-    if lb._in_medium and not tensors_of(lb._medium):
-        raise InputError(
-            "connection: the medium of this operator is not known, as it comes from a batch"
-        )
-    frames = lb.frames.detach().cpu().double()
-    elements, medium = elements_of(lb), plain(lb._medium.fields(len(lb.points)))
+    frames, medium = lb.frames.detach().cpu().double(), lb._known_medium.fields(len(lb.points))
+    elements, medium = elements_of(lb), plain(medium)
     with torch.no_grad():
         kappa = medium.get("conductivity")
         kappa = None if kappa is None else elements.values(kappa)
         linear = lb.weak.linear if lb.weak.linear.num_rows else None
         found = tangent_matrices(elements, kappa, frames, (lb.weak, linear), hodge=hodge)
     whole, *near = (each.to(lb.weak.values) for each in found)
-    own = Connection._of(lb, FieldMatrices(whole.crow, whole.col, whole.values, *near))
+    weak = PairMatrices(whole.crow, whole.col, whole.values, *near, of_functions=False)
+    own = Connection._of(lb, weak)
     own._is_hodge = hodge
     return own
 
 
 def _of_batch(lb: Any) -> Connection:
     parts: Sequence[Connection] = [shape.connection for shape in shapes_of(lb) or lb.unbatch()]
-    joined = PairMatrices.join([part.weak for part in parts])
-    weak = FieldMatrices(joined.crow, joined.col, joined.values, joined.linear)
-    own = Connection._of(lb, weak)
+    own = Connection._of(lb, PairMatrices.join([part.weak for part in parts]))
     remember_shapes(own, parts)
     return own

@@ -41,22 +41,18 @@ def builder_of(
     vertices: ArrayLike, faces: ArrayLike | None, operator: str
 ) -> tuple[Builder, Tensor, Tensor | None]:
     """The classmethod that builds the operator, and its input checked: float64 positions, int64 faces or None."""
-    _check_operator(operator)
-    if faces is None or np.prod(np.shape(faces)) == 0:
-        if operator == "cotangent":
-            raise InputError("the cotangent operator needs faces; operator='stencil' does not")
-        return LaplaceBeltrami.from_points, check_points(vertices), None
-    points = check_points(vertices, "vertices")
-    corners = check_faces(faces, len(points))
-    if operator == "cotangent":
-        return LaplaceBeltrami.from_cotangent, points, corners
-    return LaplaceBeltrami.from_mesh, points, corners
+    of_mesh, *of_cloud = _builders(operator)
+    if faces is not None and np.prod(np.shape(faces)) > 0:
+        points = check_points(vertices, "vertices")
+        return of_mesh, points, check_faces(faces, len(points))
+    if not of_cloud:
+        raise InputError("the cotangent operator needs faces; operator='stencil' does not")
+    return of_cloud[0], check_points(vertices), None
 
 
 def complete_options(builder: Builder, options: dict[str, Any]) -> dict[str, Any]:
     """All options with their defaults, except `progress`, which changes no result; InputTypeError for unknown ones."""
-    known = _defaults(builder)
-    _check_names(builder.__name__, options, known)
+    known = _known(builder.__name__, options, builder)
     if options.get("reconstruct") is not None:
         raise InputError(
             "reconstruct: a function has no name in a cache; build with LaplaceBeltrami.from_points, and store the "
@@ -67,27 +63,26 @@ def complete_options(builder: Builder, options: dict[str, Any]) -> dict[str, Any
 
 def check_options_of(operator: str, options: dict[str, Any]) -> None:
     """Raise InputError for an unknown operator, or for an option that it has neither for meshes nor for clouds."""
-    _check_operator(operator)
-    known = _defaults(LaplaceBeltrami.from_mesh) | _defaults(LaplaceBeltrami.from_points)
-    known = _defaults(LaplaceBeltrami.from_cotangent) if operator == "cotangent" else known
-    _check_names(f"operator {operator!r}", options, known)
+    _known(f"operator {operator!r}", options, *_builders(operator))
 
 
-def _check_operator(operator: str) -> None:
+def _builders(operator: str) -> list[Builder]:
+    """The builders of an operator, on meshes and, if there is one, on clouds."""
     if operator not in get_args(Operator):
         raise InputError(f"operator: expected one of {list(get_args(Operator))}, got {operator!r}")
+    if operator == "cotangent":
+        return [LaplaceBeltrami.from_cotangent]
+    return [LaplaceBeltrami.from_mesh, LaplaceBeltrami.from_points]
 
 
-def _defaults(builder: Builder) -> dict[str, Any]:
-    parameters = inspect.signature(builder).parameters.values()
+def _known(owner: str, options: dict[str, Any], *builders: Builder) -> dict[str, Any]:
+    """The options of builders with their defaults; InputTypeError where more are given."""
+    parameters = [p for each in builders for p in inspect.signature(each).parameters.values()]
     known = {p.name: p.default for p in parameters if p.kind is p.KEYWORD_ONLY}
     known.pop("progress", None)
-    return known
-
-
-def _check_names(owner: str, options: dict[str, Any], known: dict[str, Any]) -> None:
     unknown = options.keys() - known.keys()
     if unknown:
         raise InputTypeError(
             f"{owner} has no option {', '.join(sorted(unknown))}; its options are {', '.join(known) or 'none'}"
         )
+    return known

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 from typing import Any, Literal
 
 import torch
@@ -14,7 +13,6 @@ from torchlb.errors import InputError, InputTypeError
 from torchlb.fits.rules import WeightsName
 from torchlb.geometry.frames import Projection
 from torchlb.linalg.csr import Csr, Record, tensors_of
-from torchlb.operator import build
 from torchlb.operator.batching import (
     check_alike,
     join_states,
@@ -23,16 +21,22 @@ from torchlb.operator.batching import (
     shapes_of,
     split_parts,
 )
-from torchlb.operator.build_cloud import Reconstruction, build_cloud, built_again
+from torchlb.operator.build import build_cotangent, build_mesh
+from torchlb.operator.build_cloud import Reconstruction, build_cloud, plan_again
 from torchlb.operator.connection import Connection, connection_of
-from torchlb.operator.inputs import ArrayLike, check_points, float_type, warn_of_gradients
+from torchlb.operator.inputs import (
+    ArrayLike,
+    as_tensor,
+    check_points,
+    float_type,
+    warn_of_gradients,
+)
 from torchlb.operator.medium import checked_fields, pair_in, split_fields
 from torchlb.operator.options import Options
 from torchlb.operator.pair_methods import PairMethods
-from torchlb.operator.parts import MediumFields, Modes, PairMatrices
-from torchlb.operator.plan import Plan, check_fit, evaluate
+from torchlb.operator.parts import DecidedAt, MediumFields, Modes, PairMatrices
+from torchlb.operator.plan import Parts, Plan, check_fit, evaluate
 from torchlb.operator.stencil_methods import StencilMethods
-from torchlb.operator.storage import FIT_FIELDS, ROW_FIELDS
 from torchlb.operator.through import carrying, origins
 from torchlb.spectral.eigenbasis import stack_eigenbases, unstack_eigenbases
 from torchlb.stencils.conditions import Condition, ConditionName
@@ -142,8 +146,7 @@ class LaplaceBeltrami(StencilMethods, PairMethods):
         with torch.inference_mode(False):  # the tensors may be used in training
             given = {"normals": normals, "boundary": boundary, "reconstruction": reconstruct}
             built = build_cloud(points, dim, options, **given, progress=progress)
-            lb = cls._from_assembled(built, points)
-        return carrying(lb, points)
+        return cls._stored(built, points)
 
     @classmethod
     def from_mesh(
@@ -187,9 +190,8 @@ class LaplaceBeltrami(StencilMethods, PairMethods):
             order, normal_order, projection, weights, num_neighbors, condition, weak_form, certify
         )
         with torch.inference_mode(False):
-            built = build.build_mesh(vertices, faces, options, boundary=boundary, progress=progress)
-            lb = cls._from_assembled(built, vertices)
-        return carrying(lb, vertices)
+            built = build_mesh(vertices, faces, options, boundary=boundary, progress=progress)
+        return cls._stored(built, vertices)
 
     @classmethod
     def from_cotangent(cls, vertices: ArrayLike, faces: ArrayLike) -> LaplaceBeltrami:
@@ -208,7 +210,8 @@ class LaplaceBeltrami(StencilMethods, PairMethods):
         """
         warn_of_gradients(vertices, "vertices")
         with torch.inference_mode(False):
-            return cls._from_assembled(build.build_cotangent(vertices, faces), vertices)
+            built = build_cotangent(vertices, faces)
+        return cls._stored(built, as_tensor(vertices).detach())
 
     @classmethod
     def batch(cls, shapes: Sequence[LaplaceBeltrami]) -> LaplaceBeltrami:
@@ -240,12 +243,13 @@ class LaplaceBeltrami(StencilMethods, PairMethods):
 
     @property
     def plan(self) -> Plan:
-        """The decisions behind the operator, integers and flags; copies and operators from files make them again.
+        """The decisions behind the operator, integers and flags.
 
+        Copies and operators from files make them again, at the points that they were made at, which are kept unrounded.
         Raises InputError for batches, the cotangent operator, and operators without a weak pair.
         """
         if self._plan is None and self.source in ("mesh", "points") and self._has_weak_form:
-            self._plan, self._planned = built_again(self).plan, None
+            self._plan = plan_again(self)
         if self._plan is None:
             raise InputError(
                 f"plan: an operator of kind {self.source!r} has none, nor has one without a weak pair; those of "
@@ -285,20 +289,13 @@ class LaplaceBeltrami(StencilMethods, PairMethods):
                 f"points: expected {tuple(self.points.shape)}, as the operator has, got {tuple(there.shape)}"
             )
         plan = self.plan
-        planned = self.points.detach().cpu().double() if self._planned is None else self._planned
-        check_fit(planned, there, plan.faces)
+        decided = self._decided_points
+        check_fit(decided, there, plan.faces)
+        kept = {"surface": self.surface, "_decided_at": DecidedAt({"points": decided})}
         with torch.inference_mode(False):
-            built = replace(evaluate(plan, there), surface=self.surface)
-            lb = self._from_assembled(built, points).to(self.device)
-        lb._planned = planned
-        lb = carrying(lb, points)
-        if not self._in_medium:
-            return lb
-        if not tensors_of(self._medium):
-            raise InputError(
-                "at: the medium of this operator is not known, as it comes from a batch"
-            )
-        return lb.with_medium(**tensors_of(self._medium))
+            built = evaluate(plan, there) | kept
+        lb = self._stored(built, points, self.device)
+        return lb.with_medium(**tensors_of(self._known_medium)) if self._in_medium else lb
 
     def with_medium(
         self,
@@ -339,7 +336,7 @@ class LaplaceBeltrami(StencilMethods, PairMethods):
             medium, lb = checked_fields(self, given), self._alias()
             lb.weak = pair_in(self, medium.fields(self.num_points))
             lb.modes, lb._medium, lb._in_medium = Modes(None, self.mass), medium, True
-        lb._plan, lb._planned, lb.cache.elements = self._plan, self._planned, self.cache.elements
+        lb._plan, lb.cache.elements = self._plan, self.cache.elements
         return lb
 
     @property
@@ -365,34 +362,29 @@ class LaplaceBeltrami(StencilMethods, PairMethods):
         return [type(self)._of_parts(*shape) for shape in shapes]
 
     @classmethod
-    def _from_assembled(cls, built: build.AssembledOperator, given: ArrayLike) -> LaplaceBeltrami:
-        """Store a finished operator, in the floating type of the input."""
-        rows, points, pair = built.rows, built.points, built.whole_pair
-        none = rows.length.new_zeros(4, len(points))
-        fits = none if built.fit_counts is None else built.fit_counts
-        report = dict(zip(FIT_FIELDS, fits, strict=True))
-        report |= {"num_neighbors": rows.length, "normal_order": built.normal_order}
-        report |= {name: t for name, t in vars(rows).items() if name in ROW_FIELDS}
-        parts = {name: getattr(built, name) for name in ("points", "mass", "frames", "faces")}
-        values = torch.cat([rows.laplacian[None], rows.gradient.T])
-        parts |= {
-            "stencil": Csr.with_transpose(rows.crow, rows.col, values),
-            "_record": Record({name: report[name] for name in (*ROW_FIELDS, *FIT_FIELDS)}),
-            "normals": points[:0] if built.normals is None else built.normals,
-        }
-        if pair is not None:
-            linear = None if pair.linear is None else Csr(**vars(pair.linear))
-            parts["weak"] = PairMatrices(**vars(pair.matrices), linear=linear)
-        if built.on_boundary is not None and built.on_boundary.any():
-            parts["_on_boundary"] = built.on_boundary
-        lb = cls._of_parts(parts, {"source": built.source, "options": built.options})
-        lb.certificate, lb.surface, lb._plan = built.certificate, built.surface, built.plan
-        if lb._has_weak_form:
-            _ = lb.weak.radius  # before the values are rounded
-        return lb.to(float_type(given))
+    def _stored(
+        cls, parts: Parts, given: ArrayLike, device: torch.device | None = None
+    ) -> LaplaceBeltrami:
+        """Store a finished operator, in the floating type of the input, whose gradient it carries."""
+        with torch.inference_mode(False):
+            lb = cls._of_parts(parts)
+            if lb._has_weak_form:
+                _ = lb.weak.radius  # before the values are rounded
+            lb = lb.to(device, float_type(given))
+        return carrying(lb, given)
 
 
 # A whole module can be read back with torch.load(weights_only=True) where torchlb is imported.
 torch.serialization.add_safe_globals(
-    [LaplaceBeltrami, Csr, PairMatrices, MediumFields, Modes, Record, Certificate, SurfaceSummary]
+    [
+        LaplaceBeltrami,
+        Csr,
+        PairMatrices,
+        MediumFields,
+        DecidedAt,
+        Modes,
+        Record,
+        Certificate,
+        SurfaceSummary,
+    ]
 )

@@ -16,9 +16,14 @@ from torchlb.linalg.sparse import csr_tensor, to_scipy
 from torchlb.linalg.threads import threads_for
 from torchlb.operator.batching import shapes_of
 from torchlb.operator.checks import check_tolerance
-from torchlb.operator.eigenpairs import BEYOND, through_eigenpairs
 from torchlb.operator.storage import OperatorStorage
-from torchlb.operator.through import origins, through_product, without
+from torchlb.operator.through import (
+    BEYOND,
+    origins,
+    through_eigenpairs,
+    through_product,
+    without,
+)
 from torchlb.spectral.eigenbasis import (
     Eigenbasis,
     check_num_pairs,

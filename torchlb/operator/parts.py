@@ -2,16 +2,14 @@
 
 from __future__ import annotations
 
-from collections import OrderedDict
 from collections.abc import Sequence
-from typing import Any, get_args
-from weakref import finalize
+from typing import Any
 
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from torchlb.galerkin.medium import Field, FieldName
+from torchlb.galerkin.medium import Field
 from torchlb.linalg.csr import Csr, Tensors, tensors_of
 from torchlb.linalg.exponential import spectral_radius
 from torchlb.linalg.sparse import to_scipy
@@ -30,10 +28,11 @@ class PairMatrices(Csr):
     ----------
     linear
         The same matrices of P1 elements; without rows where they are equal to the pair.
+    of_functions
+        Whether constants are in the kernel of K without its additions; False for tangent fields.
     """
 
     linear: Csr
-    of_functions = True
 
     def __init__(
         self,
@@ -41,10 +40,13 @@ class PairMatrices(Csr):
         col: Tensor | None = None,
         values: Tensor | None = None,
         linear: Csr | None = None,
+        *,
+        of_functions: bool = True,
     ) -> None:
         super().__init__(crow, col, values)
         self.linear = Csr() if linear is None else linear
-        self._radius: Tensor | None = None
+        self.of_functions = of_functions
+        self.set_radius(None)
 
     @property
     def has_boundary(self) -> bool:
@@ -76,27 +78,22 @@ class PairMatrices(Csr):
         return found if fixed is None else found | fixed
 
     @property
-    def radius(self) -> Tensor:
-        """Bound on the eigenvalues of D⁻¹K₁, the P1 pair with lumped mass, for flows beyond the basis.
+    def radius(self) -> Float[Tensor, ""]:
+        """Bound on the eigenvalues of D⁻¹K₁, the P1 pair with lumped mass, for flows beyond the basis, 1/ℓ².
 
-        1/ℓ², a float64 tensor () on the CPU, which compiled code can take; computed once.
+        A float64 tensor on the CPU, computed once, which compiled code can take; neither rounded nor moved.
         """
         if self._radius is None:
             crow, col, values = self.linear_pair
             shape = self.num_rows, self.num_rows
             stiffness, mass = (to_scipy(crow, col, v.double(), shape) for v in values)
             lumped: Any = mass.sum(axis=1)
-            self.known_radius = spectral_radius(stiffness, lumped)
-        assert self._radius is not None
-        return self._radius
+            self.set_radius(spectral_radius(stiffness, lumped))
+        known: Any = self._radius
+        return known
 
-    @property
-    def known_radius(self) -> float | None:
-        """The radius, or None before it is asked for; it is neither rounded nor moved with the buffers."""
-        return None if self._radius is None else float(self._radius)
-
-    @known_radius.setter
-    def known_radius(self, radius: float | None) -> None:
+    def set_radius(self, radius: float | None) -> None:
+        """Set the radius where it is known."""
         known = None if radius is None else torch.tensor(radius, dtype=torch.float64, device="cpu")
         self._radius = known
 
@@ -105,11 +102,11 @@ class PairMatrices(Csr):
         """The joint pair of several shapes, if all have one; with P1 matrices if any shape has its own."""
         if not all(pair.num_rows for pair in records):
             return PairMatrices()
-        whole = Csr.join(records)
-        linear = None
+        whole, linear = Csr.join(records), None
         if any(pair.linear.num_rows for pair in records):
             linear = Csr.join([pair.near for pair in records])
-        return PairMatrices(whole.crow, whole.col, whole.values, linear)
+        kind = records[0].of_functions
+        return PairMatrices(whole.crow, whole.col, whole.values, linear, of_functions=kind)
 
     def split(self, sizes: Sequence[int]) -> list[PairMatrices]:  # pyright: ignore[reportIncompatibleMethodOverride]
         """Inverse of `join`, without matrices that a shape has only because others do."""
@@ -130,24 +127,6 @@ class PairMatrices(Csr):
         return PairMatrices(whole.crow, whole.col, values, near)
 
 
-class MediumFields(Tensors):
-    """The fields of a medium by `FieldName`; those that were not given are not there."""
-
-    def fields(self, num_points: int) -> dict[str, Field]:
-        """The fields, which are on the faces where there are not as many as points."""
-        return {
-            name: Field(values, len(values) != num_points, name != "potential")
-            for name, values in tensors_of(self).items()
-        }
-
-    def _load_from_state_dict(self, state_dict: Any, prefix: str, *given: Any) -> None:  # pyright: ignore[reportIncompatibleMethodOverride]
-        self._buffers.clear()
-        for name in get_args(FieldName):
-            if prefix + name in state_dict:
-                self.register_buffer(name, torch.zeros(0))
-        super()._load_from_state_dict(state_dict, prefix, *given)
-
-
 def _with_added(values: Float[Tensor, "terms nnz"]) -> Float[Tensor, "2 nnz"]:
     """K + R + C and M, from K, M, B, R, C; R of a condition and C of a potential are there only if needed."""
     return (
@@ -162,17 +141,39 @@ def _without_zeros(values: Float[Tensor, "terms nnz"]) -> Float[Tensor, "_ nnz"]
     return values[:count]
 
 
-class Modes(Tensors):
-    """The known eigenpairs.
+class Named(Tensors):
+    """Buffers of which a state may hold any, or none."""
 
-    Parameters
-    ----------
-    basis
-        Their source; None for no pairs.
-    like
-        Tensor of the floating type and on the device of the operator.
-    stored
-        Whether `state_dict` has them.
+    def _load_from_state_dict(self, state_dict: Any, prefix: str, *given: Any) -> None:  # pyright: ignore[reportIncompatibleMethodOverride]
+        self._buffers.clear()
+        for key in state_dict:
+            if key.startswith(prefix):
+                self.register_buffer(key.removeprefix(prefix), torch.zeros(0))
+        super()._load_from_state_dict(state_dict, prefix, *given)
+
+
+class MediumFields(Named):
+    """The fields of a medium by `FieldName`; those that were not given are not there."""
+
+    def fields(self, num_points: int) -> dict[str, Field]:
+        """The fields, which are on the faces where there are not as many as points."""
+        return {
+            name: Field(values, len(values) != num_points, name != "potential")
+            for name, values in tensors_of(self).items()
+        }
+
+
+class DecidedAt(Named):
+    """The points (N, n) that a plan was made at, float64 on the CPU: neither rounded nor moved with the operator."""
+
+    def _apply(self, fn: Any, recurse: bool = True) -> DecidedAt:
+        return self
+
+
+class Modes(Tensors):
+    """The known eigenpairs of a basis or of other modes; `stored` says whether `state_dict` has them.
+
+    They are of the type and on the device of `like`.
     """
 
     eigenvalues: Tensor
@@ -199,23 +200,16 @@ class Modes(Tensors):
         """Whether k pairs of each shape are known, or all that it has."""
         return min(k, self._counts.shape[1]) <= self.count
 
-    def counted(
+    def set_count(
         self, vectors: Float[Tensor, "N k"], free: Bool[Tensor, " N"], sizes: tuple[int, ...]
-    ) -> Modes:
-        """Set `count` from the eigenvectors, whose padding columns are zero, and the free points; return self."""
+    ) -> None:
+        """Set `count` from the eigenvectors, whose padding columns are zero, and the free points."""
         parts = zip(vectors.split(sizes), free.split(sizes), strict=True)
         counts = [(int((modes != 0).any(0).sum()), int(inside.sum())) for modes, inside in parts]
         most = max(sizes)
-        known = min((held for held, all_ in counts if held < all_), default=most)
-        self._counts = torch.empty(known, most)
-        return self
-
-    def basis(self, mass: Float[Tensor, " N"], sizes: tuple[int, ...] | None) -> Eigenbasis | None:
-        """The eigenbasis of all known pairs, with the mass and the sizes of the operator; None if there are none."""
-        if len(self.left) == 0:
-            return None
-        errors = self.relative_errors if len(self.relative_errors) else None
-        return Eigenbasis(self.eigenvalues, self.eigenvectors, mass, self.left, sizes, errors)
+        self._counts = torch.empty(
+            min([held for held, all_ in counts if held < all_] + [most]), most
+        )
 
 
 class OperatorCache:
@@ -225,20 +219,15 @@ class OperatorCache:
     ----------
     values
         Values of the weak pair that the results belong to; an operator with other values gets a new cache.
-    systems
-        Linear systems with their factors.
-    elements
-        Elements of the weak pair, made for the first medium.
-    connection
-        The operator's tangent fields.
+    system, elements, connection
+        The linear system with its factors; elements of the weak pair, made for the first medium; tangent fields.
     shapes
         Shapes of a batch, whose caches serve it, each with the values that it had.
     """
 
     def __init__(self, values: Tensor) -> None:
         self.values = values
-        self.connection: Any = None
-        self.systems: OrderedDict[Any, Any] = OrderedDict()
+        self.system: Any = None
         self.elements: Any = None
+        self.connection: Any = None
         self.shapes: tuple[tuple[Any, Tensor], ...] = ()
-        finalize(self, self.systems.clear)  # cholespy reports factors that outlive Python as leaks

@@ -10,29 +10,37 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cache
+from typing import Any
 
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
 from torchlb.errors import DerivativeError, InputError, first_few, renumbered, warn
+from torchlb.galerkin.absorption import absorbing
 from torchlb.galerkin.bilinear import BilinearForm
 from torchlb.galerkin.elements import subsets
 from torchlb.galerkin.forms import Forms, edge_lengths
 from torchlb.galerkin.medium import Medium
-from torchlb.galerkin.pair import PairPlan
+from torchlb.galerkin.pair import PairPlan, WeakPair
 from torchlb.galerkin.tangent import in_space
+from torchlb.geometry.boundary import boundary_faces
 from torchlb.geometry.numbering import Numbering
 from torchlb.geometry.thresholds import FACTOR
+from torchlb.linalg.csr import Csr, Record
 from torchlb.linalg.threads import threads_for
-from torchlb.operator.assembled import AssembledOperator
 from torchlb.operator.options import Options
+from torchlb.operator.parts import DecidedAt, PairMatrices
+from torchlb.operator.storage import FIT_FIELDS, ROW_FIELDS
 from torchlb.stencils.assemble import Stencils
-from torchlb.stencils.conditions import Condition
+from torchlb.stencils.conditions import Condition, condition_of
 from torchlb.stencils.low_order import MeshLowOrder
 from torchlb.stencils.placed import Placed, ShapePlan
 from torchlb.stencils.rows import Rows, RowsPlan
 from torchlb.stencils.shape import Shape
+
+Parts = dict[str, Any]
+"""Attributes of an operator by name."""
 
 
 @dataclass(frozen=True)
@@ -156,17 +164,64 @@ class Plan:
         return self.numbering.sorted(points)
 
 
-def evaluate(plan: Plan, points: Float[Tensor, "N n"]) -> AssembledOperator:
-    """Evaluate a plan at points, float64 on the CPU; InputError with a certificate or moved points of a noisy curve."""
-    here, options = plan._sorted(points), plan.options
+def evaluate(plan: Plan, points: Float[Tensor, "N n"]) -> Parts:
+    """An operator by its plan at points, float64 on the CPU; InputError with a certificate or moved points."""
+    here = plan._sorted(points)
     with renumbered(plan.numbering.given), threads_for(len(points)):
         placed, fits = plan.shape.at(here)
         pair_plan, pair = plan.pair.at(fits, plan.numbering)
         assert pair.mass is not None
         rows, shape = plan._rows(placed, pair.mass)
-    built = AssembledOperator.of(rows, shape, pair, plan.source, options.plain, plan.pair.counts)
     plan = plan if pair_plan is plan.pair else replace(plan, pair=pair_plan)
-    return replace(built.restored(plan.numbering, points, plan.faces), plan=plan)
+    given = plan.numbering, points, plan.faces, plan.source, plan.options
+    return operator_parts(rows, shape, pair, *given, plan)
+
+
+def operator_parts(
+    rows: Rows,
+    shape: Shape,
+    pair: WeakPair | None,
+    numbering: Numbering,
+    points: Float[Tensor, "N n"],
+    faces: Int[Tensor, "F corners"],
+    source: str,
+    options: Options | None,
+    plan: Plan | None,
+    **others: Any,
+) -> Parts:
+    """What an operator stores, from rows and a shape in a numbering; points, faces and pair are the user's."""
+    given, rows = numbering.restored, rows.restored(numbering)
+    counts = rows.length.new_zeros(4, len(points))
+    counts = counts if plan is None else plan.pair.counts[:, numbering.here]
+    report = {"num_neighbors": rows.length, "normal_order": given(shape.normal_order)}
+    report |= vars(rows) | dict(zip(FIT_FIELDS, counts, strict=True))
+    values = torch.cat([rows.laplacian[None], rows.gradient.T])
+    parts = others | {
+        "source": source,
+        "options": {} if options is None else options.plain,
+        "_plan": plan,
+        "points": points,
+        "faces": faces,
+        "mass": given(shape.areas),
+        "frames": given(shape.frames),
+        "normals": points[:0] if shape.normals is None else given(shape.normals),
+        "stencil": Csr.with_transpose(rows.crow, rows.col, values),
+        "_record": Record({name: report[name] for name in (*ROW_FIELDS, *FIT_FIELDS)}),
+    }
+    if plan is not None:
+        parts["_decided_at"] = DecidedAt({"points": points})
+    if shape.boundary is not None and shape.boundary.mask.any():
+        parts["_on_boundary"] = given(shape.boundary.mask)
+    if pair is not None:
+        condition = None if options is None else condition_of(options.condition)
+        if condition is not None and condition.share is not None and "_on_boundary" in parts:
+            at_boundary = torch.zeros_like(parts["_on_boundary"])
+            at_boundary[boundary_faces(faces).flatten()] = True
+            share = condition.share * parts["_on_boundary"].to(points)
+            pair = absorbing(pair, share, at_boundary)
+        linear = None if pair.linear is None else Csr(**vars(pair.linear))
+        parts["weak"] = PairMatrices(**vars(pair.matrices), linear=linear)
+    return parts
 
 
 def check_fit(

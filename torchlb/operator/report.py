@@ -117,19 +117,21 @@ class StencilReport:
     def __repr__(self) -> str:
         """Summary of one screen."""
         total = len(self.order)
+
+        def counted(name: str, count: int) -> str:
+            return f"  {name:<31}{count:>9}  {100 * count / total:6.2f} %"
+
         lines = [f"{total} points, order {self.requested_order} requested"]
         for order, count in self.order_counts.items():
             if count:
                 name = f"order {order}" if order else "low order (first at best)"
-                lines.append(f"  {name:<31}{count:>9}  {100 * count / total:6.2f} %")
+                lines.append(counted(name, count))
         if self.reason_counts:
             lines.append("why below the requested order")
             lines += [f"  {text:<38}{count:>9}" for text, count in self.reason_counts.items()]
         splines = int((self.rule == list(WEIGHT_RULES).index("polyharmonic")).sum())
         if splines:
-            lines.append(
-                f"  {'weights of polyharmonic splines':<31}{splines:>9}  {100 * splines / total:6.2f} %"
-            )
+            lines.append(counted("weights of polyharmonic splines", splines))
         if quantiles := self._quantiles():
             lines.append("stencils                      median      95 %       max")
             for name, (middle, high, most) in quantiles.items():
@@ -139,8 +141,7 @@ class StencilReport:
         if self.edges.any():
             lines.append(f"weak pair: {100 * self.curved_share:.2f} % of the edges curved")
             for degree, count in self.fit_counts.items():
-                name = f"surface of degree {degree}" if degree else "flat"
-                lines.append(f"  {name:<31}{count:>9}  {100 * count / total:6.2f} %")
+                lines.append(counted(f"surface of degree {degree}" if degree else "flat", count))
             below = torch.bincount(self.fit_reason, minlength=len(REASONS)).tolist()
             for text, count in zip(REASONS[1:], below[1:], strict=True):
                 if count:

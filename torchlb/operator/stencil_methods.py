@@ -1,6 +1,8 @@
-"""Methods of an operator by its stencil: Δf, ∇f and curvature at a point."""
+"""Methods of an operator by its stencil: Δf, ∇f and curvature at a point; curvatures of a surface in R³."""
 
 from __future__ import annotations
+
+from typing import Any
 
 import torch
 from jaxtyping import Bool, Float
@@ -10,9 +12,67 @@ from torchlb.errors import InputError
 from torchlb.geometry.boundary import boundary_faces
 from torchlb.linalg.checks import check_tensor, takes_arrays
 from torchlb.linalg.csr import tensors_of
-from torchlb.operator.curvature import Curvatures, curvatures_of, turned_frames
+from torchlb.linalg.sparse import csr_product
 from torchlb.operator.report import StencilReport
 from torchlb.operator.storage import OperatorStorage
+
+
+class Curvatures:
+    """Curvatures of a surface in R³ at its points, positive where it bends away from its normals, as a sphere does.
+
+    All are differentiable in the points. Directions are so where the principal curvatures differ.
+
+    Attributes
+    ----------
+    shape_operator
+        (N, 2, 2), 1/ℓ, symmetric: the derivative of the normal along the frames, in the frames.
+    frames
+        (N, 3, 2), orthonormal tangent vectors in columns.
+    """
+
+    def __init__(
+        self, shape_operator: Float[Tensor, "N 2 2"], frames: Float[Tensor, "N 3 2"]
+    ) -> None:
+        self.shape_operator, self._frames = shape_operator, frames
+
+    @property
+    def k1(self) -> Float[Tensor, " N"]:
+        """The larger principal curvature, κ₁ ≥ κ₂, 1/ℓ."""
+        return torch.linalg.eigvalsh(self.shape_operator)[:, 1]
+
+    @property
+    def k2(self) -> Float[Tensor, " N"]:
+        """The smaller principal curvature, κ₂, 1/ℓ."""
+        return torch.linalg.eigvalsh(self.shape_operator)[:, 0]
+
+    @property
+    def directions(self) -> Float[Tensor, "N 3 2"]:
+        """Unit tangent vectors of space of κ₁ and κ₂, up to their sign; any where both are equal."""
+        return self._frames @ torch.linalg.eigh(self.shape_operator).eigenvectors.flip(2)
+
+    @property
+    def mean(self) -> Float[Tensor, " N"]:
+        """H = (κ₁ + κ₂)/2, 1/ℓ; the mean-curvature vector Δx is −2H times the normal."""
+        return self.shape_operator.diagonal(dim1=1, dim2=2).sum(1) / 2
+
+    @property
+    def gaussian(self) -> Float[Tensor, " N"]:
+        """K = κ₁κ₂, 1/ℓ², whatever the side of the normals."""
+        return torch.linalg.det(self.shape_operator)
+
+    @property
+    def curvedness(self) -> Float[Tensor, " N"]:
+        """√((κ₁² + κ₂²)/2), 1/ℓ (Koenderink and van Doorn 1992)."""
+        return (self.shape_operator.square().sum((1, 2)) / 2).sqrt()
+
+    @property
+    def shape_index(self) -> Float[Tensor, " N"]:
+        """(2/π) atan((κ₁ + κ₂)/(κ₁ − κ₂)): 1 on spheres, 1/2 on cylinders, 0 on saddles, −1 on cups."""
+        return 2 / torch.pi * torch.atan2(self.k1 + self.k2, self.k1 - self.k2)
+
+    def __repr__(self) -> str:
+        least, most = float(self.k2.min()), float(self.k1.max())
+        return f"Curvatures({len(self.shape_operator)} points, from {least:.4g} to {most:.4g})"
 
 
 class StencilMethods(OperatorStorage):
@@ -48,10 +108,8 @@ class StencilMethods(OperatorStorage):
     def local_gradient(self, f: Tensor) -> Tensor:
         """∇f in the frames, (N, d, C) for f (N, C), (N, d) for (N,), (B, N, d, C) for (B, N, C). Units of f by 1/ℓ."""
         check_tensor(f)
-        if torch.is_autocast_enabled(f.device.type):
-            with torch.autocast(f.device.type, enabled=False):
-                return self.local_gradient(f)
-        parts = [self.stencil.product(c, f) for c in range(1, 1 + self.dim)]
+        with torch.autocast(f.device.type, enabled=False):
+            parts = [self.stencil.product(c, f) for c in range(1, 1 + self.dim)]
         return torch.stack(parts, dim=1 if f.ndim < 3 else 2)
 
     @takes_arrays
@@ -65,11 +123,9 @@ class StencilMethods(OperatorStorage):
 
     def _turned(self, equation: str, local: Tensor, frames: Tensor | None = None) -> Tensor:
         """Frames times a field, in its type, also under autocast: rounding before a derivative grows by 1/h."""
-        if torch.is_autocast_enabled(local.device.type):
-            with torch.autocast(local.device.type, enabled=False):
-                return self._turned(equation, local, frames)
         frames = self.frames if frames is None else frames
-        return torch.einsum(equation, frames.to(local.dtype), local)
+        with torch.autocast(local.device.type, enabled=False):
+            return torch.einsum(equation, frames.to(local.dtype), local)
 
     @takes_arrays
     def divergence(self, v: Tensor) -> Tensor:
@@ -151,7 +207,16 @@ class StencilMethods(OperatorStorage):
         >>> bool((found.gaussian - 0.25).abs().max() < 1e-3 and (found.mean - 0.5).abs().max() < 1e-3)
         True
         """
-        return curvatures_of(self)
+        check_surface(self, "curvatures")
+        stencil, normals = self.stencil, self.normals
+        # a neighbour's normal on the side of that of the row: surfaces without sides have curvatures, too
+        opposed = (normals[stencil.row] * normals[stencil.col]).sum(1) < 0
+        sign = torch.where(opposed, -1.0, 1.0).to(normals.dtype)
+        slopes = [
+            csr_product(stencil.pattern, v * sign, normals, False) for v in stencil.values[1:]
+        ]
+        own = self.frames.mT @ torch.stack(slopes, 2)
+        return Curvatures((own + own.mT) / 2, self.frames)
 
     def _boundary_points(self) -> Bool[Tensor, " N"]:
         """Mask of the boundary points, whether or not a condition holds there."""
@@ -160,3 +225,17 @@ class StencilMethods(OperatorStorage):
             on_boundary |= self.boundary
         sides = boundary_faces(self.faces.cpu()).flatten()
         return on_boundary.index_fill(0, sides.to(on_boundary.device), True)
+
+
+def turned_frames(lb: Any) -> Float[Tensor, "N 3 2"]:
+    """The frames of a surface in R³ after a quarter turn about the normals, ν × E."""
+    check_surface(lb, "a curl or a quarter turn")
+    return torch.linalg.cross(lb.normals[:, :, None].expand_as(lb.frames), lb.frames, dim=1)
+
+
+def check_surface(lb: Any, what: str) -> None:
+    """Raise InputError unless the operator is of a surface in R³ with normals."""
+    if lb.points.shape[1:] != (3,) or lb.dim != 2 or not len(lb.normals):
+        raise InputError(
+            f"{what}: expected a surface in R³ with normals, got one of dimension {lb.dim} in R^{lb.points.shape[1]}"
+        )

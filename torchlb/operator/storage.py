@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import asdict
+from itertools import accumulate
 from typing import Any, TypeVar
 
 import torch
@@ -12,10 +13,9 @@ from torch import Tensor
 
 from torchlb.certified.certificate import Certificate
 from torchlb.cloud.surface import SurfaceSummary
-from torchlb.errors import InputError, warn
-from torchlb.linalg.csr import Csr, Record, Tensors
-from torchlb.operator.checks import check_same_points
-from torchlb.operator.parts import MediumFields, Modes, OperatorCache, PairMatrices
+from torchlb.errors import InputError, first_few, warn
+from torchlb.linalg.csr import Csr, Record, Tensors, tensors_of
+from torchlb.operator.parts import DecidedAt, MediumFields, Modes, OperatorCache, PairMatrices
 from torchlb.spectral.eigenbasis import Eigenbasis
 from torchlb.stencils.conditions import Condition, condition_of, kind_of
 
@@ -48,6 +48,7 @@ class OperatorStorage(Tensors):
     modes: Modes
     _record: Record
     _medium: MediumFields
+    _decided_at: DecidedAt
 
     def __init__(self) -> None:
         none, whole = torch.zeros(0), torch.zeros(0, dtype=torch.int64)
@@ -58,21 +59,18 @@ class OperatorStorage(Tensors):
         self.certificate: Certificate | None = None
         self.surface: SurfaceSummary | None = None
         self._sizes: list[Tensor] | None = None
-        self._states: list[dict[str, Any]] | None = (
-            None  # the extra states of the shapes of a batch
-        )
+        self._states: list[dict[str, Any]] | None = None  # of the shapes of a batch
         self._in_medium = self._carries = False  # whether shapes of a batch require gradients
         self._plan: Any = None
-        self._planned: Tensor | None = None  # the points that the plan was made at, if others
         self._cache: OperatorCache | None = None
-        self._medium = MediumFields({})
+        self._medium, self._decided_at = MediumFields({}), DecidedAt({})
         self.stencil, self.weak, self.modes = Csr(order_t=whole), PairMatrices(), Modes(None, none)
         fields = {n: none if n in REAL_FIELDS else whole for n in (*ROW_FIELDS, *FIT_FIELDS)}
         self._record = Record(fields)
 
     def __getstate__(self) -> dict[str, Any]:
         """State for copies and files, without the plan, which is made again on demand, and the cache."""
-        return {**self.__dict__, "_plan": None, "_planned": None, "_cache": None}
+        return {**self.__dict__, "_plan": None, "_cache": None}
 
     @property
     def cache(self) -> OperatorCache:
@@ -99,14 +97,15 @@ class OperatorStorage(Tensors):
     def _of_parts(
         cls: type[Storage],
         parts: dict[str, Any],
-        state: dict[str, Any],
+        state: dict[str, Any] | None = None,
         basis: Eigenbasis | None = None,
     ) -> Storage:
-        """Create an operator from parts by name, the others empty, and the state that `get_extra_state` returns."""
+        """Create an operator from attributes by name, the others empty, and a state as of `get_extra_state`."""
         lb = cls()
         for name, part in parts.items():
             setattr(lb, name, part)
-        lb.set_extra_state(state)
+        if state is not None:
+            lb.set_extra_state(state)
         if basis is not None:
             lb._keep_basis(basis)
         return lb
@@ -135,18 +134,14 @@ class OperatorStorage(Tensors):
     @property
     def fixed(self) -> Bool[Tensor, " N"] | None:
         """Mask of the points where a Dirichlet condition holds; None if there are none."""
-        if len(self._on_boundary) == 0:
+        states = self._states or [{"options": self.options}]
+        holds = [kind_of(state["options"].get("condition")).fixes for state in states]
+        if len(self._on_boundary) == 0 or not any(holds):
             return None
-        holds = [kind.fixes for kind in self._kinds]
-        sizes = self.sizes or (self.num_points,)
-        mask = torch.tensor(holds).repeat_interleave(torch.tensor(sizes)).to(self._on_boundary)
-        return mask & self._on_boundary if any(holds) else None
-
-    @property
-    def _kinds(self) -> list[type[Condition]]:
-        """Class of the boundary condition of each shape."""
-        states = [{"options": self.options}] if self._states is None else self._states
-        return [kind_of(state["options"].get("condition")) for state in states]
+        sizes = torch.tensor(self.sizes or (self.num_points,))
+        return (
+            torch.tensor(holds).repeat_interleave(sizes).to(self._on_boundary) & self._on_boundary
+        )
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -166,33 +161,74 @@ class OperatorStorage(Tensors):
     @property
     def offsets(self) -> tuple[int, ...]:
         """Index of the first point of each shape of a batch, and N at the end; (0, N) for a single shape."""
-        sizes = self.sizes or (self.num_points,)
-        return tuple(sum(sizes[:i]) for i in range(len(sizes) + 1))
+        return tuple(accumulate(self.sizes or (self.num_points,), initial=0))
 
     @property
     def _basis(self) -> Eigenbasis | None:
         """All known eigenpairs; None if there are none."""
-        return self.modes.basis(self.mass, self.sizes)
+        held = self.modes
+        if len(held.left) == 0:
+            return None
+        errors = held.relative_errors if len(held.relative_errors) else None
+        pairs = held.eigenvalues, held.eigenvectors, self.mass, held.left
+        return Eigenbasis(*pairs, self.sizes, errors)
 
-    def _keep_basis(self, basis: Eigenbasis | None, *, stored: bool | None = None) -> None:
-        """Hold a basis (None: the present one), in `state_dict` or not (None: as before)."""
+    def _keep_basis(
+        self,
+        basis: Eigenbasis | None = None,
+        *,
+        stored: bool | None = None,
+        loaded: Float[Tensor, "N k"] | None = None,
+    ) -> None:
+        """Hold a basis (None: the present one), in `state_dict` or not (None: as before).
+
+        `loaded` are the eigenvectors of one that is still to be loaded.
+        """
         stored = self.modes.stored if stored is None else stored
-        self._hold(Modes(basis or self.modes, self.mass, stored=stored))
+        modes = Modes(basis or self.modes, self.mass, stored=stored)
+        vectors, fixed = modes.eigenvectors if loaded is None else loaded, self.fixed
+        if len(vectors):
+            free = self.mass > 0 if fixed is None else ~fixed
+            modes.set_count(vectors, free, self.sizes or (self.num_points,))
+        self.modes = modes
 
-    def _hold(self, modes: Modes, vectors: Float[Tensor, "N k"] | None = None) -> None:
-        """Hold eigenpairs; `vectors` are their eigenvectors where these are still to be loaded."""
-        vectors, sizes = modes.eigenvectors if vectors is None else vectors, self.sizes
-        free = torch.ones_like(self.mass, dtype=torch.bool) if self.fixed is None else ~self.fixed
-        self.modes = (
-            modes.counted(vectors, free, sizes or (self.num_points,)) if len(vectors) else modes
-        )
+    @property
+    def _decided_points(self) -> Float[Tensor, "N n"]:
+        """The points that the plan was made at, or is made at, float64 on the CPU."""
+        held = tensors_of(self._decided_at).get("points")
+        return self.points.detach().cpu().double() if held is None else held
+
+    @property
+    def _known_medium(self) -> MediumFields:
+        """The medium; InputError where only the batch that the operator comes from knew it."""
+        if self._in_medium and not tensors_of(self._medium):
+            raise InputError(
+                "the medium of this operator is not known, as it comes from a batch; lb.at and lb.connection need it"
+            )
+        return self._medium
 
     def check_points(self, points: Tensor) -> None:
         """Raise InputError unless the operator was built from these points, in their order, to float32 rounding.
 
         An operator does not follow its points: after scaling, turning, or taking a part of them it is another one.
         """
-        check_same_points(points, self.points)
+        built = self.points
+        if points.shape != built.shape:
+            raise InputError(
+                f"points: expected the {tuple(built.shape)} that the operator was built from, got "
+                f"{tuple(points.shape)}; build it again after points are added, left out or projected"
+            )
+        theirs, ours = points.detach().to(built.device).double(), built.double()
+        types = (torch.promote_types(t, torch.float16) for t in (points.dtype, built.dtype))
+        rounding = max(torch.finfo(t).eps for t in (*types, torch.float32))
+        distance = (theirs - ours).abs().amax(1)
+        moved = (~(distance <= 4 * rounding * float(ours.abs().amax()))).nonzero()[:, 0]
+        if len(moved):
+            raise InputError(
+                f"points: {len(moved)} of {len(points)} are not where they were when the operator was built "
+                f"({first_few(moved)}; by up to {float(distance.amax()):.3g}); build it again after scaling, turning "
+                "or deforming a shape"
+            )
 
     def __repr__(self) -> str:
         """N, d, n, source and options."""
@@ -213,7 +249,7 @@ class OperatorStorage(Tensors):
             "options": self.options,
             "certificate": None if self.certificate is None else asdict(self.certificate),
             "sizes": None if self.sizes is None else list(self.sizes),
-            "radius": self.weak.known_radius,
+            "radius": None if self.weak._radius is None else float(self.weak._radius),
             "parts": self._states,
             "medium": self._in_medium,
             "surface": None if self.surface is None else asdict(self.surface),
@@ -222,12 +258,11 @@ class OperatorStorage(Tensors):
     def set_extra_state(self, state: dict[str, Any]) -> None:
         """Inverse of `get_extra_state`; entries that are left out are unknown."""
         self.source, self.options = state["source"], dict(state["options"])
-        found, sizes, radius = (state.get(key) for key in ("certificate", "sizes", "radius"))
-        surface = state.get("surface")
+        found, surface, sizes = (state.get(key) for key in ("certificate", "surface", "sizes"))
         self.surface = None if surface is None else SurfaceSummary.of(surface)
         self.certificate = None if found is None else Certificate(**found)
-        self.sizes, self._states = None if sizes is None else tuple(sizes), state.get("parts")
-        self.weak.known_radius = radius
+        self.sizes, self._states = sizes, state.get("parts")
+        self.weak.set_radius(state.get("radius"))
         self._in_medium = bool(state.get("medium"))
 
     def _load_from_state_dict(self, state_dict: Any, prefix: str, *given: Any) -> None:
@@ -242,6 +277,7 @@ class OperatorStorage(Tensors):
                     f"{len(theirs)} others; leave it out of the state to keep the one that is there"
                 )
         vectors = state_dict.get(f"{prefix}modes.eigenvectors")
-        self._plan = self._planned = self._cache = None
+        self._plan = self._cache = None
         super()._load_from_state_dict(state_dict, prefix, *given)
-        self._hold(Modes(None, self.mass, stored=vectors is not None), vectors)
+        self.modes = Modes(None, self.mass)
+        self._keep_basis(stored=vectors is not None, loaded=vectors)

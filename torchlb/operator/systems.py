@@ -15,10 +15,11 @@ from collections import OrderedDict
 from collections.abc import Callable
 from functools import cached_property, partial
 from typing import Any
+from weakref import finalize
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from scipy import sparse
 from scipy.sparse import csgraph
 from torch import Tensor
@@ -40,17 +41,9 @@ SPACING = 4.0
 
 def pair_system(lb: OperatorStorage) -> PairSystem:
     """The system of an operator with a weak pair, for all times."""
-    return _kept(lb.cache.systems, None, lambda: PairSystem(lb))
-
-
-def _kept(kept: OrderedDict[Any, Any], key: Any, make: Callable[[], Any]) -> Any:
-    """Least-recently-used cache of `KEPT` entries: the entry of a key, made where it is missing."""
-    if key not in kept:
-        kept[key] = make()
-        if len(kept) > KEPT:
-            kept.popitem(last=False)
-    kept.move_to_end(key)
-    return kept[key]
+    cache = lb.cache
+    cache.system = cache.system or PairSystem(lb)
+    return cache.system
 
 
 def solve_columns(
@@ -78,29 +71,6 @@ def _by_shape(
     return torch.cat([function(pair_system(shape), part) for shape, part in parts])
 
 
-class _Components:
-    """Means over the connected components of a shape; on components with a condition K is regular."""
-
-    def __init__(self, lb: OperatorStorage) -> None:
-        crow, col, _ = lb.weak.linear_pair
-        where = (np.ones(len(col)), col.cpu().numpy(), crow.cpu().numpy())
-        graph = sparse.csr_array(where, shape=lb.shape)
-        self.count, number = csgraph.connected_components(graph, directed=False)
-        self.of = torch.from_numpy(number.astype(np.int64)).to(col.device)
-        held = torch.zeros(self.count, device=col.device)
-        held = held.index_add(0, self.of, lb.weak.losing(lb.fixed).float())
-        if self.count > 1:
-            held = held[self.of]
-        self.free = (held == 0)[:, None]  # by point; a single row for one component
-
-    def sums(self, weights: Float[Tensor, "N 1"], x: Float[Tensor, "N C"]) -> Float[Tensor, "_ C"]:
-        """Weighted sum over the component of each point; one row for all points if there is one component."""
-        if self.count == 1:
-            return weights.T @ x
-        found = x.new_zeros(self.count, x.shape[1])
-        return found.index_add(0, self.of, weights * x)[self.of]
-
-
 class PairSystem:
     """K, and M + tK for every t, of a weak pair."""
 
@@ -111,20 +81,43 @@ class PairSystem:
         self.units = [values.abs().max().double() for values in self.parts]
         self.pattern = crow.int(), col.int()
         self.free = None if lb.fixed is None else (~lb.fixed).double()[:, None]
-        self.components = _Components(lb)
         self.one = torch.ones_like(lb.mass.double())[:, None]
         self.ones_mass = self.mass_product(self.one)
-        self.area = self.components.sums(self.one, self.ones_mass)
         self.stiff = float(self.stiffness.double().abs().sum() / self.mass.double().sum())
         self.smooths = lb.weak.linear.num_rows > 0  # the cotangent's pair is its own P1 pair
         self.steps = 0
         crow, col, linear = lb.weak.linear_pair
         first, second = (to_scipy(crow, col, v.double(), lb.shape) for v in linear)
+        losing = lb.weak.losing(lb.fixed)
+        self._find_components(first, losing)
         if lb.weak.of_functions:
             sums = first.sum(1)  # negative row sums (float32) would make it indefinite
-            sums = np.where(lb.weak.losing(lb.fixed).cpu().numpy(), np.minimum(sums, 0.0), sums)
+            sums = np.where(losing.cpu().numpy(), np.minimum(sums, 0.0), sums)
             first = first - sparse.diags_array(sums)
-        self.linear, self.factors = (first, second), OrderedDict()
+        self.linear = first, second
+        self.factors: OrderedDict[float | None, Factor] = OrderedDict()
+        finalize(self, self.factors.clear)  # cholespy reports factors that outlive Python as leaks
+
+    def _find_components(self, linear: Any, losing: Bool[Tensor, " N"]) -> None:
+        """Find the connected components, those where K1 = 0, and their areas.
+
+        Results have a row for each point, or one row where there is one component.
+        """
+        pattern = np.ones(linear.nnz), linear.indices, linear.indptr
+        graph = sparse.csr_array(pattern, shape=linear.shape)  # with entries that are zero
+        self.count, number = csgraph.connected_components(graph, directed=False)
+        self.component = torch.from_numpy(number.astype(np.int64)).to(losing.device)
+        held = torch.zeros(self.count, device=losing.device)
+        held = held.index_add(0, self.component, losing.float())
+        self.unheld = ((held if self.count == 1 else held[self.component]) == 0)[:, None]
+        self.area = self._sums(self.one, self.ones_mass)
+
+    def _sums(self, weights: Float[Tensor, "N 1"], x: Float[Tensor, "N C"]) -> Float[Tensor, "_ C"]:
+        """Weighted sums over the component of each point."""
+        if self.count == 1:
+            return weights.T @ x
+        found = x.new_zeros(self.count, x.shape[1])
+        return found.index_add(0, self.component, weights * x)[self.component]
 
     def solve(
         self, b: Float[Tensor, "N C"], time: Float[Tensor, " C"] | None, tolerance: float | None
@@ -166,15 +159,11 @@ class PairSystem:
         shares_of = shares[0], -values * time * shares[1]
         terms = [(share, (*self.pattern, v)) for share, v in zip(shares_of, parts, strict=True)]
         near = partial(self._near, self._levels(time, b.shape[1]))
-
-        def coarse(r: Tensor) -> Tensor:
-            return near(r.double()).mul_(unit).to(r)
-
-        cycle = self._cycle(shares, coarse) if self.smooths else None
+        inverse = self._inverse(shares, unit, near)
 
         def precondition(r: Tensor) -> Tensor:
-            r = r - left @ (known.T @ r)  # the vectors are known to the tolerance of their pairs
-            x = coarse(r) if cycle is None else cycle(r.float()).to(r)
+            # the vectors are known to the tolerance of their pairs
+            x = inverse(r - left @ (known.T @ r))
             return x - known @ (left.T @ x)
 
         b = self.inside(b - left @ (known.T @ b))
@@ -206,19 +195,7 @@ class PairSystem:
             whole = torch.stack([share * v for share, v in exact]).sum(0)
             exact = [(torch.ones_like(unit).to(dtype), whole)]
         product = partial(self._product, [(share, (*self.pattern, v)) for share, v in exact])
-
-        def precondition(r: Tensor) -> Tensor:
-            x = near(r.double()).mul_(unit)
-            # Where K is singular, rounding adds large constants.
-            return (x - self._mean(self.ones_mass, x) if time is None else x).to(r)
-
-        inverse = precondition
-        if self.smooths:
-            cycle = self._cycle(shares, precondition)
-
-            def inverse(r: Tensor) -> Tensor:
-                return cycle(r.float()).to(r)
-
+        inverse = self._inverse(shares, unit, near, centered=time is None)
         size = right.norm(dim=0).clamp_min(TINY)
         b = (right / size).to(dtype)
         x, self.steps = conjugate_gradients(product, b, inverse, tolerance=tolerance)
@@ -239,14 +216,28 @@ class PairSystem:
         matrices = [without_small_entries(*self.pattern, v.double() / unit) for v, unit in parts]
         return [(m, absolute_row_sums(m[0], m[2])) for m in matrices]
 
-    def _cycle(self, shares: list[Tensor], coarse: Linear) -> Linear:
-        """Two-grid cycle around the factors' solve, in float32; of K alone where M is small for the shortest time."""
+    def _inverse(
+        self, shares: list[Tensor], unit: Tensor, near: Linear, *, centered: bool = False
+    ) -> Linear:
+        """The factors' solve as a preconditioner, within a two-grid cycle in float32 where that smooths.
+
+        The cycle is of K alone where M is small for the shortest time.
+        """
+
+        def coarse(r: Tensor) -> Tensor:
+            x = near(r.double()).mul_(unit)
+            # Where K is singular, rounding adds large constants.
+            return (x - self._mean(self.ones_mass, x) if centered else x).to(r)
+
+        if not self.smooths:
+            return coarse
         shares = [share.float() for share in shares]
         sums = [share * s for share, (_, s) in zip(shares, self._rough, strict=False)]
         terms = [(share, matrix) for share, (matrix, _) in zip(shares, self._rough, strict=False)]
         if len(sums) == 2 and bool((sums[0][:, 0] > sums[1][:, 0] / LOW).all()):
             terms = terms[:1]
-        return two_grid(partial(self._product, terms), sum(sums[1:], sums[0]), coarse)
+        cycle = two_grid(partial(self._product, terms), sum(sums[1:], sums[0]), coarse)
+        return lambda r: cycle(r.float()).to(r)
 
     def _product(self, terms: list[tuple[Tensor, Matrix]], x: Tensor) -> Tensor:
         """Product of every column with its shares of the matrices."""
@@ -274,7 +265,12 @@ class PairSystem:
 
     def factor(self, t: float | None) -> Factor:
         """The factor of M₁ + tK₁, or of K₁ with a small multiple of M₁ that makes it definite."""
-        return _kept(self.factors, t, lambda: self._factored(t))
+        if t not in self.factors:
+            self.factors[t] = self._factored(t)
+            if len(self.factors) > KEPT:
+                self.factors.popitem(last=False)
+        self.factors.move_to_end(t)
+        return self.factors[t]
 
     def _factored(self, t: float | None) -> Factor:
         first, second = self.linear
@@ -302,7 +298,7 @@ class PairSystem:
 
     def _mean(self, weights: Tensor, x: Tensor) -> Tensor:
         """Weighted sums over components where K1 = 0, divided by their areas; 0 on the others."""
-        return torch.where(self.components.free, self.components.sums(weights, x) / self.area, 0.0)
+        return torch.where(self.unheld, self._sums(weights, x) / self.area, 0.0)
 
     def inside(self, x: Tensor) -> Tensor:
         """x, set to zero at Dirichlet points."""

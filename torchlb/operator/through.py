@@ -3,7 +3,7 @@
 What follows from the weak pair (eigenpairs, flows, solves, products with K and M, the mass) is differentiable in both:
 its gradient is that of a sum of bilinear forms (`PairPlan.bilinear`). Rows of Δ and ∇, frames and normals are evaluated
 again for a gradient. All else raises an error where a derivative is asked for: no gradient is zero, or lacks a part, in
-silence.
+silence (`method.md`, section 14).
 """
 
 from __future__ import annotations
@@ -12,17 +12,24 @@ from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import torch
+from jaxtyping import Float
 from torch import Tensor
+from torch.nn.functional import pad
 
 from torchlb.errors import DerivativeError, first_few
 from torchlb.galerkin.bilinear import BilinearForm
 from torchlb.galerkin.medium import Field
 from torchlb.linalg.csr import side_by_side, tensors_of
 from torchlb.linalg.once import once_differentiable
+from torchlb.linalg.precision import ROOT_EPS
 from torchlb.operator.batching import shapes_of
 from torchlb.operator.medium import elements_of, plain
 from torchlb.operator.parts import PairMatrices
+from torchlb.operator.systems import pair_system
+from torchlb.spectral.eigenbasis import Eigenbasis, unstack_eigenbases
 
+BEYOND = 10
+"""Number of pairs beyond those asked for, which keep the solves for derivatives of eigenvectors well-conditioned."""
 Forms = Callable[..., Sequence[BilinearForm]]
 """From the gradients of results the bilinear forms whose sum has their derivative."""
 
@@ -45,19 +52,15 @@ class _Origin(NamedTuple):
         """The derivative of a sum of forms in the variables; DerivativeError where it is not finite."""
         medium, root = plain(self.medium), _root_of_absorption(self.weak)
         forms = [part for form in forms for part in self._parts(form, root)]
-        points = self.points.detach().cpu().double()
-        if self.points.requires_grad:
-            points.requires_grad_()
         leaves = [f.values for name, f in medium.items() if self.medium[name].values.requires_grad]
+        moved = []
+        if self.points.requires_grad:
+            moved = [self.points.detach().cpu().double().requires_grad_()]
         with torch.enable_grad():
-            if self.points.requires_grad:
-                leaves = [points, *leaves]
-                total = self.evaluated.bilinear(points, forms, medium)
-            else:
-                total = self.evaluated.bilinear(forms, medium)
-            found = [torch.zeros_like(leaf) for leaf in leaves]
+            total = self.evaluated.bilinear(*moved, forms, medium)
+            found = [torch.zeros_like(leaf) for leaf in (*moved, *leaves)]
             if total.requires_grad:  # M does not depend on the conductivity, for example
-                found = torch.autograd.grad(total, leaves, materialize_grads=True)
+                found = torch.autograd.grad(total, [*moved, *leaves], materialize_grads=True)
         return [_finite(g).to(v) for g, v in zip(found, self.variables, strict=True)]
 
     def _parts(self, form: BilinearForm, root: Tensor | None) -> list[BilinearForm]:
@@ -143,62 +146,37 @@ def _root_of_absorption(weak: PairMatrices) -> Tensor | None:
 
 
 class _Known(torch.autograd.Function):
-    """Results that are known, with their derivative in the variables of an operator."""
+    """Values that are known, with a function from their gradients to those of the variables that they follow from."""
 
     @staticmethod
-    def forward(ctx: Any, found: Origins, forms: Forms, count: int, *given: Tensor) -> Any:  # pyright: ignore[reportIncompatibleMethodOverride]
+    def forward(ctx: Any, gradient: Any, count: int, *given: Tensor) -> Any:  # pyright: ignore[reportIncompatibleMethodOverride]
         ctx.save_for_backward(*given[count:])
-        ctx.found, ctx.forms, ctx.count = found, forms, count
-        return tuple(result.clone() for result in given[:count])
+        ctx.gradient, ctx.count = gradient, count
+        return tuple(value.clone() for value in given[:count])
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, *grads: Tensor) -> tuple[Any, ...]:  # pyright: ignore[reportIncompatibleMethodOverride]
-        forms = ctx.forms(*(g.double() for g in grads))
-        return None, None, None, *[None] * ctx.count, *ctx.found.gradient(forms)
+        return None, None, *[None] * ctx.count, *ctx.gradient(*grads)
 
 
-class _Rows(torch.autograd.Function):
-    """Rows, frames and normals that are known, evaluated again for their derivative in the points."""
-
-    @staticmethod
-    def forward(ctx: Any, points: Tensor, plan: Any, *known: Tensor) -> Any:  # pyright: ignore[reportIncompatibleMethodOverride]
-        ctx.save_for_backward(points)
-        ctx.plan = plan
-        return tuple(each.clone() for each in known)
-
-    @staticmethod
-    @once_differentiable
-    def backward(ctx: Any, *grads: Tensor) -> tuple[Any, ...]:  # pyright: ignore[reportIncompatibleMethodOverride]
-        (points,) = ctx.saved_tensors
-        with torch.enable_grad():
-            x = points.detach().cpu().double().requires_grad_()
-            found = ctx.plan.rows_at(x)
-            (gradient,) = torch.autograd.grad(
-                found, x, [g.to(f) for g, f in zip(grads, found, strict=True)]
-            )
-        return _finite(gradient).to(points), None, *[None] * len(grads)
-
-
-class _Refused(torch.autograd.Function):
-    """A value that depends on points or medium in a way that is not differentiated."""
-
-    @staticmethod
-    def forward(ctx: Any, value: Tensor, what: str, *variables: Tensor) -> Tensor:  # pyright: ignore[reportIncompatibleMethodOverride]
-        ctx.what = what
-        return value.clone()
-
-    @staticmethod
-    def backward(ctx: Any, *grads: Any) -> Any:
-        raise DerivativeError(
-            f"{ctx.what}: no derivative in the points or in the medium; eigenpairs, flows, solves, the mass, "
-            "lb.product(name, f), Δf and ∇f have one. For derivatives in f, take an operator at points.detach()"
-        )
+def _following(
+    values: Sequence[Tensor], gradient: Callable[..., list[Tensor]], *variables: Tensor
+) -> Sequence[Tensor]:
+    given = [value.detach() for value in values]
+    return _Known.apply(gradient, len(given), *given, *variables)  # pyright: ignore[reportReturnType]
 
 
 def refused(value: Tensor, what: str, *variables: Tensor) -> Tensor:
     """The value, which raises DerivativeError where its derivative in the variables is asked for."""
-    return _Refused.apply(value.detach(), what, *variables)  # pyright: ignore[reportReturnType]
+
+    def gradient(g: Tensor) -> list[Tensor]:
+        raise DerivativeError(
+            f"{what}: no derivative in the points or in the medium; eigenpairs, flows, solves, the mass, "
+            "lb.product(name, f), Δf and ∇f have one. For derivatives in f, take an operator at points.detach()"
+        )
+
+    return _following([value], gradient, *variables)[0]
 
 
 def known(lb: Any, results: Sequence[Tensor], forms: Forms) -> Sequence[Tensor]:
@@ -206,8 +184,11 @@ def known(lb: Any, results: Sequence[Tensor], forms: Forms) -> Sequence[Tensor]:
     found = origins(lb)
     if found is None:
         return results
-    given = [result.detach() for result in results]
-    return _Known.apply(found, forms, len(given), *given, *found.variables)  # pyright: ignore[reportReturnType]
+
+    def gradient(*grads: Tensor) -> list[Tensor]:
+        return found.gradient(forms(*(g.double() for g in grads)))
+
+    return _following(results, gradient, *found.variables)
 
 
 def without(lb: Any, x: Tensor, what: str) -> Tensor:
@@ -219,10 +200,7 @@ def without(lb: Any, x: Tensor, what: str) -> Tensor:
 def carrying(lb: Any, points: Any) -> Any:
     """The operator; where points require a gradient, it comes by what has one, and errors by all else.
 
-    Raises
-    ------
-    DerivativeError
-        Where nothing of the operator has a derivative.
+    Raises DerivativeError where nothing of the operator has a derivative.
     """
     if not (isinstance(points, Tensor) and points.requires_grad and torch.is_grad_enabled()):
         return lb
@@ -231,20 +209,27 @@ def carrying(lb: Any, points: Any) -> Any:
             "points: they require gradients, which there are none of without a weak pair and of noisy curves, whose "
             "points are moved; pass points.detach() if results may be constants of them"
         )
-    one = torch.ones(lb.num_points, 1, dtype=torch.float64)
+    plan, one = lb.plan, torch.ones(lb.num_points, 1, dtype=torch.float64)
+    lb.points = own = points.to(lb.points).view_as(lb.points)  # a buffer is no Parameter
 
-    def forms(g: Tensor) -> list[BilinearForm]:
+    def of_mass(g: Tensor) -> list[BilinearForm]:
         return [BilinearForm("lumped", one, g[:, None], one[0])]
 
-    lb.points = points.to(lb.points).view_as(lb.points)  # a buffer is no Parameter
-    (lb.mass,) = known(lb, [lb.mass], forms)
-    known_rows = [lb.stencil.values, lb.frames, *([lb.normals] if len(lb.normals) else [])]
-    lb.stencil.values, lb.frames, *normals = _Rows.apply(lb.points, lb.plan, *known_rows)  # pyright: ignore[reportGeneralTypeIssues]
+    def of_rows(*grads: Tensor) -> list[Tensor]:
+        with torch.enable_grad():
+            x = own.detach().cpu().double().requires_grad_()
+            found = plan.rows_at(x)
+            scaled = [g.to(f) for g, f in zip(grads, found, strict=True)]
+            (gradient,) = torch.autograd.grad(found, x, scaled)
+        return [_finite(gradient).to(own)]
+
+    (lb.mass,) = known(lb, [lb.mass], of_mass)
+    rows = [lb.stencil.values, lb.frames, *([lb.normals] if len(lb.normals) else [])]
+    lb.stencil.values, lb.frames, *normals = _following(rows, of_rows, own)
     lb.normals = normals[0] if normals else lb.normals
     if lb.weak.near.values[3:4].any():
-        lb.stencil.values = refused(
-            lb.stencil.values, "rows of Δ and ∇ with a Robin condition", points
-        )
+        what = "rows of Δ and ∇ with a Robin condition"
+        lb.stencil.values = refused(lb.stencil.values, what, points)
     return lb
 
 
@@ -259,3 +244,69 @@ def through_product(lb: Any, name: Any, f: Tensor, result: Tensor) -> Tensor:
         return [BilinearForm(kind, side_by_side(g), other, torch.ones_like(other[0]))]
 
     return result + known(lb, [torch.zeros_like(result)], forms)[0]
+
+
+def through_eigenpairs(lb: Any, whole: Eigenbasis, k: int) -> Eigenbasis:
+    """The first k pairs of a basis, differentiable in the variables of the operator.
+
+    Of eigenvectors, what does not depend on the basis of an eigenspace (signatures, filters Φg(Λ)ΦᵀM, projectors) has
+    exact gradients; so have symmetric functions of the eigenvalues of a cluster.
+    """
+    basis = whole.truncate(k)
+    if origins(lb) is None:
+        return basis
+    shapes, wholes = shapes_of(lb) or (lb,), unstack_eigenbases(whole)
+    sizes = [shape.num_points for shape in shapes]
+
+    def forms(values: Tensor, vectors: Tensor, left: Tensor) -> list[BilinearForm]:
+        grads = values.view(len(shapes), -1), vectors.split(sizes), left.split(sizes)
+        parts = [_of_shape(*row) for row in zip(shapes, wholes, *grads, strict=True)]
+        most = max(part[0].shape[1] for part in parts)
+        joined = (
+            torch.cat([pad(own, (0, most - own.shape[1])) for own in column])
+            for column in zip(*parts, strict=True)
+        )
+        w, of_mass, u = joined
+        one = torch.ones(most, dtype=torch.float64)
+        return [BilinearForm("energy", w, u, one), BilinearForm("mass", of_mass, u, one)]
+
+    results = basis.eigenvalues, basis.eigenvectors, basis.left
+    values, vectors, left = known(lb, results, forms)
+    return Eigenbasis(values, vectors, lb.mass, left, basis.sizes, basis.relative_errors)
+
+
+def _of_shape(
+    lb: Any,
+    whole: Eigenbasis,
+    of_values: Float[Tensor, " k"],
+    of_vectors: Float[Tensor, "N k"],
+    of_left: Float[Tensor, "N k"],
+) -> tuple[Float[Tensor, "N m"], Float[Tensor, "N m"], Float[Tensor, "N m"]]:
+    """Functions w and v with the derivative Σ_i w_iᵀdK φ_i + v_iᵀdM φ_i of a result, and all known φ.
+
+    Inside the span of the m known eigenvectors it takes differences of eigenvalues, broadened where they agree to
+    rounding; outside, a solve for each vector (Nelson 1976).
+    """
+    phi, lam = whole.eigenvectors.double(), whole.eigenvalues.double()
+    count = min(of_values.shape[0], len(lam))
+    more, own = (0, len(lam) - count), of_values[:count] * phi[:, :count]
+    w, v = pad(own, more), pad(-lam[:count] * own, more)
+    if not (of_vectors.any() or of_left.any()):
+        return w, v, phi
+    solver = pair_system(lb)
+    left = solver.inside(of_left[:, :count])  # MΦ is zero at Dirichlet points
+    v += pad(left, more)
+    gradient = of_vectors[:, :count] + solver.mass_product(left)
+    inside = pad(phi.T @ gradient, more)  # φ_jᵀḡ_i
+    gap = lam - lam[:, None]
+    gap = gap / (gap.square() + (ROOT_EPS * lam[-1]) ** 2)
+    turning = (inside - inside.T) * gap / 2
+    w += phi @ turning
+    v -= phi @ (turning * (lam + lam[:, None]) / 2 + (inside + inside.T) / 4)
+    free = lb.num_points if lb.fixed is None else int((~lb.fixed).sum())
+    if len(lam) >= free:
+        return w, v, phi
+    outside = solver.solve_beyond(gradient, lam[:count], phi, lam[-1])
+    w -= pad(outside, more)
+    v += pad(lam[:count] * outside, more)
+    return w, v, phi

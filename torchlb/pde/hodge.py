@@ -13,9 +13,9 @@ from torchlb.errors import InputError
 from torchlb.galerkin.weak_gradient import WeakGradient
 from torchlb.linalg.checks import check_operator
 from torchlb.linalg.csr import Csr
-from torchlb.operator.curvature import check_surface
 from torchlb.operator.laplace_beltrami import LaplaceBeltrami
 from torchlb.operator.medium import elements_of
+from torchlb.operator.stencil_methods import check_surface
 from torchlb.operator.through import without
 from torchlb.pde.solves import TOLERANCE, solved
 
