@@ -21,9 +21,9 @@ from torchlb.cloud.manifold import face_vectors
 from torchlb.cloud.outliers import spacing_at
 from torchlb.cloud.surface import CloudSurface
 from torchlb.geometry.compatibility import admissible_neighbors
-from torchlb.geometry.complex import Faces, edges_of, pieces_of
+from torchlb.geometry.complex import Faces, edges_of
 from torchlb.geometry.frames import complete_frames
-from torchlb.geometry.thresholds import AROUND, FACTOR, LEVEL, NEAREST, OBTUSE
+from torchlb.geometry.thresholds import FACTOR, LEVEL, NEAREST, OBTUSE
 from torchlb.geometry.vectors import inner, largest, lengths
 from torchlb.linalg.precision import DENSE, NEGLIGIBLE, ROOT_EPS, SMALL
 
@@ -53,7 +53,7 @@ def in_doubt(surface: CloudSurface, faces: Faces) -> Bool[np.ndarray, " F"]:
     i, j = edges.keys // count, edges.keys % count
     edge = points[j] - points[i]
     length = lengths(edge)
-    spacing, narrow = (spacing_at(points, near, number) for number in (AROUND, AROUND // 2))
+    spacing = spacing_at(points, near)
     small, large = np.minimum(spacing[i], spacing[j]), np.maximum(spacing[i], spacing[j])
     # long against the larger spacing of their ends, or against the smaller one
     found = length > np.minimum(REACH * large, FACTOR * small)
@@ -67,13 +67,8 @@ def in_doubt(surface: CloudSurface, faces: Faces) -> Bool[np.ndarray, " F"]:
         close[i[across]] = close[j[across]] = True
         beside = close[i] | close[j]
         close[i[beside]] = close[j[beside]] = True
-        own = np.where(amid, spacing, narrow)
-        found |= steep & (close[i] & close[j] | (length > np.maximum(own[i], own[j])))
-    doubtful = found[edges.of].reshape(-1, 3).any(1)
-    if doubtful.any():
-        piece = pieces_of(faces[~doubtful], count)
-        doubtful |= (np.bincount(piece) < NEAREST)[piece][faces].any(1)
-    return np.asarray(doubtful)
+        found |= steep & close[i] & close[j]
+    return found[edges.of].reshape(-1, 3).any(1)
 
 
 def spectral_change(surface: CloudSurface) -> tuple[float, Bool[np.ndarray, " N"]]:

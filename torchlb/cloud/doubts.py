@@ -16,7 +16,7 @@ from torchlb.errors import first_few, warn
 from torchlb.geometry.boundary import boundary_faces
 from torchlb.geometry.fit_search import REASONS
 from torchlb.geometry.local_fits import FitPlan
-from torchlb.geometry.thresholds import RING, ROUGH, SLIGHT
+from torchlb.geometry.thresholds import RING, ROUGH, SLIGHT, WIDER
 from torchlb.linalg.precision import LOW, NEGLIGIBLE, SMALL
 
 CROWD = 256
@@ -44,7 +44,7 @@ def warn_of_joins(surface: CloudSurface) -> None:
     """Warn where triangles may join what is apart, or close what is open."""
     points = surface.points
     change, marked = spectral_change(surface)
-    if change > LOW:
+    if change > WIDER * SLIGHT:
         places = in_words(places_of(points.numpy(), surface.neighbors.numpy(), marked))
         warn(
             "points: triangles that are steep to the surface or long for its spacing raise "
