@@ -15,11 +15,9 @@ from jaxtyping import Bool, Float, Int
 from scipy.spatial import KDTree
 from torch import Tensor
 
-from torchlb.cloud.complexes import Complex
-from torchlb.cloud.frames import cloud_frames
+from torchlb.cloud.complexes import Complex, in_words, places_of
+from torchlb.cloud.frames import cloud_frames, settled_normals
 from torchlb.cloud.noise import denoised
-from torchlb.cloud.orientation import settled_normals
-from torchlb.cloud.places import in_words, places_of
 from torchlb.errors import InputError, first_few, warn
 from torchlb.geometry.neighbors import nearest_neighbors
 from torchlb.geometry.thresholds import CREASE, FACTOR, HALF_CREASE, OBTUSE, RING, ROUGH, WIDER

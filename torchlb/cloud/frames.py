@@ -1,18 +1,30 @@
-"""Tangent frames and normals of a cloud."""
+"""Tangent frames and normals of a cloud, and the signs of the normals, which tell the two sides of a thin shape apart.
+
+Signs are propagated along a spanning tree (Hoppe et al. 1992). Across an edge a surface is taken for an arc: the normal
+at one end is the mirror image of that at the other in the plane that bisects the edge. So the sign is carried round a
+crease, where the normals turn, and straight through a thin sheet, whose two sides face away from each other.
+"""
 
 from __future__ import annotations
 
+import numpy as np
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 from torch.nn.functional import normalize
 
+from torchlb.errors import first_few, warn
 from torchlb.fits.polynomials import monomials
 from torchlb.fits.weights import window
 from torchlb.geometry.compatibility import admissible_neighbors, planes_of
+from torchlb.geometry.complex import components, tree_sides
 from torchlb.geometry.frames import complete_frames
-from torchlb.geometry.vectors import dot
-from torchlb.linalg.precision import AT_ONCE, ROUNDING, TINY
+from torchlb.geometry.thresholds import CREASE, KINK, RING
+from torchlb.geometry.vectors import at, dot
+from torchlb.linalg.precision import AT_ONCE, LOW, ROUNDING, TINY
+
+ASTRAY = 3 / 4
+"""Share of contradicting neighbours above which a normal is flipped; a half suffices where the field has no side."""
 
 
 def cloud_frames(
@@ -97,3 +109,125 @@ def _slopes_removed(
     slope = torch.linalg.solve(square, terms @ heights[..., None])[:, 1:3]
     sound = (good.sum(1) > 7) & (slope[..., 0].norm(dim=1) < 1)
     return torch.where(sound[:, None], normalize(own - (frames @ slope)[..., 0]), own)
+
+
+def nearest_pairs(candidates: Int[Tensor, "N K"]) -> tuple[Int[Tensor, " P"], Int[Tensor, " P"]]:
+    """Pairs (i, j), i < j, of points one of which is among the candidates of the other, each pair once.
+
+    >>> [end.tolist() for end in nearest_pairs(torch.tensor([[0, 1], [1, 0], [2, 1]]))]
+    [[0, 1], [1, 2]]
+    """
+    num_points, size = candidates.shape
+    i = torch.arange(num_points).repeat_interleave(size - 1)
+    j = candidates[:, 1:].reshape(-1)
+    code = (torch.minimum(i, j) * num_points + torch.maximum(i, j)).numpy()
+    code.sort()  # takes a quarter of the time of `torch.unique`
+    code = torch.from_numpy(code[np.flatnonzero(np.diff(code, prepend=-1))])
+    low, high = code // num_points, code % num_points
+    return low[low != high], high[low != high]
+
+
+def _across(
+    points: Float[Tensor, "N n"],
+    normals: Float[Tensor, "N n"],
+    i: Int[Tensor, " P"],
+    j: Int[Tensor, " P"],
+) -> tuple[Float[Tensor, " P"], Bool[Tensor, " P"]]:
+    """(cosine between n_j and the mirror image of n_i; whether the edge is the chord of an arc).
+
+    The chord of an arc falls below one tangent plane and rises to the other, if the normals agree. Where it does not,
+    the ends may lie on the two sides of a thin sheet.
+    """
+    edge, ends = at(points, j) - at(points, i), [at(normals, end) for end in (i, j)]
+    edge = edge / edge.norm(dim=1, keepdim=True)
+    rise_i, rise_j = (dot(edge, end) for end in ends)
+    cosine = dot(*ends) - 2 * rise_i * rise_j
+    return cosine, cosine * rise_i * rise_j <= 0
+
+
+def _carried(
+    points: Float[Tensor, "N n"],
+    normals: Float[Tensor, "N n"],
+    candidates: Int[Tensor, "N K"],
+) -> tuple[Float[Tensor, " N"], Int[Tensor, " N"]]:
+    """(signs that make normals consistent with that of the root of their component, along a spanning tree; the roots).
+
+    The root is the extreme point of a component (largest last coordinate); the most certain edges enter the tree first.
+    """
+    pairs = nearest_pairs(candidates)
+    cosine, _ = _across(points, normals, *pairs)
+    order = (1 - cosine.abs()).argsort(stable=True)
+    i, j = (end[order].numpy() for end in pairs)
+    turned = tree_sides(i, j, (cosine[order] < 0).numpy(), len(points))
+    component = components(i, j, len(points))
+    # The extreme point of each component, which a lexicographic order puts last.
+    last = np.lexsort((points[:, -1].numpy(), component))
+    root = last[np.append(np.diff(component[last]) > 0, True)][component]
+    sign = np.where(turned ^ turned[root], -1.0, 1.0)
+    return torch.from_numpy(sign).to(points), torch.from_numpy(root)
+
+
+def mended_normals(
+    points: Float[Tensor, "N n"],
+    normals: Float[Tensor, "N n"],
+    candidates: Int[Tensor, "N K"],
+) -> tuple[Float[Tensor, "N n"], Bool[Tensor, " N"]]:
+    """(normals of a user with the signs of those around them; points where these have no side).
+
+    Normals that most neighbours contradict are flipped, repeatedly; or signs are propagated along a spanning tree, to
+    the side of the majority of a component, if that leaves fewer contradictions, also among normals within 20°. If many
+    contradict, and the sides are as even as chance makes them (three deviations), the component faces outward.
+    """
+    i, j = nearest_pairs(candidates[:, : RING + 1])
+    cosine, arc = _across(points, normals, i, j)
+    told = (arc & (cosine.abs() >= CREASE)).to(points)
+    if not (told * (cosine < 0)).any():
+        return normals, torch.zeros(len(points), dtype=torch.bool)
+    sign, root = _carried(points, normals, candidates)
+
+    def contradicted(
+        told: Float[Tensor, " P"], side: Float[Tensor, " N"], group: Int[Tensor, " N"]
+    ) -> Float[Tensor, " N"]:
+        """Share of contradicting pairs at the points of each group."""
+        wrong = told * (cosine * side[i] * side[j] < 0)
+        total = torch.zeros(2, len(points), dtype=points.dtype)
+        for end in (i, j):
+            total.index_add_(1, group[end], torch.stack([wrong, told]))
+        return (total[0] / total[1].clamp_min(1))[group]
+
+    side, own = torch.ones_like(sign), torch.arange(len(points))
+    many = contradicted(told, side, root) > LOW
+    for _ in range(RING):
+        astray = contradicted(told, side, own) > torch.where(many, 0.5, ASTRAY)
+        side = torch.where(astray, -side, side)
+    better = torch.ones_like(many)
+    for pairs in (told, told * (cosine.abs() >= KINK)):
+        better &= contradicted(pairs, sign, root) < contradicted(pairs, side, root)
+    votes, number = torch.zeros(2, len(points), dtype=points.dtype).index_add(
+        1, root, torch.stack([sign, torch.ones_like(sign)])
+    )
+    even = (many | better) & (votes.abs() <= 3 * number.sqrt())[root]
+    most = torch.where(even, normals[root, -1], votes[root])
+    carried = torch.where(most < 0, -sign, sign)
+    return normals * torch.where(better | even, carried, side)[:, None], even
+
+
+def settled_normals(
+    points: Float[Tensor, "N n"],
+    normals: Float[Tensor, "N n"],
+    candidates: Int[Tensor, "N K"],
+) -> tuple[Float[Tensor, "N n"], bool]:
+    """(normals consistent with their neighbours; whether their side is the user's). Warnings say what was changed."""
+    mended, even = mended_normals(points, normals, candidates)
+    turned = (((mended * normals).sum(1) < 0) & ~even).nonzero()[:, 0]
+    if even.any():
+        warn(
+            f"normals: the signs at {int(even.sum())} points contradict those of their neighbours, and neither side "
+            "has a majority; they are turned outward, as without `normals`: orient them first if the side matters"
+        )
+    if len(turned):
+        warn(
+            f"normals: {len(turned)} face the other way than those around them ({first_few(turned)}) and are turned "
+            "round, so that neighbours agree"
+        )
+    return mended, not even.all()

@@ -13,16 +13,12 @@ from torch import Tensor
 from torch.nn.functional import normalize
 
 from torchlb.cloud.cocone import REACH, Candidates, Cloud, Tetrahedra, best_manifold
-from torchlb.cloud.complexes import Complex
-from torchlb.cloud.frames import cloud_frames, refined_normals
-from torchlb.cloud.gaps import closed, filled, with_left_points
+from torchlb.cloud.complexes import Complex, Places, in_words, places_of
+from torchlb.cloud.frames import cloud_frames, refined_normals, settled_normals
+from torchlb.cloud.gaps import Pairs, at_gaps, closed, filled, stars_in_gaps, with_left_points
 from torchlb.cloud.manifold import boundary_loops, facing_out, with_single_fans, wound_alike
-from torchlb.cloud.noise import denoised
-from torchlb.cloud.orientation import settled_normals
-from torchlb.cloud.outliers import lone_points, put_beside
-from torchlb.cloud.places import Places, in_words, places_of
+from torchlb.cloud.noise import denoised, lone_points, put_beside
 from torchlb.cloud.poles import Poles, corrected_normals
-from torchlb.cloud.stars import Pairs, at_gaps, stars_in_gaps
 from torchlb.errors import InputError
 from torchlb.geometry.compatibility import mutually_admissible
 from torchlb.geometry.complex import Faces, components, delaunay, pieces_of
