@@ -5,11 +5,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from torchlb.geometry.complex import components
-from torchlb.geometry.vectors import lengths
+from torchlb.geometry.vectors import Mask, lengths
 from torchlb.linalg.precision import LOW
 
 Places = tuple[tuple[float, ...], ...]
@@ -42,7 +42,7 @@ def in_words(places: Places) -> str:
 
 
 def places_of(
-    points: Float[np.ndarray, "N n"], near: Int[np.ndarray, "N K"], marked: Bool[np.ndarray, " N"]
+    points: Float[np.ndarray, "N n"], near: Int[np.ndarray, "N K"], marked: Mask
 ) -> Places:
     """Centres of the largest groups of marked points, at most `PLACES` of them, ℓ."""
     i, j = np.arange(len(points)).repeat(near.shape[1] - 1), near[:, 1:].ravel()

@@ -32,7 +32,7 @@ from torchlb.geometry.fit_search import REASONS
 from torchlb.geometry.frames import complete_frames
 from torchlb.geometry.local_fits import FitPlan
 from torchlb.geometry.thresholds import FACTOR, LEVEL, NEAREST, OBTUSE, RING, ROUGH, SLIGHT, WIDER
-from torchlb.geometry.vectors import inner, largest, lengths
+from torchlb.geometry.vectors import Mask, Near, Points, Vectors, inner, largest, lengths
 from torchlb.linalg.precision import DENSE, LOW, NEGLIGIBLE, ROOT_EPS, SMALL
 
 CROWD = 256
@@ -94,9 +94,7 @@ def warn_of_buried(cells: Int[Tensor, "F corners"], boundary: Bool[Tensor, " N"]
         )
 
 
-def warn_of_near_duplicates(
-    points: Float[Tensor, "N n"], neighbors: Int[Tensor, "N K"], dim: int
-) -> None:
+def warn_of_near_duplicates(points: Points, neighbors: Near, dim: int) -> None:
     """Warn of points that are closer to another than chance explains, as if scanned twice.
 
     Whatever the density of random points, the nearest is closer than t times the distance of the m-th neighbour with
@@ -139,7 +137,7 @@ def warn_of_layers(points: Float[Tensor, "N 3"]) -> None:
         )
 
 
-def in_two_layers(points: Float[np.ndarray, "N 3"]) -> tuple[Int[np.ndarray, " M"], int]:
+def in_two_layers(points: Vectors) -> tuple[Int[np.ndarray, " M"], int]:
     """(sampled points around which points lie in two layers, a spacing apart or closer; size of the sample).
 
     Noise makes heights over the surface unimodal, most frequent in the middle; of two layers the middle is the rarest,
@@ -200,7 +198,7 @@ def in_doubt(surface: CloudSurface, faces: Faces) -> Bool[np.ndarray, " F"]:
     return np.asarray(found[edges.of].reshape(-1, 3).any(1))
 
 
-def spectral_change(surface: CloudSurface) -> tuple[float, Bool[np.ndarray, " N"]]:
+def spectral_change(surface: CloudSurface) -> tuple[float, Mask]:
     """(relative rise of one of the first eigenvalues over another by triangles in doubt, to first order; their points).
 
     Without these triangles an eigenvalue would be lower by their share of the energy ∫|∇φ|² of its mode. Scattered
@@ -248,7 +246,7 @@ def _coarse_space(sound: sparse.csr_matrix) -> Any:
 
 
 def _elements(
-    points: Float[np.ndarray, "N 3"], faces: Faces, weight: Float[np.ndarray, " F"]
+    points: Vectors, faces: Faces, weight: Float[np.ndarray, " F"]
 ) -> tuple[sparse.csr_array, Float[np.ndarray, " N"]]:
     """P1 stiffness matrix and lumped mass; the heights of flat triangles are bounded from below."""
     count = len(points)

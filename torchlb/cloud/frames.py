@@ -20,16 +20,14 @@ from torchlb.geometry.compatibility import admissible_neighbors, planes_of
 from torchlb.geometry.complex import components, tree_sides
 from torchlb.geometry.frames import complete_frames
 from torchlb.geometry.thresholds import CREASE, KINK, RING
-from torchlb.geometry.vectors import at, dot
+from torchlb.geometry.vectors import Frames, Near, Points, at, dot
 from torchlb.linalg.precision import AT_ONCE, LOW, ROUNDING, TINY
 
 ASTRAY = 3 / 4
 """Share of contradicting neighbours above which a normal is flipped; a half suffices where the field has no side."""
 
 
-def cloud_frames(
-    points: Float[Tensor, "N n"], candidates: Int[Tensor, "N K"], dim: int, rounds: int = 3
-) -> Float[Tensor, "N n d"]:
+def cloud_frames(points: Points, candidates: Near, dim: int, rounds: int = 3) -> Frames:
     """Initial frames of a cloud: distance-weighted principal components of the nearer half of the candidates.
 
     Each further round takes the nearest candidates that are compatible by the frames before, so that the other side of
@@ -45,10 +43,7 @@ def cloud_frames(
 
 
 def _principal_directions(
-    points: Float[Tensor, "N n"],
-    index: Int[Tensor, "B K"],
-    planes: Float[Tensor, "N n d"] | Float[Tensor, "N n"] | None,
-    dim: int,
+    points: Points, index: Int[Tensor, "B K"], planes: Frames | Points | None, dim: int
 ) -> Float[Tensor, "B n d"]:
     """Leading eigenvectors of the weighted covariance of the nearer half of the compatible points.
 
@@ -72,7 +67,7 @@ def _principal_directions(
 def refined_normals(
     points: Float[Tensor, "N 3"],
     normals: Float[Tensor, "N 3"],
-    candidates: Int[Tensor, "N K"],
+    candidates: Near,
     centers: Int[Tensor, " B"] | None = None,
     rounds: int = 1,
 ) -> Float[Tensor, "N 3"]:
@@ -111,7 +106,7 @@ def _slopes_removed(
     return torch.where(sound[:, None], normalize(own - (frames @ slope)[..., 0]), own)
 
 
-def nearest_pairs(candidates: Int[Tensor, "N K"]) -> tuple[Int[Tensor, " P"], Int[Tensor, " P"]]:
+def nearest_pairs(candidates: Near) -> tuple[Int[Tensor, " P"], Int[Tensor, " P"]]:
     """Pairs (i, j), i < j, of points one of which is among the candidates of the other, each pair once.
 
     >>> [end.tolist() for end in nearest_pairs(torch.tensor([[0, 1], [1, 0], [2, 1]]))]
@@ -128,10 +123,7 @@ def nearest_pairs(candidates: Int[Tensor, "N K"]) -> tuple[Int[Tensor, " P"], In
 
 
 def _across(
-    points: Float[Tensor, "N n"],
-    normals: Float[Tensor, "N n"],
-    i: Int[Tensor, " P"],
-    j: Int[Tensor, " P"],
+    points: Points, normals: Points, i: Int[Tensor, " P"], j: Int[Tensor, " P"]
 ) -> tuple[Float[Tensor, " P"], Bool[Tensor, " P"]]:
     """(cosine between n_j and the mirror image of n_i; whether the edge is the chord of an arc).
 
@@ -146,9 +138,7 @@ def _across(
 
 
 def _carried(
-    points: Float[Tensor, "N n"],
-    normals: Float[Tensor, "N n"],
-    candidates: Int[Tensor, "N K"],
+    points: Points, normals: Points, candidates: Near
 ) -> tuple[Float[Tensor, " N"], Int[Tensor, " N"]]:
     """(signs that make normals consistent with that of the root of their component, along a spanning tree; the roots).
 
@@ -168,10 +158,8 @@ def _carried(
 
 
 def mended_normals(
-    points: Float[Tensor, "N n"],
-    normals: Float[Tensor, "N n"],
-    candidates: Int[Tensor, "N K"],
-) -> tuple[Float[Tensor, "N n"], Bool[Tensor, " N"]]:
+    points: Points, normals: Points, candidates: Near
+) -> tuple[Points, Bool[Tensor, " N"]]:
     """(normals of a user with the signs of those around them; points where these have no side).
 
     Normals that most neighbours contradict are flipped, repeatedly; or signs are propagated along a spanning tree, to
@@ -212,11 +200,7 @@ def mended_normals(
     return normals * torch.where(better | even, carried, side)[:, None], even
 
 
-def settled_normals(
-    points: Float[Tensor, "N n"],
-    normals: Float[Tensor, "N n"],
-    candidates: Int[Tensor, "N K"],
-) -> tuple[Float[Tensor, "N n"], bool]:
+def settled_normals(points: Points, normals: Points, candidates: Near) -> tuple[Points, bool]:
     """(normals consistent with their neighbours; whether their side is the user's). Warnings say what was changed."""
     mended, even = mended_normals(points, normals, candidates)
     turned = (((mended * normals).sum(1) < 0) & ~even).nonzero()[:, 0]

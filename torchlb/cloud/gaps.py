@@ -16,7 +16,7 @@ from torchlb.cloud.manifold import boundary_loops, ears_of
 from torchlb.cloud.voronoi import natural_neighbors, unrolled
 from torchlb.geometry.complex import Edges, Faces, edges_of, pieces_of, spanning_pairs
 from torchlb.geometry.thresholds import CREASE, NEAREST, ROUGH, SLIGHT
-from torchlb.geometry.vectors import inner, largest, lengths, smallest
+from torchlb.geometry.vectors import Mask, inner, largest, lengths, smallest
 from torchlb.linalg.precision import LOW, TINY
 
 Pairs = tuple[Int[np.ndarray, " P"], Int[np.ndarray, " P"]]
@@ -156,9 +156,7 @@ def _meet(one: Float[np.ndarray, "P 4 3"], two: Float[np.ndarray, "P 4 3"]) -> n
     return np.any(after & before, axis=1)
 
 
-def closed(
-    cloud: Cloud, faces: Faces, kept: Bool[np.ndarray, " N"]
-) -> tuple[Faces, list[list[int]]]:
+def closed(cloud: Cloud, faces: Faces, kept: Mask) -> tuple[Faces, list[list[int]]]:
     """(faces with narrow boundary loops closed by ear clipping; the loops that were closed).
 
     The reach of a point is at least that of the triangles at it. A loop stays open if two neighbouring points of it are
@@ -241,7 +239,7 @@ def local_stars(cloud: Cloud, centers: Int[np.ndarray, " B"]) -> Faces:
     return cloud.small(found.numpy())
 
 
-def at_gaps(faces: Faces, pairs: Pairs, count: int) -> Bool[np.ndarray, " N"]:
+def at_gaps(faces: Faces, pairs: Pairs, count: int) -> Mask:
     """Points of pairs in different components, one without a closed fan of faces: sheets do not grow together."""
     i, j = pairs
     piece, outer = pieces_of(faces, count), edges_of(faces, count).outer

@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from torchlb.geometry.complex import Faces, components, edges_of, tree_sides
-from torchlb.geometry.vectors import inner, lengths
+from torchlb.geometry.vectors import Vectors, inner, lengths
 from torchlb.linalg.precision import TINY
 
 
@@ -45,15 +45,13 @@ def with_single_fans(faces: Faces, count: int) -> Faces:
     return faces
 
 
-def face_vectors(points: Float[np.ndarray, "N 3"], faces: Faces) -> Float[np.ndarray, "F 3"]:
+def face_vectors(points: Vectors, faces: Faces) -> Float[np.ndarray, "F 3"]:
     """Area vectors of the faces: normals as long as the areas, ℓ²."""
     a, b, c = (points.take(corner, 0) for corner in faces.T)
     return np.cross(b - a, c - a) / 2
 
 
-def wound_alike(
-    points: Float[np.ndarray, "N 3"], faces: Faces
-) -> tuple[Faces, Bool[np.ndarray, " F"]]:
+def wound_alike(points: Vectors, faces: Faces) -> tuple[Faces, Bool[np.ndarray, " F"]]:
     """(faces wound consistently, carried along the flattest edges; which faces lie at a seam).
 
     At a seam neighbours still disagree: the surface is one-sided, or a wrong triangle makes it seem so.
@@ -73,9 +71,7 @@ def wound_alike(
     return np.where(flip[:, None], faces[:, ::-1], faces), at_seam
 
 
-def facing_out(
-    points: Float[np.ndarray, "N 3"], faces: Faces, outward: Float[np.ndarray, "N 3"]
-) -> Faces:
+def facing_out(points: Vectors, faces: Faces, outward: Vectors) -> Faces:
     """Faces turned so that every patch, connected by edges, as a whole faces the outward vectors at its corners."""
     if len(faces) == 0:
         return faces

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 from scipy.spatial import KDTree
 from torch import Tensor
 
@@ -16,7 +16,7 @@ from torchlb.fits.polynomials import monomials, num_monomials
 from torchlb.geometry.compatibility import admissible_neighbors
 from torchlb.geometry.frames import complete_frames
 from torchlb.geometry.thresholds import AROUND, RING, ROUGH
-from torchlb.geometry.vectors import inner, lengths
+from torchlb.geometry.vectors import Frames, Mask, Near, Points, Vectors, inner, lengths
 from torchlb.linalg.precision import AT_ONCE, NEGLIGIBLE, ROUNDING
 
 SMOOTH = 4.0
@@ -30,11 +30,7 @@ HIGH = 0.2
 """Least sine of the angle at which a lone point stands above the plane of its neighbours, seen from their centroid."""
 
 
-def denoised(
-    points: Float[Tensor, "N n"],
-    planes: Float[Tensor, "N n"] | Float[Tensor, "N n d"],
-    candidates: Int[Tensor, "N K"],
-) -> tuple[Float[Tensor, "N n"], float]:
+def denoised(points: Points, planes: Points | Frames, candidates: Near) -> tuple[Points, float]:
     """(points on the shape; root mean square distance of the cloud from it, ℓ); the points and 0 if it is clean.
 
     Quartics follow a smooth shape where quadratics do not: F, the variance removed by the quartic terms over that which
@@ -65,9 +61,9 @@ def denoised(
 
 
 def _residuals(
-    points: Float[Tensor, "N n"],
-    planes: Float[Tensor, "N n"] | Float[Tensor, "N n d"],
-    candidates: Int[Tensor, "N K"],
+    points: Points,
+    planes: Points | Frames,
+    candidates: Near,
     centers: Int[Tensor, " B"],
     degree: int,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
@@ -91,15 +87,13 @@ def _residuals(
 
 
 def spacing_at(
-    points: Float[np.ndarray, "N 3"], near: Int[np.ndarray, "N K"], number: int = AROUND
+    points: Vectors, near: Int[np.ndarray, "N K"], number: int = AROUND
 ) -> Float[np.ndarray, " N"]:
     """Spacing around each point: the distance to its neighbour of this number, ℓ."""
     return lengths(points[near[:, min(number, near.shape[1] - 1)]] - points)
 
 
-def lone_points(
-    points: Float[np.ndarray, "N 3"], near: Int[np.ndarray, "N K"]
-) -> Bool[np.ndarray, " N"]:
+def lone_points(points: Vectors, near: Int[np.ndarray, "N K"]) -> Mask:
     """Points with a far larger spacing than their neighbours, off the plane of these, and in none with their like.
 
     At a jump in density half a disc of twice the spacing holds twelve other points of a like spacing.
@@ -130,9 +124,7 @@ def lone_points(
     return lone
 
 
-def put_beside(
-    points: Float[np.ndarray, "N 3"], lone: Bool[np.ndarray, " N"]
-) -> Float[np.ndarray, "N 3"]:
+def put_beside(points: Vectors, lone: Mask) -> Vectors:
     """All points, the lone ones moved beside the nearest other, at most a third of the way to a neighbour of that."""
     moved, others = points.copy(), np.flatnonzero(~lone)
     tree = KDTree(points[others])

@@ -23,6 +23,7 @@ from torchlb.geometry.boundary import BoundaryPlan
 from torchlb.geometry.compatibility import mutually_admissible, planes_of
 from torchlb.geometry.neighbors import adjacency, nearest_neighbors
 from torchlb.geometry.thresholds import CREASE, RING, WIDER
+from torchlb.geometry.vectors import Frames, Near, Points
 from torchlb.linalg.precision import rows_at_once
 
 
@@ -57,9 +58,7 @@ def _directions(
 
 
 def _inverse_radius(
-    coords: Float[Tensor, "B K d"],
-    valid: Bool[Tensor, "B K"],
-    directions: Float[Tensor, "B u d"],
+    coords: Float[Tensor, "B K d"], valid: Bool[Tensor, "B K"], directions: Float[Tensor, "B u d"]
 ) -> Float[Tensor, "B K u"]:
     """2 y_j·u / |y_j|², whose maximum over j is 1 / r(u) if positive; 0 for invalid neighbours."""
     square = coords.square().sum(-1, keepdim=True).clamp_min(torch.finfo(coords.dtype).tiny)
@@ -114,11 +113,7 @@ def unrolled(
     return coords * (offset.norm(dim=-1, keepdim=True) / length)
 
 
-def nearest_graph(
-    points: Float[Tensor, "N n"],
-    frames: Float[Tensor, "N n d"],
-    candidates: Int[Tensor, "N K"],
-) -> sparse.csr_array:
+def nearest_graph(points: Points, frames: Frames, candidates: Near) -> sparse.csr_array:
     """Neighbour graph of a cloud in place of the edges of a mesh, symmetric (N, N).
 
     Each point is joined to its 2^(d+1) nearest compatible neighbours (4, 8, 16 for curves, surfaces, solids) and to its
@@ -156,12 +151,12 @@ class CloudBoundaryPlan(BoundaryPlan):
     inside: Int[Tensor, "_ q"]
     near: Int[Tensor, "_ K"]
 
-    def initial(self, points: Float[Tensor, "N n"]) -> Float[Tensor, "b n d_minus_1"]:
+    def initial(self, points: Points) -> Float[Tensor, "b n d_minus_1"]:
         """Initial tangents of the boundary."""
         return cloud_frames(points[self.members], self.near, self.sides.shape[1] - 1)
 
     def measures(
-        self, points: Float[Tensor, "N n"]
+        self, points: Points
     ) -> tuple[Float[Tensor, "b n"], Float[Tensor, " b"], Float[Tensor, " b"]]:
         """Outward vectors; volumes of the Voronoi cells within the boundary; folds, all 1."""
         own, ends = points[self.members], self.sides.shape[1] == 1
@@ -175,7 +170,7 @@ class CloudBoundaryPlan(BoundaryPlan):
 
 
 def boundary_of_cloud(
-    points: Float[Tensor, "N n"], mask: Bool[Tensor, " N"], dim: int, degree: int
+    points: Points, mask: Bool[Tensor, " N"], dim: int, degree: int
 ) -> BoundaryPlan | None:
     """Boundary of a cloud of dimension d from the mask of its boundary points; None if there are none."""
     if not mask.any():
