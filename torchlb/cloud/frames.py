@@ -83,35 +83,43 @@ def refined_normals(
     return normals
 
 
-def _slopes_removed(
-    points: Float[Tensor, "N 3"], normals: Float[Tensor, "N 3"], index: Int[Tensor, "B K"]
-) -> Float[Tensor, "B 3"]:
+def _slopes_removed(points: Points, normals: Points, index: Int[Tensor, "B K"]) -> Tensor:
     """Normals at the first point of each row, turned by the slope of a quadratic through its neighbours."""
     own = normals[index[:, 0]]
-    frames = complete_frames(own)
-    offset = points[index] - points[index[:, :1]]
-    distance = offset.norm(dim=-1)
-    good = admissible_neighbors(points, normals, index)
+    found, _, radius, count = local_polynomials(points, normals, index, 2, weighted=True)
+    slope = (found[:, 1:3] @ own[..., None])[..., 0] / radius[:, None]
+    turned = normalize(own - (complete_frames(own) @ slope[..., None])[..., 0])
+    return torch.where(((count > 7) & (slope.norm(dim=1) < 1))[:, None], turned, own)
+
+
+def local_polynomials(
+    points: Points, planes: Points | Frames, index: Int[Tensor, "B K"], degree: int, weighted: bool
+) -> tuple[Tensor, Tensor, Float[Tensor, " B"], Int[Tensor, " B"]]:
+    """Polynomials of heights over the plane of the first point of each row, through its compatible points.
+
+    The result is (coefficients of the coordinates over the radius, the constant first; residuals; radius of the
+    neighbourhood, ℓ; number of its points). The polynomials need not pass through the point itself.
+    """
+    offset, own = points[index] - points[index[:, :1]], planes[index[:, 0]]
+    frames = complete_frames(own) if planes.ndim == 2 else own
+    good = admissible_neighbors(points, planes, index)
     good[:, 0] = True
-    reach = (distance * good).amax(1, keepdim=True).clamp_min(TINY)
-    weight = window((distance / reach).clamp_max(1.1)) * good
-    terms = monomials(offset @ frames / reach[..., None], 2).mT
+    distance = offset.norm(dim=-1)
+    radius = (distance * good).amax(1).clamp_min(TINY)
+    weight = window((distance / radius[:, None]).clamp_max(1.1)) * good if weighted else good
+    coords = offset @ frames
+    heights = (offset - coords @ frames.mT) * weight[..., None]
+    terms = monomials(coords / radius[:, None, None], degree).mT
     terms = torch.cat([torch.ones_like(terms[:, :1]), terms], 1) * weight[:, None]
-    heights = weight * dot(offset, own[:, None]) / reach
     square = terms @ terms.mT
     trace = square.diagonal(dim1=-2, dim2=-1).sum(-1)
-    square += ROUNDING * trace[:, None, None] * torch.eye(6, dtype=points.dtype)
-    slope = torch.linalg.solve(square, terms @ heights[..., None])[:, 1:3]
-    sound = (good.sum(1) > 7) & (slope[..., 0].norm(dim=1) < 1)
-    return torch.where(sound[:, None], normalize(own - (frames @ slope)[..., 0]), own)
+    square += ROUNDING * trace[:, None, None] * torch.eye(square.shape[-1]).to(square)
+    coefficients = torch.linalg.solve(square, terms @ heights)
+    return coefficients, heights - terms.mT @ coefficients, radius, good.sum(1)
 
 
 def nearest_pairs(candidates: Near) -> tuple[Int[Tensor, " P"], Int[Tensor, " P"]]:
-    """Pairs (i, j), i < j, of points one of which is among the candidates of the other, each pair once.
-
-    >>> [end.tolist() for end in nearest_pairs(torch.tensor([[0, 1], [1, 0], [2, 1]]))]
-    [[0, 1], [1, 2]]
-    """
+    """Pairs (i, j), i < j, of points one of which is among the candidates of the other, each pair once."""
     num_points, size = candidates.shape
     i = torch.arange(num_points).repeat_interleave(size - 1)
     j = candidates[:, 1:].reshape(-1)

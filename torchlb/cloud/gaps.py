@@ -10,6 +10,7 @@ from __future__ import annotations
 import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
+from scipy.spatial.distance import pdist
 
 from torchlb.cloud.cocone import REACH, Cloud, conormals
 from torchlb.cloud.manifold import boundary_loops, ears_of
@@ -179,7 +180,7 @@ def closed(cloud: Cloud, faces: Faces, kept: Mask) -> tuple[Faces, list[list[int
         declared = cloud.boundary[loop] & cloud.boundary[np.roll(loop, 1)]
         if declared.any() or kept[loop].any() or np.ptp(places, axis=0).max() > wide:
             continue
-        if max(lengths(places - place).max() for place in places) > wide:
+        if pdist(places).max() > wide:
             continue
         ears = ears_of(loop, known, count, cost)
         if ears is not None:

@@ -13,11 +13,7 @@ from torchlb.linalg.precision import TINY
 
 
 def with_single_fans(faces: Faces, count: int) -> Faces:
-    """Prune the faces until those around each point form one fan (umbrella): the closed one, or else the largest.
-
-    >>> with_single_fans(np.array([[0, 1, 2], [0, 2, 3], [0, 4, 5]]), 6).tolist()
-    [[0, 1, 2], [0, 2, 3]]
-    """
+    """Prune the faces until those around each point form one fan (umbrella): the closed one, or else the largest."""
     looked_at = np.ones(count, dtype=bool)  # points; later only those that lost a face
     while len(around := np.flatnonzero(looked_at.take(faces).any(1))):
         part = faces[around]
@@ -83,11 +79,7 @@ def facing_out(points: Vectors, faces: Faces, outward: Vectors) -> Faces:
 
 
 def boundary_loops(faces: Faces, count: int) -> list[list[int]]:
-    """Points of every boundary loop in order, each walked round from face to face.
-
-    >>> [sorted(loop) for loop in boundary_loops(np.array([[0, 1, 2], [1, 3, 2]]), 4)]
-    [[0, 1, 2, 3]]
-    """
+    """Points of every boundary loop in order, each walked round from face to face."""
     edges = edges_of(faces, count)
     mate = np.full(3 * len(faces), -1)
     one, two = edges.twins

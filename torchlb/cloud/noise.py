@@ -10,14 +10,12 @@ import numpy as np
 import torch
 from jaxtyping import Float, Int
 from scipy.spatial import KDTree
-from torch import Tensor
 
-from torchlb.fits.polynomials import monomials, num_monomials
-from torchlb.geometry.compatibility import admissible_neighbors
-from torchlb.geometry.frames import complete_frames
+from torchlb.cloud.frames import local_polynomials
+from torchlb.fits.polynomials import num_monomials
 from torchlb.geometry.thresholds import AROUND, RING, ROUGH
 from torchlb.geometry.vectors import Frames, Mask, Near, Points, Vectors, inner, lengths
-from torchlb.linalg.precision import AT_ONCE, NEGLIGIBLE, ROUNDING
+from torchlb.linalg.precision import AT_ONCE, NEGLIGIBLE
 
 SMOOTH = 4.0
 """F from which on the residual of quadratics is taken for shape: 6 and more of clean clouds, 1.5 to 4 with noise of a
@@ -41,10 +39,11 @@ def denoised(points: Points, planes: Points | Frames, candidates: Near) -> tuple
     size, terms = candidates.shape[1], [num_monomials(dim, degree) for degree in (2, 4)]
     if size < terms[1] + 3:
         return points, 0.0
-    some = torch.arange(0, len(points), -(-len(points) // SAMPLE))
-    radius, counts, two, _ = _residuals(points, planes, candidates, some, 2)
-    _, _, four, _ = _residuals(points, planes, candidates, some, 4)
-    free = counts - terms[0], counts - terms[1]
+    some = candidates[:: -(-len(points) // SAMPLE)]
+    _, left, radius, count = local_polynomials(points, planes, some, 2, weighted=False)
+    two = left.square().sum((1, 2))
+    four = local_polynomials(points, planes, some, 4, weighted=False)[1].square().sum((1, 2))
+    free = count - terms[0], count - terms[1]
     use = (free[1] > 2) & (two > free[0] * (NEGLIGIBLE * radius) ** 2)
     if use.double().mean() < 0.5:
         return points, 0.0
@@ -52,38 +51,12 @@ def denoised(points: Points, planes: Points | Frames, candidates: Near) -> tuple
     if ratio[use].median() > SMOOTH:
         return points, 0.0
     moved, squares = points.clone(), []
-    for part in torch.arange(len(points)).split(AT_ONCE):
-        _, counts, left, offset = _residuals(points, planes, candidates, part, 2)
-        known = counts > terms[0] + 2
-        moved[part] += torch.where(known[:, None], offset, 0.0)
-        squares.append((left / (counts - terms[0]))[known])
+    for part in candidates.split(AT_ONCE):
+        found, left, _, count = local_polynomials(points, planes, part, 2, weighted=False)
+        known = count > terms[0] + 2
+        moved[part[:, 0]] += torch.where(known[:, None], found[:, 0], 0.0)
+        squares.append((left.square().sum((1, 2)) / (count - terms[0]))[known])
     return moved, float(torch.cat(squares).median().sqrt())
-
-
-def _residuals(
-    points: Points,
-    planes: Points | Frames,
-    candidates: Near,
-    centers: Int[Tensor, " B"],
-    degree: int,
-) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """(radius; number of compatible neighbours; sum of squared residuals of polynomials; their offset at 0)."""
-    index = candidates[centers]
-    offset = points[index] - points[centers, None]
-    good = admissible_neighbors(points, planes, index)
-    good[:, 0] = True
-    radius = (offset.norm(dim=-1) * good).amax(1)
-    frames = complete_frames(planes[centers]) if planes.ndim == 2 else planes[centers]
-    coords = offset @ frames
-    heights = (offset - coords @ frames.mT) * good[..., None]
-    scale = radius.clamp_min(torch.finfo(radius.dtype).tiny)[:, None, None]
-    terms = monomials(coords / scale, degree).mT
-    terms = torch.cat([torch.ones_like(terms[:, :1]), terms], 1) * good[:, None]
-    square = terms @ terms.mT
-    square += ROUNDING * good.sum(1)[:, None, None] * torch.eye(square.shape[-1]).to(square)
-    coefficients = torch.linalg.solve(square, terms @ heights)
-    left = heights - terms.mT @ coefficients
-    return radius, good.sum(1), left.square().sum((1, 2)), coefficients[:, 0]
 
 
 def spacing_at(

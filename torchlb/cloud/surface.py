@@ -62,9 +62,7 @@ class SurfaceSummary:
     @classmethod
     def of(cls, entries: dict[str, Any]) -> SurfaceSummary:
         """Inverse of `dataclasses.asdict`, also after a round trip through JSON."""
-        entries = dict(entries)
-        places = tuple(map(tuple, entries.pop("places", ())))
-        return cls(**entries, places=places)
+        return cls(**entries | {"places": tuple(map(tuple, entries.get("places", ())))})
 
     def __str__(self) -> str:
         """Summary of two lines, or three."""
@@ -75,15 +73,10 @@ class SurfaceSummary:
             f"{noise}\n  {self.components} components, {self.boundary_loops} boundary loops, {self.holes_closed} gaps "
             "closed"
         )
-        return f"{text}\n  {self.contact}" if self.contacts else text
-
-    @property
-    def contact(self) -> str:
-        """Sentence on where sheets are closer to each other than their points."""
+        if not self.contacts:
+            return text
         where = in_words(self.places)
-        return (
-            f"{self.contacts} points are nearest to one of another sheet, most of them near {where}"
-        )
+        return f"{text}\n  {self.contacts} points are nearest to one of another sheet, most of them near {where}"
 
 
 @dataclass(frozen=True, kw_only=True)

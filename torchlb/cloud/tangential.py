@@ -103,9 +103,6 @@ def voronoi_shares(corners: Float[np.ndarray, "S corners n"]) -> Float[np.ndarra
 
     The cell consists of simplices from the corner over the midpoint of an edge there, the circumcentre of a triangle at
     the edge, and so on to the circumcentre.
-
-    >>> voronoi_shares(np.array([[[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]]])).tolist()
-    [0.5]
     """
     dim = corners.shape[1] - 1
     edges = corners[:, 1:] - corners[:, :1]

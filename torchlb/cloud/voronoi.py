@@ -68,12 +68,7 @@ def _inverse_radius(
 def natural_neighbors(
     coords: Float[Tensor, "B K d"], valid: Bool[Tensor, "B K"]
 ) -> Bool[Tensor, "B K"]:
-    """Which of the valid neighbours bound the cell; those that bound less than 3° of it may be missed.
-
-    >>> corners = torch.tensor([[[1.0, 0.0], [0.0, 1.0], [-1.0, 0.0], [0.0, -1.0], [2.0, 0.1]]])
-    >>> natural_neighbors(corners, torch.ones(1, 5, dtype=torch.bool)).tolist()
-    [[True, True, True, True, False]]
-    """
+    """Which of the valid neighbours bound the cell; those that bound less than 3° of it may be missed."""
     nearest, first = _inverse_radius(coords, valid, _directions(coords, valid)).max(dim=1)
     natural = torch.zeros_like(valid)
     natural.scatter_reduce_(1, first, nearest > 0, "amax")
@@ -85,13 +80,6 @@ def cell_volume(coords: Float[Tensor, "B K d"], valid: Bool[Tensor, "B K"]) -> F
 
     An open cell ends half-way to the farthest valid neighbour; in directions without one within 60° it ends at the
     point itself, as at the end of a curve.
-
-    >>> around = torch.tensor([[[1.0, 0.0], [0.0, 1.0], [-1.0, 0.0], [0.0, -1.0], [2.0, 0.0]]])
-    >>> cell_volume(around, torch.ones(1, 5, dtype=torch.bool)).round(decimals=2).tolist()
-    [1.0]
-    >>> end = torch.tensor([[[1.0], [2.0]]])
-    >>> cell_volume(end, torch.ones(1, 2, dtype=torch.bool)).tolist()
-    [0.5]
     """
     dim = coords.shape[-1]
     distance = coords.norm(dim=-1).masked_fill(~valid, 0)
