@@ -108,10 +108,9 @@ class Tetrahedra:
         cells, beyond = (x.astype(np.int64) for x in (found.simplices, found.neighbors))
         del found
         total, volume = circumcenters(moved, cells)
-        with np.errstate(all="ignore"):
-            centers = total / volume[:, None]
         most = np.ptp(moved, axis=0).max() / NEGLIGIBLE  # bounds the centres of nearly flat cells
-        centers = np.nan_to_num(centers, posinf=most, neginf=-most).clip(-most, most)
+        with np.errstate(all="ignore"):
+            centers = np.nan_to_num(total / volume[:, None]).clip(-most, most)
         centers += moved.take(cells[:, 0], 0)
         number, first = np.nonzero(np.arange(len(cells)) > beyond.T)
         others = np.array([[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]])

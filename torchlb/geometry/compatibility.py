@@ -11,33 +11,13 @@ from torchlb.geometry.vectors import Frames, Near, Points, at, dot
 from torchlb.linalg.precision import AT_ONCE
 
 
-def _smallest_singular_value(
-    a: Float[Tensor, "P n d"], b: Float[Tensor, "P n d"]
-) -> Float[Tensor, " P"]:
-    """σ_min(AᵀB) of pairs of orthonormal frames."""
-    product = a.mT @ b
-    dim = product.shape[-1]
-    if dim == 1:
-        return product[:, 0, 0].abs()
-    if dim == 2:  # σ² are the roots of s² − |A|²s + det² = 0
-        frobenius = product.square().sum((-1, -2))
-        (a, b), (c, d) = (row.unbind(-1) for row in product.unbind(-2))
-        discriminant = (frobenius.square() - 4 * (a * d - b * c).square()).clamp_min(0)
-        return ((frobenius - discriminant.sqrt()) / 2).clamp_min(0).sqrt()
-    return torch.linalg.svdvals(product)[:, -1]
-
-
 def planes_of(frames: Frames) -> Frames | Points:
     """Tangent planes as `compatible` takes them: unit normals of a surface in R³, else the frames."""
     return torch.linalg.cross(*frames.unbind(-1)) if frames.shape[1:] == (3, 2) else frames
 
 
 def normal_frames(frames: Frames) -> Float[Tensor, "N n m"]:
-    """Orthonormal frames of the normal spaces, m = n − d.
-
-    >>> normal_frames(torch.eye(3)[None, :, :2])[0].T
-    tensor([[0., 0., 1.]])
-    """
+    """Orthonormal frames of the normal spaces, m = n − d."""
     n, dim = frames.shape[1:]
     if (n, dim) == (3, 2):
         return planes_of(frames)[..., None]
@@ -61,7 +41,7 @@ def compatible(
         if planes.ndim == 3:
             flat = torch.einsum("pn,pnd->pd", offset, mine)
             height = total - dot(flat, flat)
-            cosine = _smallest_singular_value(theirs, mine)
+            cosine = torch.linalg.svdvals(theirs.mT @ mine)[:, -1]
         else:
             height = dot(offset, mine).square()
             cosine = dot(theirs, mine).abs()
