@@ -6,8 +6,7 @@ import pytest
 import torch
 
 from tolerances import TOLERANCE
-from torchlb.cloud.frames import cloud_frames
-from torchlb.cloud.orientation import mended_normals, nearest_pairs
+from torchlb.cloud.frames import cloud_frames, mended_normals, nearest_pairs
 from torchlb.geometry.compatibility import thin_sides
 from torchlb.geometry.complex import consistently_wound
 from torchlb.geometry.frames import complete_frames, normals_of_frames, vertex_normals

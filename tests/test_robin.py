@@ -25,7 +25,7 @@ from torchlb import (
     poisson_solve,
     save_operator,
 )
-from torchlb.cloud.boundary import boundary_of_cloud
+from torchlb.cloud.voronoi import boundary_of_cloud
 from torchlb.geometry.boundary import boundary_of_mesh
 from torchlb.geometry.frames import mesh_frames
 from torchlb.linalg.sparse import to_scipy

@@ -9,7 +9,7 @@ import torch
 import trimesh
 
 from torchlb import InputError, LaplaceBeltrami
-from torchlb.cloud import doubtful
+from torchlb.cloud import doubts
 from torchlb.cloud.doubts import warn_of_layers
 from torchlb.cloud.manifold import boundary_loops, with_single_fans, wound_alike
 from torchlb.cloud.surface import cloud_surface
@@ -224,8 +224,8 @@ def test_change_by_the_middle_of_a_strip_is_its_share_of_energy(monkeypatch):
         middle = surface.points.numpy()[faces, 0].mean(1)
         return (middle > start) & (middle < end)
 
-    monkeypatch.setattr(doubtful, "in_doubt", within)
-    change, _ = doubtful.spectral_change(cloud_surface(points))
+    monkeypatch.setattr(doubts, "in_doubt", within)
+    change, _ = doubts.spectral_change(cloud_surface(points))
     turn = 2 * np.pi * np.arange(1, 11)
     rest = 1 - (end - start) + (np.sin(turn * end) - np.sin(turn * start)) / turn
     assert change == pytest.approx(1 - rest.min() / rest.max(), rel=0.1)

@@ -3,12 +3,11 @@
 `reconstruct` makes a `Complex` (`complexes`, `reconstruction`): chains of segments for a `curve`, Delaunay tetrahedra
 for a `solid`, triangles for a `surface` in R² and R³, and the stars of the `tangential` Delaunay complex otherwise.
 
-The steps of `surface` are: `outliers`, lone points; `frames`, tangent planes and normals; `orientation`, signs of the
-normals by neighbours; `noise`, denoising; `cocone`, Delaunay tetrahedra and candidate triangles; `poles`, inside and
-outside by Voronoi cells; `manifold`, fans, patches and winding; `gaps`, filled and closed; `stars`, local triangles
-where no sheet passes. `doubtful`: triangles that may join or close in error, and their effect; `doubts`: the warnings,
-which name `places`. Where cells overlap, the `boundary` comes from a mask, with the sizes of `voronoi` cells in the
-tangent plane.
+The steps of `surface` are: `frames`, tangent planes, normals and their signs; `noise`, denoising, and lone points put
+aside; `cocone`, Delaunay tetrahedra and candidate triangles; `poles`, inside and outside by Voronoi cells; `manifold`,
+fans, patches and winding; `gaps`, filled, closed, or left to local stars. `doubts`: triangles that may join or close in
+error, their effect, and the warnings. `voronoi`: cells in the tangent plane, and the boundary of a mask where simplices
+overlap.
 """
 
 from torchlb.cloud.complexes import Complex

@@ -17,7 +17,7 @@ from jaxtyping import Bool, Float, Int
 from torchlb.cloud.manifold import face_vectors
 from torchlb.geometry.complex import Faces, circumcenters, delaunay, edges_of
 from torchlb.geometry.thresholds import CREASE, LEVEL, WIDER
-from torchlb.geometry.vectors import inner, largest, lengths, smallest
+from torchlb.geometry.vectors import Mask, Vectors, inner, largest, lengths, smallest
 from torchlb.linalg.precision import LOW, NEGLIGIBLE, ROUNDING, SINGLE, TINY
 
 COCONE = np.sqrt((1 - LEVEL) / 2)
@@ -36,11 +36,11 @@ class Cloud:
     `reach` bounds the circumradius of triangles at each point, ℓ; half of it does if all corners are on the boundary.
     """
 
-    points: Float[np.ndarray, "N 3"]
-    normals: Float[np.ndarray, "N 3"]
+    points: Vectors
+    normals: Vectors
     neighbors: Int[np.ndarray, "N K"]
     reach: Float[np.ndarray, " N"]
-    boundary: Bool[np.ndarray, " N"]
+    boundary: Mask
 
     def circles(self, faces: Faces) -> tuple[Float[np.ndarray, " F"], Float[np.ndarray, "F 3"]]:
         """Circumradii, ℓ, and unit normals of triangles."""
@@ -87,7 +87,7 @@ class Tetrahedra:
     `sides` index the circumcentres on the two sides of each triangle; those beyond the hull are points far away.
     """
 
-    points: Float[np.ndarray, "N 3"]
+    points: Vectors
     cells: Int[np.ndarray, "T 4"]
     centers: Float[np.ndarray, "_ 3"]
     triangles: Faces
@@ -95,12 +95,7 @@ class Tetrahedra:
     hull: Bool[np.ndarray, " F"]
 
     @classmethod
-    def of(
-        cls,
-        points: Float[np.ndarray, "N 3"],
-        normals: Float[np.ndarray, "N 3"],
-        spacing: Float[np.ndarray, " N"],
-    ) -> Tetrahedra:
+    def of(cls, points: Vectors, normals: Vectors, spacing: Float[np.ndarray, " N"]) -> Tetrahedra:
         """Triangulate a cloud in no plane, with unit normals; `spacing` is the distance to the nearest point, ℓ.
 
         Points are perturbed first, mostly along the surface: cospherical points form one cell with as many corners, for
@@ -113,10 +108,9 @@ class Tetrahedra:
         cells, beyond = (x.astype(np.int64) for x in (found.simplices, found.neighbors))
         del found
         total, volume = circumcenters(moved, cells)
-        with np.errstate(all="ignore"):
-            centers = total / volume[:, None]
         most = np.ptp(moved, axis=0).max() / NEGLIGIBLE  # bounds the centres of nearly flat cells
-        centers = np.nan_to_num(centers, posinf=most, neginf=-most).clip(-most, most)
+        with np.errstate(all="ignore"):
+            centers = np.nan_to_num(total / volume[:, None]).clip(-most, most)
         centers += moved.take(cells[:, 0], 0)
         number, first = np.nonzero(np.arange(len(cells)) > beyond.T)
         others = np.array([[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]])
@@ -177,11 +171,11 @@ class Candidates:
     triangles: Faces
     tangent: Bool[np.ndarray, " F"]
     parting: Bool[np.ndarray, " F"]
-    outward: Float[np.ndarray, "N 3"]
+    outward: Vectors
 
 
 def conormals(
-    points: Float[np.ndarray, "N 3"],
+    points: Vectors,
     tail: Int[np.ndarray, "*batch"],
     head: Int[np.ndarray, "*batch"],
     tip: Int[np.ndarray, "*batch"],
@@ -194,7 +188,7 @@ def conormals(
     return out / np.maximum(lengths(out), TINY)[..., None]
 
 
-def best_manifold(points: Float[np.ndarray, "N 3"], faces: Faces) -> Faces:
+def best_manifold(points: Vectors, faces: Faces) -> Faces:
     """Greedy choice of triangles, best first, such that no edge has three faces or two that fold back.
 
     Only triangles at an edge where not all can stay are decided one by one.

@@ -15,15 +15,13 @@ from jaxtyping import Bool, Float, Int
 from scipy.spatial import KDTree
 from torch import Tensor
 
-from torchlb.cloud.complexes import Complex
-from torchlb.cloud.frames import cloud_frames
+from torchlb.cloud.complexes import Complex, in_words, places_of
+from torchlb.cloud.frames import cloud_frames, settled_normals
 from torchlb.cloud.noise import denoised
-from torchlb.cloud.orientation import settled_normals
-from torchlb.cloud.places import in_words, places_of
 from torchlb.errors import InputError, first_few, warn
 from torchlb.geometry.neighbors import nearest_neighbors
 from torchlb.geometry.thresholds import CREASE, FACTOR, HALF_CREASE, OBTUSE, RING, ROUGH, WIDER
-from torchlb.geometry.vectors import inner, lengths
+from torchlb.geometry.vectors import Mask, Points, inner, lengths
 from torchlb.linalg.precision import TINY
 
 NEAR = 2 * RING
@@ -36,10 +34,7 @@ Links = Int[np.ndarray, "N 2"]
 
 
 def cloud_curve(
-    points: Float[Tensor, "N n"],
-    *,
-    normals: Float[Tensor, "N n"] | None = None,
-    boundary: Bool[Tensor, " N"] | None = None,
+    points: Points, *, normals: Points | None = None, boundary: Bool[Tensor, " N"] | None = None
 ) -> Complex:
     """The curve through all points: closed and open chains, which end at the points of the boundary.
 
@@ -90,7 +85,7 @@ class Chain(NamedTuple):
 def _links(
     points: Float[np.ndarray, "N n"],
     near: Int[np.ndarray, "N K"],
-    single: Bool[np.ndarray, " N"],
+    single: Mask,
     noise: float,
     tangents: Float[np.ndarray, "N n"] | None,
 ) -> Links:
@@ -125,9 +120,7 @@ def _links(
     return links
 
 
-def _joined(
-    points: Float[np.ndarray, "N n"], links: Links, single: Bool[np.ndarray, " N"], noise: float
-) -> Links:
+def _joined(points: Float[np.ndarray, "N n"], links: Links, single: Mask, noise: float) -> Links:
     """Join loose ends by the shortest segments that do not turn back, but for noise."""
     free = np.where(single, 1, 2) - (links >= 0).sum(1)
     loose = np.flatnonzero(free > 0)

@@ -1,26 +1,49 @@
-"""Warnings of what may be wrong with the surface through a cloud; they name the points, and what to do."""
+"""What may be wrong with the surface through a cloud: warnings that name the points, and say what to do.
+
+Triangles may join what is apart, or close what is open. The evidence is local and independent of the triangles: on a
+sound surface a point surrounded by its own sheet has no edge along its normal, and no edge is much longer than the
+spacing. On a random cloud a few triangles are always in doubt, most of them without effect, so that it is their effect
+on the first eigenvalues that counts.
+"""
 
 from __future__ import annotations
 
+from typing import Any
+
+import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
+from scipy import sparse
+from scipy.linalg import eigh
 from scipy.spatial import KDTree
 from scipy.special import pdtrc
 from torch import Tensor
 
-from torchlb.cloud.doubtful import spectral_change
-from torchlb.cloud.noise import in_two_layers
-from torchlb.cloud.places import in_words, places_of
+from torchlb.cloud.cocone import REACH
+from torchlb.cloud.complexes import in_words, places_of
+from torchlb.cloud.manifold import face_vectors
+from torchlb.cloud.noise import SAMPLE, spacing_at
 from torchlb.cloud.surface import CloudSurface
 from torchlb.errors import first_few, warn
 from torchlb.geometry.boundary import boundary_faces
+from torchlb.geometry.compatibility import admissible_neighbors
+from torchlb.geometry.complex import Faces, edges_of
 from torchlb.geometry.fit_search import REASONS
+from torchlb.geometry.frames import complete_frames
 from torchlb.geometry.local_fits import FitPlan
-from torchlb.geometry.thresholds import RING, ROUGH, SLIGHT
-from torchlb.linalg.precision import LOW, NEGLIGIBLE, SMALL
+from torchlb.geometry.thresholds import FACTOR, LEVEL, NEAREST, OBTUSE, RING, ROUGH, SLIGHT, WIDER
+from torchlb.geometry.vectors import Mask, Near, Points, Vectors, inner, largest, lengths
+from torchlb.linalg.precision import DENSE, LOW, NEGLIGIBLE, ROOT_EPS, SMALL
 
 CROWD = 256
 """Rank of the neighbour whose distance sets the scale where more points than the nearest crowd into one place."""
+PAIRS = 11
+"""Number of eigenpairs, the constant included."""
+PATCH = 40
+"""Number of points around each whose heights are tested for two layers."""
+UNIMODAL = 1.6
+"""Kurtosis of the residuals of quadratics below which they form two layers: 1 for two values, at least 9/5 for a
+symmetric unimodal distribution, 3 for a normal one."""
 
 
 def warn_of_doubts(surface: CloudSurface, plan: FitPlan, mass: Float[Tensor, " N"]) -> None:
@@ -44,7 +67,7 @@ def warn_of_joins(surface: CloudSurface) -> None:
     """Warn where triangles may join what is apart, or close what is open."""
     points = surface.points
     change, marked = spectral_change(surface)
-    if change > LOW:
+    if change > WIDER * SLIGHT:
         places = in_words(places_of(points.numpy(), surface.neighbors.numpy(), marked))
         warn(
             "points: triangles that are steep to the surface or long for its spacing raise "
@@ -71,9 +94,7 @@ def warn_of_buried(cells: Int[Tensor, "F corners"], boundary: Bool[Tensor, " N"]
         )
 
 
-def warn_of_near_duplicates(
-    points: Float[Tensor, "N n"], neighbors: Int[Tensor, "N K"], dim: int
-) -> None:
+def warn_of_near_duplicates(points: Points, neighbors: Near, dim: int) -> None:
     """Warn of points that are closer to another than chance explains, as if scanned twice.
 
     Whatever the density of random points, the nearest is closer than t times the distance of the m-th neighbour with
@@ -114,3 +135,125 @@ def warn_of_layers(points: Float[Tensor, "N 3"]) -> None:
             "be one sheet there, with half of the area. Add points until they are closer than it is thick, keep one "
             "side alone, or give the mesh if there is one"
         )
+
+
+def in_two_layers(points: Vectors) -> tuple[Int[np.ndarray, " M"], int]:
+    """(sampled points around which points lie in two layers, a spacing apart or closer; size of the sample).
+
+    Noise makes heights over the surface unimodal, most frequent in the middle; of two layers the middle is the rarest,
+    which shows in the kurtosis of the residuals of local quadratics. Clouds of fewer than 2 `PATCH` points are not
+    tested.
+    """
+    some = np.arange(0, len(points), -(-len(points) // SAMPLE))
+    if len(points) < 2 * PATCH:
+        return some[:0], len(some)
+    distance, index = (np.asarray(part) for part in KDTree(points).query(points[some], k=PATCH))
+    offset = points[index] - points[index].mean(1, keepdims=True)
+    axes = np.linalg.eigh(offset.transpose(0, 2, 1) @ offset)[1]
+    height, v, u = np.moveaxis(offset @ axes / distance[:, -1:, None], -1, 0)
+    basis = np.linalg.qr(np.stack([np.ones_like(u), u, v, u * u, u * v, v * v], -1))[0]
+    height -= (basis @ (basis.transpose(0, 2, 1) @ height[..., None]))[..., 0]
+    square = np.square(height).mean(1)
+    layered = (height**4).mean(1) < UNIMODAL * square**2
+    return some[layered & (square > LOW**2 * np.pi / PATCH)], len(some)
+
+
+def _surrounded(
+    points: Float[Tensor, "N 3"], normals: Float[Tensor, "N 3"], near: Int[Tensor, "B K"]
+) -> Bool[np.ndarray, " B"]:
+    """Whether the first point of each row is surrounded by its own sheet: no gap of 120° in the tangent plane."""
+    good = admissible_neighbors(points, normals, near)[:, 1:]
+    good &= good.cumsum(1) <= NEAREST
+    flat = (points[near[:, 1:]] - points[near[:, :1]]) @ complete_frames(normals[near[:, 0]])
+    angle = torch.atan2(*flat.unbind(-1)).masked_fill(~good, torch.inf).sort(1).values
+    after = torch.cat([angle[:, 1:], torch.full_like(angle[:, :1], torch.inf)], 1)
+    after = torch.where(after.isinf(), angle[:, :1] + 2 * torch.pi, after)
+    gap = (after - angle).masked_fill(angle.isinf(), 0.0).amax(1)
+    return np.asarray(good.any(1) & (gap < OBTUSE))
+
+
+def in_doubt(surface: CloudSurface, faces: Faces) -> Bool[np.ndarray, " F"]:
+    """Triangles with an edge that crosses between sheets, or is far longer than the spacing."""
+    points, normals = surface.points.numpy(), surface.normals.numpy()
+    near, count = surface.neighbors.numpy(), len(points)
+    edges = edges_of(faces, count)
+    i, j = edges.keys // count, edges.keys % count
+    edge = points[j] - points[i]
+    length = lengths(edge)
+    spacing = spacing_at(points, near)
+    small, large = np.minimum(spacing[i], spacing[j]), np.maximum(spacing[i], spacing[j])
+    # long against the larger spacing of their ends, or against the smaller one
+    found = length > np.minimum(REACH * large, FACTOR * small)
+    steep_i, steep_j = (np.abs(inner(edge, normals[k])) > LEVEL * length for k in (i, j))
+    steep = steep_i | steep_j
+    if steep.any():
+        amid, ends = np.zeros(count, dtype=bool), np.unique([i[steep], j[steep]])
+        amid[ends] = _surrounded(surface.points, surface.normals, surface.neighbors[ends])
+        across = (steep_i & amid[i]) | (steep_j & amid[j])
+        close = np.zeros(count, dtype=bool)
+        close[i[across]] = close[j[across]] = True
+        beside = close[i] | close[j]
+        close[i[beside]] = close[j[beside]] = True
+        found |= steep & close[i] & close[j]
+    return np.asarray(found[edges.of].reshape(-1, 3).any(1))
+
+
+def spectral_change(surface: CloudSurface) -> tuple[float, Mask]:
+    """(relative rise of one of the first eigenvalues over another by triangles in doubt, to first order; their points).
+
+    Without these triangles an eigenvalue would be lower by their share of the energy ∫|∇φ|² of its mode. Scattered
+    triangles have the same share of every mode; a bridge has nearly all of a mode that it alone bounds.
+    """
+    points, parts = surface.points.numpy(), (surface.cells.numpy(), surface.stars.numpy())
+    faces = np.concatenate(parts)
+    weight = np.array([1.0, 1 / 3]).repeat([len(part) for part in parts])
+    doubtful, marked = in_doubt(surface, faces), np.zeros(len(points), dtype=bool)
+    if not doubtful.any():
+        return 0.0, marked
+    marked[faces[doubtful]] = True
+    stiffness, mass = _elements(points, faces, weight)
+    sound, _ = _elements(points, faces, np.where(doubtful, SMALL, 1.0) * weight)
+    used = mass > 0  # points in no face have none
+    stiffness, sound = (sparse.csr_matrix(part[used][:, used]) for part in (stiffness, sound))
+    basis = _coarse_space(sound)
+    whole, sound, mass = (
+        (basis.T @ part @ basis).toarray() for part in (stiffness, sound, sparse.diags(mass[used]))
+    )
+    values, modes = eigh(whole, mass, subset_by_index=[0, min(PAIRS, len(whole)) - 1])
+    moving = values > ROOT_EPS * values.max()
+    values, modes = values[moving], modes[:, moving]
+    rest = (modes * (sound @ modes)).sum(0) / values
+    return float(1 - rest.min() / rest.max()) if len(rest) else 0.0, marked
+
+
+def _coarse_space(sound: sparse.csr_matrix) -> Any:
+    """Smoothed aggregates (Vaněk, Mandel, Brezina 1996), none of which reaches across triangles in doubt."""
+    import pyamg
+
+    hierarchy = pyamg.smoothed_aggregation_solver(
+        sound + sparse.diags(NEGLIGIBLE * sound.diagonal()),
+        strength=("symmetric", {"theta": SMALL}),  # pyright: ignore[reportArgumentType]
+        symmetry="symmetric",
+        smooth=("jacobi", {"weighting": "local"}),
+        improve_candidates=None,
+        max_coarse=DENSE,
+        coarse_solver="splu",
+    )
+    basis = sparse.identity(len(sound.diagonal()), format="csr")
+    for level in hierarchy.levels[:-1]:
+        basis = basis @ level.P
+    return basis
+
+
+def _elements(
+    points: Vectors, faces: Faces, weight: Float[np.ndarray, " F"]
+) -> tuple[sparse.csr_array, Float[np.ndarray, " N"]]:
+    """P1 stiffness matrix and lumped mass; the heights of flat triangles are bounded from below."""
+    count = len(points)
+    side = points[np.roll(faces, -2, 1)] - points[np.roll(faces, -1, 1)]
+    longest = largest(lengths(side.reshape(-1, 3)).reshape(-1, 3))
+    area = np.maximum(lengths(face_vectors(points, faces)), NEGLIGIBLE * longest**2)
+    entry = np.einsum("fkx,flx->fkl", side, side) * (weight / (4 * area))[:, None, None]
+    row, col = faces.repeat(3, axis=1).ravel(), np.tile(faces, 3).ravel()
+    stiffness = sparse.coo_array((entry.ravel(), (row, col)), shape=(count, count)).tocsr()
+    return stiffness, np.bincount(faces.ravel(), (area * weight).repeat(3) / 3, count)

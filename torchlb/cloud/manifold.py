@@ -8,16 +8,12 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from torchlb.geometry.complex import Faces, components, edges_of, tree_sides
-from torchlb.geometry.vectors import inner, lengths
+from torchlb.geometry.vectors import Vectors, inner, lengths
 from torchlb.linalg.precision import TINY
 
 
 def with_single_fans(faces: Faces, count: int) -> Faces:
-    """Prune the faces until those around each point form one fan (umbrella): the closed one, or else the largest.
-
-    >>> with_single_fans(np.array([[0, 1, 2], [0, 2, 3], [0, 4, 5]]), 6).tolist()
-    [[0, 1, 2], [0, 2, 3]]
-    """
+    """Prune the faces until those around each point form one fan (umbrella): the closed one, or else the largest."""
     looked_at = np.ones(count, dtype=bool)  # points; later only those that lost a face
     while len(around := np.flatnonzero(looked_at.take(faces).any(1))):
         part = faces[around]
@@ -45,15 +41,13 @@ def with_single_fans(faces: Faces, count: int) -> Faces:
     return faces
 
 
-def face_vectors(points: Float[np.ndarray, "N 3"], faces: Faces) -> Float[np.ndarray, "F 3"]:
+def face_vectors(points: Vectors, faces: Faces) -> Float[np.ndarray, "F 3"]:
     """Area vectors of the faces: normals as long as the areas, ℓ²."""
     a, b, c = (points.take(corner, 0) for corner in faces.T)
     return np.cross(b - a, c - a) / 2
 
 
-def wound_alike(
-    points: Float[np.ndarray, "N 3"], faces: Faces
-) -> tuple[Faces, Bool[np.ndarray, " F"]]:
+def wound_alike(points: Vectors, faces: Faces) -> tuple[Faces, Bool[np.ndarray, " F"]]:
     """(faces wound consistently, carried along the flattest edges; which faces lie at a seam).
 
     At a seam neighbours still disagree: the surface is one-sided, or a wrong triangle makes it seem so.
@@ -73,9 +67,7 @@ def wound_alike(
     return np.where(flip[:, None], faces[:, ::-1], faces), at_seam
 
 
-def facing_out(
-    points: Float[np.ndarray, "N 3"], faces: Faces, outward: Float[np.ndarray, "N 3"]
-) -> Faces:
+def facing_out(points: Vectors, faces: Faces, outward: Vectors) -> Faces:
     """Faces turned so that every patch, connected by edges, as a whole faces the outward vectors at its corners."""
     if len(faces) == 0:
         return faces
@@ -87,11 +79,7 @@ def facing_out(
 
 
 def boundary_loops(faces: Faces, count: int) -> list[list[int]]:
-    """Points of every boundary loop in order, each walked round from face to face.
-
-    >>> [sorted(loop) for loop in boundary_loops(np.array([[0, 1, 2], [1, 3, 2]]), 4)]
-    [[0, 1, 2, 3]]
-    """
+    """Points of every boundary loop in order, each walked round from face to face."""
     edges = edges_of(faces, count)
     mate = np.full(3 * len(faces), -1)
     one, two = edges.twins

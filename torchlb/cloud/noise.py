@@ -1,4 +1,8 @@
-"""Noise of a cloud: its detection, and denoising by local quadratics (`method.md`, section 12)."""
+"""Noise of a cloud, denoising by local quadratics, and lone points (`method.md`, section 12).
+
+At the edges of a depth image pixels hang between the front and the back; other scanners leave points about. They lie on
+no surface, and must not join what is apart.
+"""
 
 from __future__ import annotations
 
@@ -6,30 +10,25 @@ import numpy as np
 import torch
 from jaxtyping import Float, Int
 from scipy.spatial import KDTree
-from torch import Tensor
 
-from torchlb.fits.polynomials import monomials, num_monomials
-from torchlb.geometry.compatibility import admissible_neighbors
-from torchlb.geometry.frames import complete_frames
-from torchlb.linalg.precision import AT_ONCE, LOW, NEGLIGIBLE, ROUNDING
+from torchlb.cloud.frames import local_polynomials
+from torchlb.fits.polynomials import num_monomials
+from torchlb.geometry.thresholds import AROUND, RING, ROUGH
+from torchlb.geometry.vectors import Frames, Mask, Near, Points, Vectors, inner, lengths
+from torchlb.linalg.precision import AT_ONCE, NEGLIGIBLE
 
 SMOOTH = 4.0
 """F from which on the residual of quadratics is taken for shape: 6 and more of clean clouds, 1.5 to 4 with noise of a
 twentieth of the spacing, 1 of pure noise."""
 SAMPLE = 2000
 """Number of points by which a cloud is judged."""
-PATCH = 40
-"""Number of points around each whose heights are tested for two layers."""
-UNIMODAL = 1.6
-"""Kurtosis of the residuals of quadratics below which they form two layers: 1 for two values, at least 9/5 for a
-symmetric unimodal distribution, 3 for a normal one."""
+LONE = 2.5
+"""Least spacing of a lone point, over the lower quartile of its neighbours'."""
+HIGH = 0.2
+"""Least sine of the angle at which a lone point stands above the plane of its neighbours, seen from their centroid."""
 
 
-def denoised(
-    points: Float[Tensor, "N n"],
-    planes: Float[Tensor, "N n"] | Float[Tensor, "N n d"],
-    candidates: Int[Tensor, "N K"],
-) -> tuple[Float[Tensor, "N n"], float]:
+def denoised(points: Points, planes: Points | Frames, candidates: Near) -> tuple[Points, float]:
     """(points on the shape; root mean square distance of the cloud from it, ℓ); the points and 0 if it is clean.
 
     Quartics follow a smooth shape where quadratics do not: F, the variance removed by the quartic terms over that which
@@ -40,10 +39,11 @@ def denoised(
     size, terms = candidates.shape[1], [num_monomials(dim, degree) for degree in (2, 4)]
     if size < terms[1] + 3:
         return points, 0.0
-    some = torch.arange(0, len(points), -(-len(points) // SAMPLE))
-    radius, counts, two, _ = _residuals(points, planes, candidates, some, 2)
-    _, _, four, _ = _residuals(points, planes, candidates, some, 4)
-    free = counts - terms[0], counts - terms[1]
+    some = candidates[:: -(-len(points) // SAMPLE)]
+    _, left, radius, count = local_polynomials(points, planes, some, 2, weighted=False)
+    two = left.square().sum((1, 2))
+    four = local_polynomials(points, planes, some, 4, weighted=False)[1].square().sum((1, 2))
+    free = count - terms[0], count - terms[1]
     use = (free[1] > 2) & (two > free[0] * (NEGLIGIBLE * radius) ** 2)
     if use.double().mean() < 0.5:
         return points, 0.0
@@ -51,56 +51,63 @@ def denoised(
     if ratio[use].median() > SMOOTH:
         return points, 0.0
     moved, squares = points.clone(), []
-    for part in torch.arange(len(points)).split(AT_ONCE):
-        _, counts, left, offset = _residuals(points, planes, candidates, part, 2)
-        known = counts > terms[0] + 2
-        moved[part] += torch.where(known[:, None], offset, 0.0)
-        squares.append((left / (counts - terms[0]))[known])
+    for part in candidates.split(AT_ONCE):
+        found, left, _, count = local_polynomials(points, planes, part, 2, weighted=False)
+        known = count > terms[0] + 2
+        moved[part[:, 0]] += torch.where(known[:, None], found[:, 0], 0.0)
+        squares.append((left.square().sum((1, 2)) / (count - terms[0]))[known])
     return moved, float(torch.cat(squares).median().sqrt())
 
 
-def in_two_layers(points: Float[np.ndarray, "N 3"]) -> tuple[Int[np.ndarray, " M"], int]:
-    """(sampled points around which points lie in two layers, a spacing apart or closer; size of the sample).
+def spacing_at(
+    points: Vectors, near: Int[np.ndarray, "N K"], number: int = AROUND
+) -> Float[np.ndarray, " N"]:
+    """Spacing around each point: the distance to its neighbour of this number, ℓ."""
+    return lengths(points[near[:, min(number, near.shape[1] - 1)]] - points)
 
-    Noise makes heights over the surface unimodal, most frequent in the middle; of two layers the middle is the rarest,
-    which shows in the kurtosis of the residuals of local quadratics. Clouds of fewer than 2 `PATCH` points are not
-    tested.
+
+def lone_points(points: Vectors, near: Int[np.ndarray, "N K"]) -> Mask:
+    """Points with a far larger spacing than their neighbours, off the plane of these, and in none with their like.
+
+    At a jump in density half a disc of twice the spacing holds twelve other points of a like spacing.
     """
-    some = np.arange(0, len(points), -(-len(points) // SAMPLE))
-    if len(points) < 2 * PATCH:
-        return some[:0], len(some)
-    distance, index = (np.asarray(part) for part in KDTree(points).query(points[some], k=PATCH))
-    offset = points[index] - points[index].mean(1, keepdims=True)
-    axes = np.linalg.eigh(offset.transpose(0, 2, 1) @ offset)[1]
-    height, v, u = np.moveaxis(offset @ axes / distance[:, -1:, None], -1, 0)
-    basis = np.linalg.qr(np.stack([np.ones_like(u), u, v, u * u, u * v, v * v], -1))[0]
-    height -= (basis @ (basis.transpose(0, 2, 1) @ height[..., None]))[..., 0]
-    square = np.square(height).mean(1)
-    layered = (height**4).mean(1) < UNIMODAL * square**2
-    return some[layered & (square > LOW**2 * np.pi / PATCH)], len(some)
+    lone = np.zeros(len(points), dtype=bool)
+    spacing = spacing_at(points, near)
+    usual = np.partition(spacing[near[:, 1:]], near.shape[1] // 4, axis=1)[:, near.shape[1] // 4]
+    far = np.flatnonzero(spacing > LONE * usual)
+    if len(far) == 0:
+        return lone
+    around = points[near[far, 1:]]
+    middle = around.mean(1)
+    normal = np.linalg.svd(around - middle[:, None], full_matrices=False)[2][:, 2]
+    above = points[far] - middle
+    lone[far] = np.abs(inner(above, normal)) > HIGH * lengths(above)
+    octave = np.floor(np.log2(spacing[far]))
+    for scale in np.unique(octave):
+        alike = points[spacing >= 2.0 ** (scale - 1)]
+        if len(alike) > RING:
+            own = far[octave == scale]
+            found = KDTree(alike).query(points[own], k=RING + 1)
+            distance, mates = (np.asarray(part) for part in found)
+            offset = alike[mates[:, 1:]] - points[own, None]
+            offset = np.concatenate([0 * offset[:, :1], offset], 1)
+            offset -= offset.mean(1, keepdims=True)
+            _, middle, least = np.linalg.svd(offset, compute_uv=False).T
+            lone[own] &= (least >= ROUGH * middle) | (distance[:, -1] > 2 * spacing[own])
+    return lone
 
 
-def _residuals(
-    points: Float[Tensor, "N n"],
-    planes: Float[Tensor, "N n"] | Float[Tensor, "N n d"],
-    candidates: Int[Tensor, "N K"],
-    centers: Int[Tensor, " B"],
-    degree: int,
-) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """(radius; number of compatible neighbours; sum of squared residuals of polynomials; their offset at 0)."""
-    index = candidates[centers]
-    offset = points[index] - points[centers, None]
-    good = admissible_neighbors(points, planes, index)
-    good[:, 0] = True
-    radius = (offset.norm(dim=-1) * good).amax(1)
-    frames = complete_frames(planes[centers]) if planes.ndim == 2 else planes[centers]
-    coords = offset @ frames
-    heights = (offset - coords @ frames.mT) * good[..., None]
-    scale = radius.clamp_min(torch.finfo(radius.dtype).tiny)[:, None, None]
-    terms = monomials(coords / scale, degree).mT
-    terms = torch.cat([torch.ones_like(terms[:, :1]), terms], 1) * good[:, None]
-    square = terms @ terms.mT
-    square += ROUNDING * good.sum(1)[:, None, None] * torch.eye(square.shape[-1]).to(square)
-    coefficients = torch.linalg.solve(square, terms @ heights)
-    left = heights - terms.mT @ coefficients
-    return radius, good.sum(1), left.square().sum((1, 2)), coefficients[:, 0]
+def put_beside(points: Vectors, lone: Mask) -> Vectors:
+    """All points, the lone ones moved beside the nearest other, at most a third of the way to a neighbour of that."""
+    moved, others = points.copy(), np.flatnonzero(~lone)
+    tree = KDTree(points[others])
+    host = np.asarray(tree.query(points[lone])[1])
+    ring = np.asarray(tree.query(points[others[host]], k=min(AROUND + 1, len(others)))[1])
+    order, size = np.argsort(host, kind="stable"), ring.shape[1] - 1
+    turn = np.empty_like(host)  # index of a lone point among those of its host
+    turn[order] = np.arange(len(host)) - np.searchsorted(host[order], host[order])
+    end = points[others[ring[np.arange(len(host)), 1 + turn % size]]]
+    start = points[others[host]]
+    share = 1 / (3.0 + turn // size)
+    moved[lone] = start + share[:, None] * (end - start)
+    return moved

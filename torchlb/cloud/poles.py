@@ -21,7 +21,7 @@ from torchlb.cloud.cocone import Tetrahedra
 from torchlb.cloud.frames import refined_normals
 from torchlb.geometry.complex import edges_of, tree_sides
 from torchlb.geometry.thresholds import FACTOR
-from torchlb.geometry.vectors import at, dot, inner, lengths
+from torchlb.geometry.vectors import Near, at, dot, inner, lengths
 from torchlb.linalg.precision import LOW, ROUNDING, STEPS, TINY
 
 LONG = 1.4
@@ -145,10 +145,7 @@ def _cosine(a: Float[Tensor, "B 3"], b: Float[Tensor, "B 3"]) -> Float[Tensor, "
 
 
 def corrected_normals(
-    points: Float[Tensor, "N 3"],
-    normals: Float[Tensor, "N 3"],
-    candidates: Int[Tensor, "N K"],
-    poles: Poles,
+    points: Float[Tensor, "N 3"], normals: Float[Tensor, "N 3"], candidates: Near, poles: Poles
 ) -> Float[Tensor, "N 3"]:
     """Normals replaced by the longest ray where the Voronoi cell is short along them, and refined around that.
 

@@ -13,23 +13,19 @@ from torch import Tensor
 from torch.nn.functional import normalize
 
 from torchlb.cloud.cocone import REACH, Candidates, Cloud, Tetrahedra, best_manifold
-from torchlb.cloud.complexes import Complex
-from torchlb.cloud.frames import cloud_frames, refined_normals
-from torchlb.cloud.gaps import closed, filled, with_left_points
+from torchlb.cloud.complexes import Complex, Places, in_words, places_of
+from torchlb.cloud.frames import cloud_frames, refined_normals, settled_normals
+from torchlb.cloud.gaps import Pairs, at_gaps, closed, filled, stars_in_gaps, with_left_points
 from torchlb.cloud.manifold import boundary_loops, facing_out, with_single_fans, wound_alike
-from torchlb.cloud.noise import denoised
-from torchlb.cloud.orientation import settled_normals
-from torchlb.cloud.outliers import lone_points, put_beside
-from torchlb.cloud.places import Places, in_words, places_of
+from torchlb.cloud.noise import denoised, lone_points, put_beside
 from torchlb.cloud.poles import Poles, corrected_normals
-from torchlb.cloud.stars import Pairs, at_gaps, stars_in_gaps
 from torchlb.errors import InputError
 from torchlb.geometry.compatibility import mutually_admissible
 from torchlb.geometry.complex import Faces, components, delaunay, pieces_of
 from torchlb.geometry.frames import vertex_normals
 from torchlb.geometry.neighbors import mesh_graph, nearest_neighbors
 from torchlb.geometry.thresholds import LEVEL, NEAREST, RING
-from torchlb.geometry.vectors import lengths
+from torchlb.geometry.vectors import Mask, Near, Vectors, lengths
 from torchlb.linalg.precision import LOW, NEGLIGIBLE, ROOT_EPS
 
 
@@ -66,9 +62,7 @@ class SurfaceSummary:
     @classmethod
     def of(cls, entries: dict[str, Any]) -> SurfaceSummary:
         """Inverse of `dataclasses.asdict`, also after a round trip through JSON."""
-        entries = dict(entries)
-        places = tuple(map(tuple, entries.pop("places", ())))
-        return cls(**entries, places=places)
+        return cls(**entries | {"places": tuple(map(tuple, entries.get("places", ())))})
 
     def __str__(self) -> str:
         """Summary of two lines, or three."""
@@ -79,15 +73,10 @@ class SurfaceSummary:
             f"{noise}\n  {self.components} components, {self.boundary_loops} boundary loops, {self.holes_closed} gaps "
             "closed"
         )
-        return f"{text}\n  {self.contact}" if self.contacts else text
-
-    @property
-    def contact(self) -> str:
-        """Sentence on where sheets are closer to each other than their points."""
+        if not self.contacts:
+            return text
         where = in_words(self.places)
-        return (
-            f"{self.contacts} points are nearest to one of another sheet, most of them near {where}"
-        )
+        return f"{text}\n  {self.contacts} points are nearest to one of another sheet, most of them near {where}"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -169,12 +158,12 @@ class _Start(NamedTuple):
     two_sided: bool
     frames: Float[Tensor, "N 3 2"]
     noise: float
-    lone: Bool[np.ndarray, " N"]
+    lone: Mask
 
 
 def _start(
     points: Float[Tensor, "N 3"],
-    candidates: Int[Tensor, "N K"],
+    candidates: Near,
     given: Float[Tensor, "N 3"] | None,
     boundary: Bool[Tensor, " N"] | None,
 ) -> _Start:
@@ -216,9 +205,7 @@ def _start(
     return _Start(cloud, tetrahedra.candidates(cloud, side), two_sided, frames, noise, lone)
 
 
-def _reaches(
-    points: Float[np.ndarray, "N 3"], near: Int[np.ndarray, "N K"]
-) -> Float[np.ndarray, " N"]:
+def _reaches(points: Vectors, near: Int[np.ndarray, "N K"]) -> Float[np.ndarray, " N"]:
     """Largest circumradius of a triangle at each point, by the `RING` nearest; by all neighbours if these are in a row.
 
     Rings of a scan may be many times farther apart than the points along them.
@@ -267,11 +254,7 @@ def _chosen(cloud: Cloud, found: Candidates, two_sided: bool, pairs: Pairs) -> F
 
 
 def _completed(
-    cloud: Cloud,
-    bare: Faces,
-    pool: Faces,
-    pairs: Pairs,
-    outward: Float[np.ndarray, "N 3"],
+    cloud: Cloud, bare: Faces, pool: Faces, pairs: Pairs, outward: Vectors
 ) -> tuple[Faces, list[list[int]]]:
     """(faces turned outward, with gaps filled from the pool or closed, and all points; the loops closed)."""
     places, count = cloud.points, len(cloud.points)
@@ -305,12 +288,12 @@ def _without_gaps(cloud: Cloud, faces: Faces, pool: Faces) -> Faces:
     return faces if more is faces else with_single_fans(more, count)
 
 
-def _of_faces(cloud: Cloud, faces: Faces) -> Float[np.ndarray, "N 3"]:
+def _of_faces(cloud: Cloud, faces: Faces) -> Vectors:
     """Unit normals of the faces at every point, zero where there are none."""
     return vertex_normals(torch.from_numpy(cloud.points), torch.from_numpy(faces)).numpy()
 
 
-def _along(cloud: Cloud, vectors: Float[np.ndarray, "N 3"]) -> Cloud:
+def _along(cloud: Cloud, vectors: Vectors) -> Cloud:
     """Cloud with its normals on the side of the vectors, where these have one."""
     away = (cloud.normals * vectors).sum(1) < 0
     return replace(cloud, normals=np.where(away[:, None], -cloud.normals, cloud.normals))
@@ -325,9 +308,7 @@ def _righted(cloud: Cloud, faces: Faces) -> Cloud:
     return replace(cloud, normals=np.where(misaligned[:, None], realigned, cloud.normals))
 
 
-def _planar_triangles(
-    points: Float[np.ndarray, "N 3"],
-) -> tuple[Faces, Float[np.ndarray, " 3"]] | None:
+def _planar_triangles(points: Vectors) -> tuple[Faces, Float[np.ndarray, " 3"]] | None:
     """Delaunay triangles and normal of a planar cloud; None if it is not planar."""
     centered = points - points.mean(0)
     _, spread, axes = np.linalg.svd(centered, full_matrices=False)
@@ -336,7 +317,7 @@ def _planar_triangles(
     return delaunay(centered @ axes[:2].T).simplices.astype(np.int64), axes[2]
 
 
-def _contacts(cloud: Cloud, faces: Faces) -> Bool[np.ndarray, " N"]:
+def _contacts(cloud: Cloud, faces: Faces) -> Mask:
     """Points whose nearest one is more than three edges away, and these nearest ones."""
     count = len(cloud.points)
     graph = sparse.csr_array(mesh_graph(torch.from_numpy(faces), count) + sparse.eye_array(count))

@@ -17,7 +17,6 @@ import numpy as np
 import torch
 from jaxtyping import Float, Int
 from scipy.spatial import QhullError
-from torch import Tensor
 
 from torchlb.cloud.complexes import Complex
 from torchlb.cloud.frames import cloud_frames
@@ -27,7 +26,7 @@ from torchlb.geometry.compatibility import mutually_admissible, planes_of
 from torchlb.geometry.complex import Faces, delaunay, edges_of
 from torchlb.geometry.neighbors import nearest_neighbors
 from torchlb.geometry.thresholds import AROUND, FACTOR, SLIGHT
-from torchlb.geometry.vectors import lengths
+from torchlb.geometry.vectors import Frames, Near, Points, lengths
 from torchlb.linalg.precision import NEGLIGIBLE
 
 CANDIDATES = {2: 24, 3: 64}
@@ -36,7 +35,7 @@ LOOP = 12
 """Number of edges of the largest loop that is closed."""
 
 
-def cloud_stars(points: Float[Tensor, "N n"], dim: int) -> Complex:
+def cloud_stars(points: Points, dim: int) -> Complex:
     """Complex of dimension d ≥ 2 through a cloud in Rⁿ, n > d: a surface of triangles, or all simplices of stars."""
     near = nearest_neighbors(points, min(CANDIDATES[dim], len(points)))
     frames = cloud_frames(points, near, dim)
@@ -57,7 +56,7 @@ def cloud_stars(points: Float[Tensor, "N n"], dim: int) -> Complex:
 
 
 def delaunay_stars(
-    points: Float[Tensor, "N n"], frames: Float[Tensor, "N n d"], candidates: Int[Tensor, "N K"]
+    points: Points, frames: Frames, candidates: Near
 ) -> Int[np.ndarray, "S corners"]:
     """Simplices of the star of every point, the point first."""
     dim, found = frames.shape[2], []
@@ -104,9 +103,6 @@ def voronoi_shares(corners: Float[np.ndarray, "S corners n"]) -> Float[np.ndarra
 
     The cell consists of simplices from the corner over the midpoint of an edge there, the circumcentre of a triangle at
     the edge, and so on to the circumcentre.
-
-    >>> voronoi_shares(np.array([[[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]]])).tolist()
-    [0.5]
     """
     dim = corners.shape[1] - 1
     edges = corners[:, 1:] - corners[:, :1]

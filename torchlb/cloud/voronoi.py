@@ -1,11 +1,13 @@
 """Voronoi cells in the tangent plane: natural neighbours, a graph and volumes for points in any dimension.
 
 Seen from a point, its Voronoi cell among neighbours at y_j ends in the direction u at r(u) = min_j |y_j|² / (2 y_j·u).
-Neighbours that attain the minimum are its natural neighbours; the mean of r^d over all directions gives its volume.
+Neighbours that attain the minimum are its natural neighbours; the mean of r^d over all directions gives its volume. By
+these the boundary of a cloud is that of a mask, where cells overlap.
 """
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from functools import cache
 from math import gamma, pi
 
@@ -13,11 +15,15 @@ import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
 from scipy import sparse
+from scipy.spatial import KDTree
 from torch import Tensor
 
+from torchlb.cloud.frames import cloud_frames
+from torchlb.geometry.boundary import BoundaryPlan
 from torchlb.geometry.compatibility import mutually_admissible, planes_of
-from torchlb.geometry.neighbors import adjacency
-from torchlb.geometry.thresholds import CREASE, WIDER
+from torchlb.geometry.neighbors import adjacency, nearest_neighbors
+from torchlb.geometry.thresholds import CREASE, RING, WIDER
+from torchlb.geometry.vectors import Frames, Near, Points
 from torchlb.linalg.precision import rows_at_once
 
 
@@ -52,9 +58,7 @@ def _directions(
 
 
 def _inverse_radius(
-    coords: Float[Tensor, "B K d"],
-    valid: Bool[Tensor, "B K"],
-    directions: Float[Tensor, "B u d"],
+    coords: Float[Tensor, "B K d"], valid: Bool[Tensor, "B K"], directions: Float[Tensor, "B u d"]
 ) -> Float[Tensor, "B K u"]:
     """2 y_j·u / |y_j|², whose maximum over j is 1 / r(u) if positive; 0 for invalid neighbours."""
     square = coords.square().sum(-1, keepdim=True).clamp_min(torch.finfo(coords.dtype).tiny)
@@ -64,12 +68,7 @@ def _inverse_radius(
 def natural_neighbors(
     coords: Float[Tensor, "B K d"], valid: Bool[Tensor, "B K"]
 ) -> Bool[Tensor, "B K"]:
-    """Which of the valid neighbours bound the cell; those that bound less than 3° of it may be missed.
-
-    >>> corners = torch.tensor([[[1.0, 0.0], [0.0, 1.0], [-1.0, 0.0], [0.0, -1.0], [2.0, 0.1]]])
-    >>> natural_neighbors(corners, torch.ones(1, 5, dtype=torch.bool)).tolist()
-    [[True, True, True, True, False]]
-    """
+    """Which of the valid neighbours bound the cell; those that bound less than 3° of it may be missed."""
     nearest, first = _inverse_radius(coords, valid, _directions(coords, valid)).max(dim=1)
     natural = torch.zeros_like(valid)
     natural.scatter_reduce_(1, first, nearest > 0, "amax")
@@ -81,13 +80,6 @@ def cell_volume(coords: Float[Tensor, "B K d"], valid: Bool[Tensor, "B K"]) -> F
 
     An open cell ends half-way to the farthest valid neighbour; in directions without one within 60° it ends at the
     point itself, as at the end of a curve.
-
-    >>> around = torch.tensor([[[1.0, 0.0], [0.0, 1.0], [-1.0, 0.0], [0.0, -1.0], [2.0, 0.0]]])
-    >>> cell_volume(around, torch.ones(1, 5, dtype=torch.bool)).round(decimals=2).tolist()
-    [1.0]
-    >>> end = torch.tensor([[[1.0], [2.0]]])
-    >>> cell_volume(end, torch.ones(1, 2, dtype=torch.bool)).tolist()
-    [0.5]
     """
     dim = coords.shape[-1]
     distance = coords.norm(dim=-1).masked_fill(~valid, 0)
@@ -109,11 +101,7 @@ def unrolled(
     return coords * (offset.norm(dim=-1, keepdim=True) / length)
 
 
-def nearest_graph(
-    points: Float[Tensor, "N n"],
-    frames: Float[Tensor, "N n d"],
-    candidates: Int[Tensor, "N K"],
-) -> sparse.csr_array:
+def nearest_graph(points: Points, frames: Frames, candidates: Near) -> sparse.csr_array:
     """Neighbour graph of a cloud in place of the edges of a mesh, symmetric (N, N).
 
     Each point is joined to its 2^(d+1) nearest compatible neighbours (4, 8, 16 for curves, surfaces, solids) and to its
@@ -138,3 +126,51 @@ def nearest_graph(
         chosen[rows] |= natural_neighbors(offset @ frames[rows], near)
     pick = chosen.reshape(-1).numpy()
     return adjacency(centers.numpy()[pick], flat.numpy()[pick], num_rows)
+
+
+@dataclass(frozen=True)
+class CloudBoundaryPlan(BoundaryPlan):
+    """Neighbours of the boundary points of a cloud, where a mask gives the boundary and not a complex.
+
+    `inside` are the nearest points off the boundary, which tell the side of the shape; `near` the nearest boundary
+    points, by their position in `members`, for the initial tangents.
+    """
+
+    inside: Int[Tensor, "_ q"]
+    near: Int[Tensor, "_ K"]
+
+    def initial(self, points: Points) -> Float[Tensor, "b n d_minus_1"]:
+        """Initial tangents of the boundary."""
+        return cloud_frames(points[self.members], self.near, self.sides.shape[1] - 1)
+
+    def measures(
+        self, points: Points
+    ) -> tuple[Float[Tensor, "b n"], Float[Tensor, " b"], Float[Tensor, " b"]]:
+        """Outward vectors; volumes of the Voronoi cells within the boundary; folds, all 1."""
+        own, ends = points[self.members], self.sides.shape[1] == 1
+        size = torch.full_like(own[:, 0], float(ends))  # a single point of a boundary has no length
+        if self.near.shape[1] > 1:
+            offset = own[self.near[:, 1:]] - own[:, None]
+            valid = torch.ones_like(self.near[:, 1:], dtype=torch.bool)
+            size = cell_volume(unrolled(offset, self.initial(points)), valid)
+        outward = (own[:, None] - points[self.inside]).mean(1)
+        return outward, size, torch.ones_like(size)
+
+
+def boundary_of_cloud(
+    points: Points, mask: Bool[Tensor, " N"], dim: int, degree: int
+) -> BoundaryPlan | None:
+    """Boundary of a cloud of dimension d from the mask of its boundary points; None if there are none."""
+    if not mask.any():
+        return None
+    members = mask.nonzero()[:, 0]
+    own, others = points[members], (~mask).nonzero()[:, 0] if not mask.all() else members
+    count = min(RING, len(others))
+    _, index = KDTree(points[others].numpy()).query(own.numpy(), k=count)
+    inside = others[torch.from_numpy(index.reshape(len(members), count))]
+    near = nearest_neighbors(own, min(max(8 * (dim - 1), 1), len(own)))
+    none, crease = members.new_zeros(0, dim), torch.zeros_like(members, dtype=torch.bool)
+    plan = CloudBoundaryPlan(mask, members, None, none, none[:, 0], crease, inside, near)
+    if dim == 1:
+        return plan
+    return plan.with_fits(points, nearest_graph(own, plan.initial(points), near), degree)

@@ -23,28 +23,21 @@ from torchlb.geometry.frames import mesh_frames, normals_of_frames
 from torchlb.geometry.local_fits import FitPlan, LocalFits
 from torchlb.geometry.neighbors import GraphNeighborhoods, mesh_graph
 from torchlb.geometry.thresholds import CREASE, KINK
+from torchlb.geometry.vectors import Frames, Points
 from torchlb.linalg.precision import TINY
 
 
 @dataclass(frozen=True)
 class Boundary:
-    """Boundary points of a shape.
+    """Boundary points of a shape, and their outward unit conormals, which are zero elsewhere.
 
-    Attributes
-    ----------
-    mask
-        (N,), which points lie on the boundary.
-    conormals
-        (N, n), unit and outward on the boundary, zero elsewhere.
-    sizes
-        (N,), ℓ^{d−1}, first-order share of each point in the boundary's length or area; 1 at the end of a curve.
-    folds
-        (N,), 1 over the length of the mean of the outer normals where ν is that mean, 1 elsewhere: if ∂_n f = g for
-        each of these normals n, ∂_ν f is `folds` times g.
+    `sizes`, ℓ^{d−1}, are first-order shares in the boundary's length or area, 1 at the end of a curve. `folds` is 1
+    over the length of the mean of the outer normals where ν is that mean, 1 elsewhere: if ∂_n f = g for each of these
+    normals n, ∂_ν f is `folds` times g.
     """
 
     mask: Bool[Tensor, " N"]
-    conormals: Float[Tensor, "N n"]
+    conormals: Points
     sizes: Float[Tensor, " N"]
     folds: Float[Tensor, " N"]
 
@@ -53,19 +46,10 @@ class Boundary:
 class BoundaryPlan:
     """Combinatorial data of the boundary of a mesh, from which `at` computes a `Boundary` for given coordinates.
 
-    Attributes
-    ----------
-    mask
-        (N,), points where a boundary condition holds.
-    members
-        (b,), all boundary points.
-    fits
-        Plan of the fits of the boundary's tangents, points numbered by their position in `members`; None at the ends of
-        curves.
-    sides, opposite
-        (G, d), (G,): unpaired sides of the cells, and the corner opposite each.
-    crease
-        (b,), boundary points at a crease or a corner of the boundary.
+    A boundary condition holds at the points in `mask`, of all boundary points `members`; `crease` tells which of these
+    are at a crease or a corner of the boundary. `fits` plans the fits of its tangents, points numbered by their
+    position in `members`, and is None at the ends of curves. `sides` are the unpaired sides of the cells, `opposite`
+    the corner opposite each.
     """
 
     mask: Bool[Tensor, " N"]
@@ -75,7 +59,7 @@ class BoundaryPlan:
     opposite: Int[Tensor, " G"]
     crease: Bool[Tensor, " b"]
 
-    def at(self, points: Float[Tensor, "N n"], frames: Float[Tensor, "N n d"]) -> Boundary:
+    def at(self, points: Points, frames: Frames) -> Boundary:
         """Boundary at these coordinates, of a shape with these frames."""
         members, own = self.members, points[self.members]
         tangents = frames.new_zeros(len(members), points.shape[1], 0)
@@ -89,12 +73,12 @@ class BoundaryPlan:
         mask = self.mask.to(points)
         return Boundary(self.mask, conormals * mask[:, None], every[0] * mask, every[1])
 
-    def initial(self, points: Float[Tensor, "N n"]) -> Float[Tensor, "b n d_minus_1"]:
+    def initial(self, points: Points) -> Float[Tensor, "b n d_minus_1"]:
         """Initial tangents of the boundary."""
         return mesh_frames(points[self.members], torch.searchsorted(self.members, self.sides))
 
     def measures(
-        self, points: Float[Tensor, "N n"]
+        self, points: Points
     ) -> tuple[Float[Tensor, "b n"], Float[Tensor, " b"], Float[Tensor, " b"]]:
         """Outward vectors, sizes and folds of the boundary points, the last two as in `Boundary`."""
         outward, size = outward_sums(points, self.sides, self.opposite)
@@ -103,13 +87,10 @@ class BoundaryPlan:
         folds = torch.where(self.crease & (length > 0), size / length, 1.0)
         return outward, size / factorial(self.sides.shape[1]), folds
 
-    def with_fits(
-        self, points: Float[Tensor, "N n"], graph: sparse.csr_array, degree: int
-    ) -> BoundaryPlan:
+    def with_fits(self, points: Points, graph: sparse.csr_array, degree: int) -> BoundaryPlan:
         """Plan with fits of the boundary's tangents, of this degree or lower ones."""
-        search = FitSearch(
-            GraphNeighborhoods(points[self.members], graph, self.initial(points)), degree
-        )
+        own = GraphNeighborhoods(points[self.members], graph, self.initial(points))
+        search = FitSearch(own, degree)
         search.refine(torch.arange(len(self.members)))
         return replace(self, fits=search.finish()[0])
 
@@ -147,7 +128,7 @@ def open_sides(cells: Int[Tensor, "F v"]) -> tuple[Int[Tensor, "G w"], Int[Tenso
     return sides[number], cells[cell[order]].sum(1) - sides[number].sum(1)
 
 
-def outer_faces(points: Float[Tensor, "N n"], cells: Int[Tensor, "F 4"]) -> Int[Tensor, "G 3"]:
+def outer_faces(points: Points, cells: Int[Tensor, "F 4"]) -> Int[Tensor, "G 3"]:
     """Boundary triangles of tetrahedra, in R³ oriented so that their normals point outwards."""
     sides, opposite = open_sides(cells)
     if points.shape[1] != 3:
@@ -158,7 +139,7 @@ def outer_faces(points: Float[Tensor, "N n"], cells: Int[Tensor, "F 4"]) -> Int[
 
 
 def boundary_of_mesh(
-    vertices: Float[Tensor, "N n"], faces: Int[Tensor, "F v"], degree: int
+    vertices: Points, faces: Int[Tensor, "F v"], degree: int
 ) -> BoundaryPlan | None:
     """Boundary of a mesh from its unpaired sides, its tangents fitted up to `degree`; None for a closed mesh."""
     sides, opposite = open_sides(faces)
@@ -176,17 +157,15 @@ def boundary_of_mesh(
     return plan.with_fits(vertices, graph, degree)
 
 
-def boundary_creases(
-    vertices: Float[Tensor, "N n"], cells: Int[Tensor, "F v"]
-) -> Bool[Tensor, " N"]:
+def boundary_creases(vertices: Points, cells: Int[Tensor, "F v"]) -> Bool[Tensor, " N"]:
     """Vertices where the boundary of a mesh turns by 60° or more, as at the edges and corners of a cube."""
     outward, size = outward_sums(vertices, *open_sides(cells))
     return outward.square().sum(1) < (1 + CREASE) / 2 * size.square()
 
 
 def outward_sums(
-    vertices: Float[Tensor, "N n"], sides: Int[Tensor, "G w"], opposite: Int[Tensor, " G"]
-) -> tuple[Float[Tensor, "N n"], Float[Tensor, " N"]]:
+    vertices: Points, sides: Int[Tensor, "G w"], opposite: Int[Tensor, " G"]
+) -> tuple[Points, Float[Tensor, " N"]]:
     """(sum over the boundary sides at each vertex of their outer normals, weighted by their sizes; sum of the sizes).
 
     The size of a side is (d − 1)! times its volume.

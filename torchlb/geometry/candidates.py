@@ -52,13 +52,7 @@ def list_candidates(
 
 
 def stencil_candidates(
-    dim: int,
-    order: int,
-    weights: str,
-    num_neighbors: int | None,
-    *,
-    on_mesh: bool,
-    triangles: bool,
+    dim: int, order: int, weights: str, num_neighbors: int | None, *, on_mesh: bool, triangles: bool
 ) -> list[Candidate]:
     """Candidates for a row of order p: degree p + 1, then the even degrees below, then positive weights of order 1.
 

@@ -7,37 +7,17 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from torchlb.geometry.thresholds import CREASE, HALF_CREASE
-from torchlb.geometry.vectors import at, dot
+from torchlb.geometry.vectors import Frames, Near, Points, at, dot
 from torchlb.linalg.precision import AT_ONCE
 
 
-def _smallest_singular_value(
-    a: Float[Tensor, "P n d"], b: Float[Tensor, "P n d"]
-) -> Float[Tensor, " P"]:
-    """σ_min(AᵀB) of pairs of orthonormal frames."""
-    product = a.mT @ b
-    dim = product.shape[-1]
-    if dim == 1:
-        return product[:, 0, 0].abs()
-    if dim == 2:  # σ² are the roots of s² − |A|²s + det² = 0
-        frobenius = product.square().sum((-1, -2))
-        (a, b), (c, d) = (row.unbind(-1) for row in product.unbind(-2))
-        discriminant = (frobenius.square() - 4 * (a * d - b * c).square()).clamp_min(0)
-        return ((frobenius - discriminant.sqrt()) / 2).clamp_min(0).sqrt()
-    return torch.linalg.svdvals(product)[:, -1]
-
-
-def planes_of(frames: Float[Tensor, "N n d"]) -> Float[Tensor, "N n d"] | Float[Tensor, "N n"]:
+def planes_of(frames: Frames) -> Frames | Points:
     """Tangent planes as `compatible` takes them: unit normals of a surface in R³, else the frames."""
     return torch.linalg.cross(*frames.unbind(-1)) if frames.shape[1:] == (3, 2) else frames
 
 
-def normal_frames(frames: Float[Tensor, "N n d"]) -> Float[Tensor, "N n m"]:
-    """Orthonormal frames of the normal spaces, m = n − d.
-
-    >>> normal_frames(torch.eye(3)[None, :, :2])[0].T
-    tensor([[0., 0., 1.]])
-    """
+def normal_frames(frames: Frames) -> Float[Tensor, "N n m"]:
+    """Orthonormal frames of the normal spaces, m = n − d."""
     n, dim = frames.shape[1:]
     if (n, dim) == (3, 2):
         return planes_of(frames)[..., None]
@@ -45,10 +25,7 @@ def normal_frames(frames: Float[Tensor, "N n d"]) -> Float[Tensor, "N n m"]:
 
 
 def compatible(
-    points: Float[Tensor, "N n"],
-    planes: Float[Tensor, "N n d"] | Float[Tensor, "N n"],
-    centers: Int[Tensor, " P"],
-    others: Int[Tensor, " P"],
+    points: Points, planes: Frames | Points, centers: Int[Tensor, " P"], others: Int[Tensor, " P"]
 ) -> Bool[Tensor, " P"]:
     """Whether `others[j]` may enter the stencil of `centers[j]`.
 
@@ -64,7 +41,7 @@ def compatible(
         if planes.ndim == 3:
             flat = torch.einsum("pn,pnd->pd", offset, mine)
             height = total - dot(flat, flat)
-            cosine = _smallest_singular_value(theirs, mine)
+            cosine = torch.linalg.svdvals(theirs.mT @ mine)[:, -1]
         else:
             height = dot(offset, mine).square()
             cosine = dot(theirs, mine).abs()
@@ -73,9 +50,7 @@ def compatible(
 
 
 def admissible_neighbors(
-    points: Float[Tensor, "N n"],
-    planes: Float[Tensor, "N n d"] | Float[Tensor, "N n"],
-    index: Int[Tensor, "B K"],
+    points: Points, planes: Frames | Points, index: Int[Tensor, "B K"]
 ) -> Bool[Tensor, "B K"]:
     """Which points of each row are compatible with its first, see `compatible`."""
     centers = index[:, 0].repeat_interleave(index.shape[1])
@@ -83,9 +58,7 @@ def admissible_neighbors(
 
 
 def mutually_admissible(
-    points: Float[Tensor, "N n"],
-    planes: Float[Tensor, "N n d"] | Float[Tensor, "N n"],
-    candidates: Int[Tensor, "N K"],
+    points: Points, planes: Frames | Points, candidates: Near
 ) -> tuple[Int[Tensor, " P"], Int[Tensor, " P"], Bool[Tensor, "N others"]]:
     """Pairs (i, j) of each point with its candidates, row by row, and which of them are compatible both ways."""
     others = candidates[:, 1:]
@@ -94,9 +67,7 @@ def mutually_admissible(
     return i, j, good.view(others.shape)
 
 
-def thin_sides(
-    points: Float[Tensor, "N n"], oriented: Float[Tensor, "N n"], candidates: Int[Tensor, "N K"]
-) -> Float[Tensor, "N n"]:
+def thin_sides(points: Points, oriented: Points, candidates: Near) -> Points:
     """Oriented normals in and next to thin places, zero elsewhere.
 
     Points are on different sides if their normals have a negative product. A place is thin where a near point stands

@@ -10,13 +10,13 @@ from functools import cached_property
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Int, Shaped
+from jaxtyping import Bool, Float, Int
 from scipy import sparse
 from scipy.sparse import csgraph
 from scipy.spatial import Delaunay
 from torch import Tensor
 
-from torchlb.geometry.vectors import inner
+from torchlb.geometry.vectors import Mask, Vectors, inner
 
 Faces = Int[np.ndarray, "_ 3"]
 
@@ -28,7 +28,7 @@ def delaunay(points: Float[np.ndarray, "N n"]) -> Delaunay:
 
 
 def circumcenters(
-    points: Float[np.ndarray, "N 3"], cells: Int[np.ndarray, "T 4"]
+    points: Vectors, cells: Int[np.ndarray, "T 4"]
 ) -> tuple[Float[np.ndarray, "T 3"], Float[np.ndarray, " T"]]:
     """(c, v) of tetrahedra: the circumcentre is the first corner + c/v, and v six times the signed volume.
 
@@ -39,26 +39,17 @@ def circumcenters(
     origin = points.take(cells[:, 0], 0)
     u, v, w = (points.take(cells[:, k], 0) - origin for k in (1, 2, 3))
     crosses = np.cross(v, w), np.cross(w, u), np.cross(u, v)
-    a, b, c = (
-        inner(x, x)[:, None] / 2 * cross for x, cross in zip((u, v, w), crosses, strict=True)
-    )
-    return a + b + c, inner(u, crosses[0])
+    parts = zip((u, v, w), crosses, strict=True)
+    total = sum(inner(x, x)[:, None] / 2 * cross for x, cross in parts)
+    return np.asarray(total), inner(u, crosses[0])
 
 
 @dataclass(frozen=True)
 class Edges:
-    """Edges of triangles on `count` points.
+    """Edges of triangles on `count` points, by their keys low · count + high, ascending.
 
-    Attributes
-    ----------
-    keys
-        (E,), low · count + high of the two ends, ascending.
-    of
-        (3F,), number of the edge of each half-edge.
-    uses
-        (E,), number of faces at each edge.
-    order
-        (3F,), half-edges sorted by the number of their edge.
+    `of` numbers the edge of each half-edge, `uses` counts the faces at each edge, and `order` sorts the half-edges by
+    the number of their edge.
     """
 
     faces: Faces
@@ -85,7 +76,7 @@ class Edges:
         return self.order[first], self.order[first + 1]
 
     @cached_property
-    def outer(self) -> Bool[np.ndarray, " N"]:
+    def outer(self) -> Mask:
         """Points on the boundary or in no face."""
         result = np.ones(self.count, dtype=bool)
         result[self.faces.ravel()] = False
@@ -105,24 +96,11 @@ class Edges:
 
 
 def _order(key: Int[np.ndarray, " K"], count: int) -> Int[np.ndarray, " K"]:
-    """Stable order of keys below `count`, by the counting sort that transposes a sparse matrix.
-
-    >>> _order(np.array([5, 3, 5, 0]), 6).tolist()
-    [3, 1, 0, 2]
-    """
+    """Stable order of keys below `count`, by the counting sort that transposes a sparse matrix."""
     size, narrow = len(key), key.astype(np.int32)  # SciPy would scan wide indices to narrow them
     ends = np.arange(size + 1, dtype=np.int32)
     rows = sparse.csr_array((np.ones(size, np.int8), narrow, ends), (size, count))
     return rows.tocsc().indices.astype(np.int64)
-
-
-def _joined(
-    i: np.ndarray, j: np.ndarray, data: Shaped[np.ndarray, " P"], count: int
-) -> sparse.csr_array:
-    """Graph of the pairs (i, j), in which repeated pairs stay separate entries."""
-    order = _order(i, count)
-    ends = np.append(0, np.bincount(i, minlength=count).cumsum()).astype(np.int32)
-    return sparse.csr_array((data[order], j.astype(np.int32)[order], ends), (count, count))
 
 
 def edges_of(faces: Faces, count: int) -> Edges:
@@ -131,8 +109,8 @@ def edges_of(faces: Faces, count: int) -> Edges:
     >>> edges_of(np.array([[0, 1, 2], [1, 3, 2]]), 4).uses.tolist()
     [1, 1, 2, 1, 1]
     """
-    tail, head = np.roll(faces, -1, 1).ravel(), np.roll(faces, -2, 1).ravel()
-    low, high = np.minimum(tail, head), np.maximum(tail, head)
+    ends = np.roll(faces, -1, 1).ravel(), np.roll(faces, -2, 1).ravel()
+    low, high = np.minimum(*ends), np.maximum(*ends)
     order = _order(high, count)
     order = order[_order(low[order], count)]
     ascending = (low * count + high)[order]
@@ -145,7 +123,7 @@ def edges_of(faces: Faces, count: int) -> Edges:
 
 def components(i: np.ndarray, j: np.ndarray, count: int) -> Int[np.ndarray, " count"]:
     """Label of the connected component of each of `count` nodes, joined by the pairs (i, j); that of node 0 is 0."""
-    graph = _joined(i, j, np.ones(len(i)), count)
+    graph = sparse.csr_array((np.ones(len(i)), (i, j)), (count, count))
     return csgraph.connected_components(graph, directed=False)[1].astype(np.int64)
 
 
@@ -155,7 +133,10 @@ def spanning_pairs(i: np.ndarray, j: np.ndarray, count: int) -> Int[np.ndarray, 
     >>> spanning_pairs(np.array([0, 0, 1, 2]), np.array([1, 1, 2, 0]), 4).tolist()
     [0, 2]
     """
-    ranks = _joined(i, j, np.arange(1.0, len(i) + 1), count)
+    order = _order(i, count)  # repeated pairs stay separate entries
+    ends = np.append(0, np.bincount(i, minlength=count).cumsum()).astype(np.int32)
+    rows = order + 1.0, j.astype(np.int32)[order], ends
+    ranks = sparse.csr_array(rows, (count, count))
     return csgraph.minimum_spanning_tree(ranks).data.astype(np.int64) - 1
 
 

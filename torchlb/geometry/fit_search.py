@@ -32,16 +32,9 @@ IN_ROWS = REASONS.index("neighbours too close to a line or conic")
 class FitSearch:
     """Search for the first of the degrees q, q − 1, … whose fit of heights is regular, and likewise for functions.
 
-    Parameters
-    ----------
-    neighborhoods
-        Neighbourhoods of the points, and the initial frames of the fits.
-    frame_degree
-        Highest degree q of the fits of tangent planes; 0 keeps the initial ones.
-    degrees
-        Degrees m of the fits of functions, best first; without any there are neither such fits nor graphs.
-    num_neighbors
-        Number of points of the fits of heights, if the user has fixed it.
+    `frame_degree` is q, and 0 keeps the initial planes; `degrees` are those of the fits of functions, best first:
+    without any there are neither such fits nor graphs. A user may have fixed the number of points of the fits of
+    heights.
     """
 
     def __init__(
@@ -133,8 +126,6 @@ class FitSearch:
 
     def _try(self, block: Neighborhoods) -> Bool[Tensor, " b"]:
         """Make fits of functions and keep those that pass; return which do."""
-        if len(block.vertices) == 0:
-            return torch.zeros(0, dtype=torch.bool)
         return self._keep(block, *self.fits.fitted(block))
 
     def _keep(

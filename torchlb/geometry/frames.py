@@ -13,7 +13,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from torchlb.geometry.vectors import at, dot
+from torchlb.geometry.vectors import Frames, Points, at, dot
 from torchlb.linalg.once import once_differentiable
 from torchlb.linalg.precision import ROUNDING
 
@@ -21,9 +21,7 @@ Projection = Literal["tangent", "normal"]
 PROJECTIONS = get_args(Projection)
 
 
-def mesh_frames(
-    vertices: Float[Tensor, "N n"], faces: Int[Tensor, "F v"]
-) -> Float[Tensor, "N n d"]:
+def mesh_frames(vertices: Points, faces: Int[Tensor, "F v"]) -> Frames:
     """Initial frames of a mesh of d-simplices: at each vertex the plane closest to those of its faces.
 
     The frame spans the leading eigenvectors of the area-weighted mean of the projectors onto the faces' planes,
@@ -79,10 +77,7 @@ def orthonormalized(frames: Float[Tensor, "B n d"]) -> Float[Tensor, "B n d"]:
 
 
 def local_offsets(
-    points: Float[Tensor, "N n"],
-    frames: Float[Tensor, "N n d"],
-    index: Int[Tensor, "B K"],
-    projection: str,
+    points: Points, frames: Frames, index: Int[Tensor, "B K"], projection: str
 ) -> Float[Tensor, "B neighbors d"]:
     """Coordinates y of the neighbours in the centre's tangent plane, in its frame; `index` has the centre first.
 
@@ -101,8 +96,8 @@ def local_offsets(
 
 
 def local_heights(
-    points: Float[Tensor, "N n"],
-    frames: Float[Tensor, "N n d"],
+    points: Points,
+    frames: Frames,
     index: Int[Tensor, "B K"],
     coords: Float[Tensor, "B neighbors d"],
 ) -> Float[Tensor, "B neighbors n"]:
@@ -111,7 +106,7 @@ def local_heights(
     return offset - coords @ at(frames, index[:, 0]).mT
 
 
-def complete_frames(normals: Float[Tensor, "N n"]) -> Float[Tensor, "N n d"]:
+def complete_frames(normals: Points) -> Frames:
     """Orthonormal frames of the hyperplanes orthogonal to `normals`, of any length but zero."""
     if normals.shape[1] != 3:
         return torch.linalg.qr(normals[..., None], mode="complete")[0][..., 1:]
@@ -121,7 +116,7 @@ def complete_frames(normals: Float[Tensor, "N n"]) -> Float[Tensor, "N n d"]:
     return orthonormalized(torch.stack([first, torch.linalg.cross(normals, first)], -1))
 
 
-def normals_of_frames(frames: Float[Tensor, "N n d"]) -> Float[Tensor, "N n"]:
+def normals_of_frames(frames: Frames) -> Points:
     """Unit normal of each frame with d = n − 1, such that [frame, normal] is right-handed."""
     n = frames.shape[1]
     if n == 3:
@@ -130,15 +125,13 @@ def normals_of_frames(frames: Float[Tensor, "N n d"]) -> Float[Tensor, "N n"]:
     return torch.stack([(-1) ** (n - 1 + i) * minor for i, minor in enumerate(minors)], 1)
 
 
-def _edges(vertices: Float[Tensor, "N n"], faces: Int[Tensor, "F v"]) -> Float[Tensor, "F edges n"]:
+def _edges(vertices: Points, faces: Int[Tensor, "F v"]) -> Float[Tensor, "F edges n"]:
     """Edges from the first corner of each face to the others."""
     corners = at(vertices, faces)
     return corners[:, 1:] - corners[:, :1]
 
 
-def vertex_normals(
-    vertices: Float[Tensor, "N n"], faces: Int[Tensor, "F n"]
-) -> Float[Tensor, "N n"]:
+def vertex_normals(vertices: Points, faces: Int[Tensor, "F n"]) -> Points:
     """Unit mean of the normals of the faces (segments in R², triangles in R³) at every vertex, weighted by area.
 
     Counter-clockwise triangles face the viewer, counter-clockwise polygons outward. Zero where the mean vanishes up to

@@ -17,25 +17,15 @@ from torch import Tensor
 from torchlb.fits.polynomials import num_monomials
 from torchlb.fits.weights import CenteredFit, centered_fit
 from torchlb.geometry.frames import orthonormalized
-from torchlb.geometry.vectors import at
+from torchlb.geometry.vectors import Frames, Points, at
 from torchlb.linalg.precision import rows_at_once
 
 
 class Neighborhoods(NamedTuple):
-    """Neighbourhoods of fits of the same degree and number of points.
+    """Neighbourhoods of fits of the same degree m and number of points, around `vertices`.
 
-    Attributes
-    ----------
-    degree
-        Degree m of the fits.
-    vertices
-        (b,), centres of the fits.
-    points
-        (b, K), the vertex first; padded by the vertex.
-    keep
-        (b, K − 1), which neighbours are no padding.
-    frame, surface
-        (b,), whether the fit provides the tangent plane, and the graph of the surface; False for fits of functions.
+    `points` has the vertex first, and as padding; `keep` tells which neighbours are no padding. `frame` and `surface`
+    tell whether the fit provides the tangent plane, and the graph of the surface; they are False for fits of functions.
     """
 
     degree: int
@@ -55,28 +45,17 @@ class Neighborhoods(NamedTuple):
 
 @dataclass(frozen=True)
 class FitPlan:
-    """Degrees and neighbourhoods of all fits of a shape.
+    """Degrees and neighbourhoods of all fits of a shape, of heights (`surface`) and of `functions`.
 
-    Attributes
-    ----------
-    surface, functions
-        Neighbourhoods of the fits of heights, and of functions.
-    order
-        (N,), degree of the fit behind each tangent plane; 0 for the initial plane.
-    surface_degree
-        (N,), degree of the graph around each vertex; 0 where there is none.
-    degree
-        (N,), degree m of the fit of functions; 0 where none passed, which leaves the vertex flat.
-    reason
-        (N,), why the highest degree was not reached, an index into `REASONS`.
-    size
-        (N,), number of points of the fit of functions, the vertex included.
-    highest
-        Degree up to which graphs are kept.
-    jet, reach
-        Degree up to which fits of functions are kept, and fraction of the offset to a node at which they are evaluated.
-        Fits of degree 2 and 3 keep the gradient, at half of the offset: the cubic Hermite interpolant in the middle of
-        an edge, (u_a + u_b)/2 + (∂u_a − ∂u_b)/8 with ∂ along it, is the mean of u_a + ∇u_a·y over its ends.
+    Degrees of each vertex: `order`, of the fit behind its tangent plane, 0 for the initial plane; `surface_degree`, of
+    the graph around it, 0 without; `degree`, m of the fit of functions, 0 where none passed, which leaves it flat.
+    `reason` indexes in `REASONS` why the highest degree was not reached, `size` counts the points of the fit of
+    functions, the vertex included.
+
+    Graphs are kept up to the degree `highest`, fits of functions up to `jet`, which are evaluated at the fraction
+    `reach` of the offset to a node. Fits of degree 2 and 3 keep the gradient, at half of the offset: the cubic Hermite
+    interpolant in the middle of an edge, (u_a + u_b)/2 + (∂u_a − ∂u_b)/8 with ∂ along it, is the mean of u_a + ∇u_a·y
+    over its ends.
     """
 
     surface: list[Neighborhoods]
@@ -96,25 +75,14 @@ class FitPlan:
 
 
 class LocalFits:
-    """Tangent planes, graphs and coefficients of the fits at given points, over the `initial` frames.
+    """Tangent planes (`frames`), graphs and coefficients of the fits at given points, over the `initial` frames.
 
-    Graphs are kept up to a degree.
-
-    Attributes
-    ----------
-    frames
-        (N, n, d), frames of the tangent planes.
-    heights
-        (N, M − 1, n), ℓ: graphs of the surface over the initial frames, as vectors; zero beyond the monomials of a fit.
-    surface_radius, radius
-        (N,), ℓ, radii of the fits of heights and of functions.
-    coefficients
-        Coefficients of the fits of functions, in the order of `FitPlan.functions`, as in `CenteredFit`.
+    `heights`, (N, M − 1, n), ℓ, are graphs of the surface up to a degree, as vectors, zero beyond the monomials of a
+    fit; `surface_radius` and `radius`, (N,), ℓ, are radii of the fits of heights and of functions; `coefficients` those
+    of functions, in the order of `FitPlan.functions`, as in `CenteredFit`.
     """
 
-    def __init__(
-        self, points: Float[Tensor, "N n"], initial: Float[Tensor, "N n d"], degree: int
-    ) -> None:
+    def __init__(self, points: Points, initial: Frames, degree: int) -> None:
         self.points, self.initial, self.frames = points, initial, initial.clone()
         terms = num_monomials(initial.shape[2], degree) - 1
         self.heights = points.new_zeros(len(points), terms, points.shape[1])
@@ -122,9 +90,7 @@ class LocalFits:
         self.coefficients: list[Tensor] = []
 
     @classmethod
-    def at(
-        cls, plan: FitPlan, points: Float[Tensor, "N n"], initial: Float[Tensor, "N n d"]
-    ) -> LocalFits:
+    def at(cls, plan: FitPlan, points: Points, initial: Frames) -> LocalFits:
         """Compute the fits of a plan at these points."""
         found, dim = cls(points, initial, plan.highest), initial.shape[2]
         for block in plan.surface:
@@ -168,9 +134,8 @@ class LocalFits:
         """Store the tangent planes and the graphs of these fits."""
         on = block.frame
         if on.any():
-            tilted = (
-                at(self.initial, block.vertices[on]) + slope_of(fit, graph, self.initial)[on].mT
-            )
+            slope = slope_of(fit, graph, self.initial)[on].mT
+            tilted = at(self.initial, block.vertices[on]) + slope
             self.frames[block.vertices[on]] = orthonormalized(tilted)
         on = block.surface
         if on.any():
@@ -179,7 +144,7 @@ class LocalFits:
 
 
 def slope_of(
-    fit: CenteredFit, graph: Float[Tensor, "b M n"], frames: Float[Tensor, "N n d"]
+    fit: CenteredFit, graph: Float[Tensor, "b M n"], frames: Frames
 ) -> Float[Tensor, "b d n"]:
     """First derivatives of the fitted heights, vectors in the normal space."""
     return graph[:, : frames.shape[2]] / fit.radius[:, None, None]

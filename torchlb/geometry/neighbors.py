@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from functools import cached_property
+from itertools import combinations
 from math import ceil
 
 import numpy as np
@@ -21,10 +22,10 @@ from torch import Tensor
 
 from torchlb.geometry.compatibility import normal_frames
 from torchlb.geometry.thresholds import AROUND, CREASE, HALF_CREASE, WIDER
-from torchlb.geometry.vectors import at
+from torchlb.geometry.vectors import Frames, Near, Points, at
 
 
-def nearest_neighbors(points: Float[Tensor, "N n"], size: int) -> Int[Tensor, "N K"]:
+def nearest_neighbors(points: Points, size: int) -> Near:
     """The `size` nearest points of each point by distance, itself first even where others coincide with it.
 
     >>> nearest_neighbors(torch.tensor([[0.0], [1.0], [3.0]]), 2).tolist()
@@ -56,32 +57,22 @@ def mesh_graph(faces: Int[Tensor, "F v"], num_points: int) -> sparse.csr_array:
     [[0, 1, 1, 0], [1, 0, 1, 0], [1, 1, 0, 0], [0, 0, 0, 0]]
     """
     corners = faces.numpy()
-    pairs = [(a, b) for a in range(corners.shape[1]) for b in range(a)]
-    i = np.concatenate([corners[:, a] for a, _ in pairs])
-    j = np.concatenate([corners[:, b] for _, b in pairs])
+    i, j = np.concatenate([corners[:, pair] for pair in combinations(range(corners.shape[1]), 2)]).T
     return adjacency(i, j, num_points)
 
 
 @dataclass(frozen=True, eq=False)
 class GraphNeighborhoods:
-    """Nearest points of a k-hop neighbourhood, for any chunk of centres; results are kept.
+    """Nearest points of a k-hop neighbourhood in a symmetric graph, for any chunk of centres; results are kept.
 
-    Parameters
-    ----------
-    points
-        (N, n), length ℓ.
-    graph
-        (N, N) symmetric adjacency, from `mesh_graph` or `nearest_graph`.
-    frames
-        (N, n, d) tangent frames that decide compatibility.
-    sides
-        (N, n) from `thin_sides`; points on the other side of a thin shape are refused. None if unknown.
+    The tangent frames decide compatibility. Points on the other side of a thin shape are refused by their `sides`, from
+    `thin_sides`, if these are known.
     """
 
-    points: Float[Tensor, "N n"]
+    points: Points
     graph: sparse.csr_array
-    frames: Float[Tensor, "N n d"]
-    sides: Float[Tensor, "N n"] | None = None
+    frames: Frames
+    sides: Points | None = None
     # by size, indices and counts of all points; a count of 0 is not known yet; copies share what is found
     _kept: dict[int, tuple[Tensor, Tensor]] = field(default_factory=dict)
 

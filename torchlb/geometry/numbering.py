@@ -7,22 +7,20 @@ from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Int
 from scipy import sparse
 from scipy.spatial import KDTree
 from torch import Tensor
+
+from torchlb.geometry.vectors import Points
 
 
 @dataclass(frozen=True)
 class Numbering:
     """Permutation of the points of a shape along a k-d tree, in which operators are built faster.
 
-    Attributes
-    ----------
-    given
-        (N,), the user's number of each point in the order of the tree.
-    here
-        (N,), the position of each of the user's points in that order.
+    `given` is the user's number of each point in the order of the tree, `here` the position of each of the user's
+    points in that order.
 
     >>> numbering = Numbering.along_tree(torch.rand(50, 3))
     >>> numbering.given[numbering.here].equal(torch.arange(50))
@@ -33,7 +31,7 @@ class Numbering:
     here: Int[Tensor, " N"]
 
     @classmethod
-    def along_tree(cls, points: Float[Tensor, "N n"]) -> Numbering:
+    def along_tree(cls, points: Points) -> Numbering:
         """Order of the leaves of a k-d tree of the sorted points, the same however the user numbers them."""
         places = points.numpy()
         first = np.lexsort(places.T)

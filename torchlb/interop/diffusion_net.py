@@ -41,7 +41,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from torchlb.cloud.orientation import settled_normals
+from torchlb.cloud.frames import settled_normals
 from torchlb.errors import InputError
 from torchlb.geometry.neighbors import nearest_neighbors
 from torchlb.geometry.thresholds import NEAREST

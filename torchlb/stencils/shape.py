@@ -10,8 +10,8 @@ from scipy import sparse
 from torch import Tensor
 from tqdm import tqdm
 
-from torchlb.cloud.boundary import boundary_of_cloud
 from torchlb.cloud.surface import CloudSurface
+from torchlb.cloud.voronoi import boundary_of_cloud
 from torchlb.errors import InputError, first_few
 from torchlb.geometry.boundary import BoundaryPlan, boundary_of_mesh
 from torchlb.geometry.compatibility import thin_sides
