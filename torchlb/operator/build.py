@@ -33,7 +33,6 @@ from torchlb.operator.options import Options
 from torchlb.operator.plan import Plan, stencils_of
 from torchlb.stencils.assemble import assemble
 from torchlb.stencils.conditions import Condition
-from torchlb.stencils.low_order import MeshLowOrder
 from torchlb.stencils.rows import Reason, matrix_rows
 from torchlb.stencils.shape import Shape, mesh_shape
 
@@ -57,7 +56,6 @@ def with_plan(
     """Attach the plan of an operator that has a weak pair; any other is returned unchanged."""
     if pair is None or shape.plan is None:
         return built
-    assert isinstance(shape.low_order, MeshLowOrder)
     rows = None if built.certificate else stencils_of(shape, options).plan(built.rows)
     parts = numbering, shape.plan, rows, pair, shape.low_order.flips, built.faces, order
     plan = Plan(*parts, shape.on_mesh, moved, built.source, options)
@@ -162,7 +160,7 @@ def build_cotangent(vertices: ArrayLike, faces: ArrayLike) -> AssembledOperator:
     corners = mended_faces(vertices, corners)
     _warn_of_long_triangles(vertices, corners)
     matrix, mass = cotangent_laplacian(vertices, corners)
-    shape = mesh_shape(vertices, corners, 0, condition=None, areas=mass)
+    shape = replace(mesh_shape(vertices, corners, 0, condition=None), areas=mass)
     centers = torch.arange(len(vertices))
     rows = matrix_rows(matrix, shape.points, shape.frames, centers)
     row = centers.repeat_interleave(rows.length)
