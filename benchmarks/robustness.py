@@ -34,7 +34,6 @@ from torch import Tensor
 from tqdm import tqdm
 
 from torchlb import LaplaceBeltrami, clean_mesh
-from torchlb.certified import krylov
 from torchlb.surfaces import Sphere, Torus
 
 DENSE = 3000
@@ -229,16 +228,11 @@ def main() -> None:
     parser.add_argument(
         "--split", action="store_true", help="seconds of stencils + certificate, by building twice"
     )
-    parser.add_argument(
-        "--unfactored", action="store_true", help="the certificate's Krylov methods at every size"
-    )
     parser.add_argument("--summarize", type=Path, nargs="+", metavar="TABLE")
     options = parser.parse_args()
     if options.summarize:
         print(*summarize(options.summarize), sep="\n")
         return
-    if options.unfactored:
-        krylov.LARGEST_FACTORED = 0
     torch.set_num_threads(1)
     warnings.simplefilter("ignore")
     every = list(shapes_in(options.data)) if options.data else list(dirty())

@@ -12,9 +12,9 @@ from torchlb.geometry.candidates import (
     Candidate,
     Search,
     list_candidates,
-    stencil_candidates,
 )
 from torchlb.geometry.neighbors import GraphNeighborhoods, nearest_neighbors
+from torchlb.stencils.assemble import stencil_candidates
 from torchlb.surfaces import Sphere
 
 
@@ -106,18 +106,15 @@ def test_who_rejects_a_degree_goes_on_with_the_next(neighborhoods):
 
 
 def test_candidates_of_a_row():
-    """Degrees p + 1, then even ones; order 1 by positive weights, on triangles if asked for; splines first."""
+    """Degrees p + 1, then even ones; on a mesh degree 2 at order 1 only; splines first."""
 
-    def degrees(order, on_mesh, weights="least_squares", triangles=None):
-        triangles = on_mesh if triangles is None else triangles
-        options = {"on_mesh": on_mesh, "triangles": triangles}
-        listed = stencil_candidates(2, order, weights, 100, **options)
+    def degrees(order, on_mesh, weights="least_squares"):
+        listed = stencil_candidates(2, order, weights, 100, on_mesh=on_mesh)
         return [(c.degree, c.rule[0]) for c in listed]
 
     assert degrees(5, on_mesh=True) == [(6, "l"), (4, "l")]
-    assert degrees(4, on_mesh=False) == [(5, "l"), (4, "l"), (2, "l"), (2, "p")]
-    assert degrees(4, on_mesh=False, triangles=True) == [(5, "l"), (4, "l"), (2, "l")]
-    assert degrees(1, on_mesh=True) == [(2, "l"), (2, "p")]
+    assert degrees(4, on_mesh=False) == [(5, "l"), (4, "l"), (2, "l")]
+    assert degrees(1, on_mesh=True) == [(2, "l")]
     assert degrees(3, on_mesh=True, weights="polyharmonic") == [(4, "p"), (4, "l")]
 
 

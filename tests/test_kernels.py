@@ -10,8 +10,7 @@ import torch
 from scipy import sparse
 
 from torchlb.cloud.cocone import best_manifold, conormals
-from torchlb.fits.least_squares import left_inverse
-from torchlb.fits.weights import scaled_system
+from torchlb.fits.weights import left_inverse, scaled_system
 from torchlb.galerkin import assembly
 from torchlb.galerkin.pair import Pattern
 from torchlb.geometry.compatibility import compatible, normal_frames
@@ -36,7 +35,7 @@ def test_without_a_place_for_it_what_is_compiled_is_not_kept(monkeypatch):
 def test_left_inverses_are_those_of_normal_equations_by_qr(dim, degree, batch):
     """And the condition is ‖R⁻¹‖ of columns of length one; a set on a line leaves the others as they are."""
     coords = torch.randn(batch, 90, dim, dtype=torch.float64)
-    _, _, values, root = scaled_system(coords, degree)
+    _, values, root = scaled_system(coords, degree)
     values[7::64] = 0.0
     inverse, condition = left_inverse(values, root)
     regular = torch.ones(batch, dtype=torch.bool)
@@ -56,7 +55,7 @@ def test_left_inverses_are_as_accurate_as_their_condition_allows(degree):
     """Every row, beside one computed with 50 digits."""
     mpmath.mp.dps = 50
     coords = torch.randn(2, int(0.8 * (degree + 1) * (degree + 2)), 2, dtype=torch.float64)
-    _, _, values, root = scaled_system(coords, degree)
+    _, values, root = scaled_system(coords, degree)
     inverse, condition = left_inverse(values, root)
     for v, w, found, bound in zip(values, root, inverse, condition, strict=True):
         v = mpmath.matrix(v.tolist())

@@ -27,7 +27,7 @@ from torchlb.operator.cleaning import clean_mesh, cleaned
 from torchlb.operator.dispatch import Operator, build_operator
 from torchlb.operator.laplace_beltrami import LaplaceBeltrami
 from torchlb.pde import geodesics, heat
-from torchlb.plot.comparison import draw_comparison, spectra, spectrum_table
+from torchlb.plot.comparison import draw_comparison, spectrum_table
 from torchlb.version import __version__
 
 __all__ = ["main"]
@@ -122,7 +122,7 @@ def compare(mesh: Path, k: int, out: Path | None, clean: bool, **options: Any) -
             operators["cotangent"] = LaplaceBeltrami.from_cotangent(vertices, faces)
         except ValueError as error:
             click.echo(f"no cotangent operator to compare with: {error}", err=True)
-    values = spectra(operators, k)
+    values = {name: lb.eigenbasis(k).eigenvalues.double() for name, lb in operators.items()}
     click.echo(f"smallest eigenvalues of −Δ, 1/length²\n{spectrum_table(values)}")
     out = out or Path(f"{mesh.stem}_compare.png")
     try:

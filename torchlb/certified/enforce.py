@@ -18,7 +18,6 @@ from torch import Tensor
 from tqdm import tqdm
 
 from torchlb.certified.certificate import Certificate, check_certificate
-from torchlb.certified.krylov import prefers_krylov
 from torchlb.errors import StabilityWarning, as_given, warn
 from torchlb.linalg.precision import LOW
 from torchlb.linalg.sparse import to_scipy
@@ -50,7 +49,6 @@ def certify(
     bottom: int,
     *,
     outflow: bool = False,
-    most: int = MOST_ROUNDS,
     progress: bool = True,
 ) -> tuple[Rows, Float[Tensor, " N"], Certificate]:
     """Widen rows, or lower their order, until the certificate holds.
@@ -69,10 +67,10 @@ def certify(
             matrix = to_scipy(rows.crow, rows.col, rows.laplacian, (count, count))
             free = rows.candidate < bottom
             marked, start = _into_closed_classes(matrix) & free, torch.full_like(times, bottom)
-            if not marked.any() or rounds == most:  # else π is 0 outside those
+            if not marked.any() or rounds == MOST_ROUNDS:  # else π is 0 outside those
                 mass, result, feed = check_certificate(matrix, areas, outflow=outflow)
                 marked = _marked(matrix, mass / areas, feed, free, spread=not result.holds)
-                if not marked.any() or rounds == most:
+                if not marked.any() or rounds == MOST_ROUNDS:
                     break
                 times += marked
                 start = first.candidate + candidates_skipped(times)
@@ -86,7 +84,7 @@ def certify(
     if not result.holds:
         worst = (mass / areas).argsort() if feed.shape[1] == 0 else (-feed.max(1)).argsort()
         names = ", ".join(map(str, as_given(worst[:8]).tolist()))
-        stopped = ", where rounds end" if rounds == most else ""
+        stopped = ", where rounds end" if rounds == MOST_ROUNDS else ""
         warn(
             f"{result}{stopped}; the worst points: {names}. Lower `order`, or repair the surface there.",
             StabilityWarning,
@@ -126,15 +124,14 @@ def _marked(
     *,
     spread: bool,
 ) -> Bool[Tensor, " N"]:
-    """Rows to widen or lower: those that make π small or contribute to S > 0.
+    """Rows to widen or lower: those that make π small, or contribute most to a direction v with vᵀSv > 0.
 
     With `spread`, neighbours are marked too until one is free, since low-order rows are symmetric only together.
     """
     joined = sparse.csr_array(abs(matrix) + abs(matrix).T)
     joined.data[:] = 1.0
-    marked = _around_small_weights(matrix, density.numpy(), free.numpy()) | _feeding(
-        joined, feed, peaks=prefers_krylov(len(feed))
-    )
+    marked = _around_small_weights(matrix, density.numpy(), free.numpy())
+    marked |= (feed > LOW * feed.max(axis=0)).any(axis=1)
     while spread and not (marked & free.numpy()).any():
         wider = joined @ marked > 0
         if (wider == marked).all():
@@ -162,22 +159,6 @@ def _around_small_weights(
     marked[row[(inflow < LOW * worst[col]) & (inflow < 0)]] = True
     marked[small[density[small] > 0]] = True
     marked[matrix[small[~free[small]]].indices] = True
-    return marked
-
-
-def _feeding(
-    joined: sparse.csr_array, feed: Float[np.ndarray, "N k"], *, peaks: bool
-) -> Bool[np.ndarray, " N"]:
-    """Rows that contribute most to a direction with vᵀSv > 0; with `peaks`, also local maxima of the contribution.
-
-    Directions from Krylov methods are sums of many local ones, with random weights.
-    """
-    marked = (feed > LOW * feed.max(axis=0)).any(axis=1)
-    for own in feed.T[: feed.shape[1] * peaks]:
-        high = np.flatnonzero(own > MARGIN * own.max())
-        around = joined[high]
-        largest = np.maximum.reduceat(own[around.indices], around.indptr[:-1])
-        marked[high[(own[high] >= LOW * largest) & (around @ own > 0)]] = True
     return marked
 
 

@@ -1,4 +1,4 @@
-"""Rules for weights by name, sizes of their stencils, and reference figures of good stencils."""
+"""Rules for weights by name, least squares and polyharmonic splines; sizes and reference figures of good stencils."""
 
 from __future__ import annotations
 
@@ -7,25 +7,60 @@ from math import ceil, gamma, pi
 from typing import Literal, NamedTuple
 
 import torch
+from jaxtyping import Float
+from torch import Tensor
 
-from torchlb.fits.polyharmonic import polyharmonic_weights
-from torchlb.fits.polynomials import num_monomials
-from torchlb.fits.weights import least_squares_weights, positive_weights
+from torchlb.fits.polynomials import functionals, monomials, num_monomials
+from torchlb.fits.weights import Weights, centered_fit, least_squares_weights
 
 WeightsName = Literal["least_squares", "polyharmonic"]
-WEIGHT_RULES = {
-    "least_squares": least_squares_weights,
-    "polyharmonic": polyharmonic_weights,
-    "positive": positive_weights,
-}
-"""The rules for the weights of a stencil; the first two are the values of the option `weights`."""
-
 SIZE_FACTORS = {
     "least_squares": (1.6, 2.0, 2.5, 3.0, 4.0, 5.0, 7.0, 10.0),
     "polyharmonic": (2.0, 2.5, 3.0),
-    "positive": (1.6, 2.5, 4.0, 7.0, 10.0),
 }
 """Points of a stencil per polynomial, by the rule for its weights, in the order in which they are tried."""
+
+
+def polyharmonic_weights(
+    coords: Float[Tensor, "B neighbors d"],
+    degree: int,
+    heights: Float[Tensor, "B neighbors n"] | None = None,
+) -> Weights:
+    r"""Derivatives of the interpolant by the spline :math:`|y|^{2m+3}` plus polynomials of degree m.
+
+    On Deserno's sphere with 2,022 nodes errors are smaller than by least squares, 10 times at p = 3, 80 times at p = 5
+    (`method.md`, section 2). Arguments and result are those of `least_squares_weights`; m ≥ 2.
+    """
+    exponent = 2 * degree + 3
+    fit, (batch, _, dim) = centered_fit(coords, degree), coords.shape
+    scaled, wanted = coords / fit.radius[:, None, None], functionals(dim, degree).to(coords)
+    nodes = torch.cat([scaled.new_zeros(batch, 1, dim), scaled], dim=1)
+    # Distances from differences: |a|² − 2ab + |b|² would lose half the digits.
+    kernel = (nodes[:, :, None] - nodes[:, None]).square().sum(-1).pow(exponent / 2)
+    polynomials = torch.cat([torch.ones_like(nodes[..., :1]), monomials(nodes, degree)], dim=-1)
+    num_points, num_polynomials = polynomials.shape[1:]
+    zero = kernel.new_zeros(batch, num_polynomials, num_polynomials)
+    upper = torch.cat([kernel, polynomials], dim=2)
+    matrix = torch.cat([upper, torch.cat([polynomials.mT, zero], dim=2)], dim=1)
+    exact = torch.cat([wanted.new_zeros(1, dim + 1), wanted]).expand(batch, -1, -1)
+    right = torch.cat([_kernel_derivatives(nodes, exponent), exact], dim=1)
+    factors, pivots, _ = torch.linalg.lu_factor_ex(matrix)
+    weights = torch.linalg.lu_solve(factors, pivots, right)[:, :num_points]
+    moments = fit.values.mT @ weights[:, 1:]
+    # Points that nearly coincide have weights of any size, which cancel up to rounding.
+    rounding = torch.finfo(weights.dtype).eps * weights.abs().sum(1).amax(1)
+    violation = (moments - wanted).abs().amax((1, 2)) + rounding
+    return fit.weights(weights, violation / wanted.abs().max(), coords, heights)
+
+
+def _kernel_derivatives(nodes: Float[Tensor, "B K d"], s: int) -> Float[Tensor, "B K F"]:
+    """First derivatives, then Δ, at y = 0 of |y − y_j|^s: −s r^{s−2} y and s (s + d − 2) r^{s−2}."""
+    power = s * nodes.norm(dim=-1, keepdim=True) ** (s - 2)
+    return torch.cat([-power * nodes, (s + nodes.shape[-1] - 2) * power], dim=-1)
+
+
+WEIGHT_RULES = {"least_squares": least_squares_weights, "polyharmonic": polyharmonic_weights}
+"""The rules for the weights of a stencil, the values of the option `weights`."""
 
 
 class Reference(NamedTuple):

@@ -6,15 +6,16 @@ Local coordinates y_j of the K − 1 neighbours, centre at the origin. One facto
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, fields
+from typing import Any
 
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from torchlb.fits.least_squares import left_inverse
 from torchlb.fits.polynomials import functionals, monomial_derivatives, monomials, num_monomials
-from torchlb.linalg.precision import NEGLIGIBLE, ROUNDING, SINGLE
+from torchlb.linalg.once import once_differentiable
+from torchlb.linalg.precision import SINGLE
 
 
 @dataclass(frozen=True)
@@ -58,6 +59,53 @@ class Weights:
         return Weights(*(torch.cat([getattr(p, f.name) for p in parts]) for f in fields(Weights)))
 
 
+def left_inverse(
+    values: Float[Tensor, "B K M"], root: Float[Tensor, "B K"]
+) -> tuple[Float[Tensor, "B M K"], Float[Tensor, " B"]]:
+    """C = (VᵀΩV)⁻¹VᵀΩ, for which Cu are the coefficients of the weighted fit to u, and the condition.
+
+    Modified Gram–Schmidt on √ω V = QR and back substitution give C = R⁻¹Qᵀ√ω, every row as accurate as by Householder's
+    QR (`decisions.md`, *Compiled kernels*). Columns that are dependent to the last digit give non-finite results.
+
+    V has K ≥ M rows, in float64; `root` is √ω. The condition is the Frobenius norm ‖R⁻¹‖ for columns of √ω V scaled to
+    unit length; ‖R‖ is then between 1 and √M.
+
+    >>> left_inverse(torch.ones(1, 4, 1, dtype=torch.float64), torch.ones(1, 4, dtype=torch.float64))[0].tolist()
+    [[[0.25, 0.25, 0.25, 0.25]]]
+    """
+    return _LeftInverse.apply(values, root)  # pyright: ignore[reportReturnType]
+
+
+class _LeftInverse(torch.autograd.Function):
+    """C and its condition; the condition has no derivative.
+
+    With A = VᵀΩV and H = A⁻¹C̄ derivatives are V̄ = Ω(H(I − VC)ᵀ)ᵀ − Cᵀ(C̄Cᵀ), and the column sums of H(I − VC)ᵀ ∘ Vᵀ
+    for ω. As C Ω^{−½} = R⁻¹Qᵀ, it gives A⁻¹ = R⁻¹R⁻ᵀ without another factorisation.
+    """
+
+    @staticmethod
+    def forward(ctx: Any, values: Tensor, root: Tensor) -> tuple[Tensor, Tensor]:  # pyright: ignore[reportIncompatibleMethodOverride]
+        from torchlb.linalg import kernels
+
+        columns, weights = values.mT.contiguous().numpy(), root.contiguous().numpy()
+        inverse, condition = (
+            torch.from_numpy(found) for found in kernels.left_inverse(columns, weights)
+        )
+        ctx.save_for_backward(values, root, inverse)
+        ctx.mark_non_differentiable(condition)
+        return inverse, condition
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, grad: Tensor, _: Tensor) -> tuple[Tensor, Tensor]:  # pyright: ignore[reportIncompatibleMethodOverride]
+        values, root, inverse = ctx.saved_tensors
+        half = torch.where(root[:, None] > 0, inverse / root[:, None], 0.0)
+        h = half @ (half.mT @ grad)
+        rest = h - (h @ inverse.mT) @ values.mT
+        of_values = root[..., None].square() * rest.mT - inverse.mT @ (grad @ inverse.mT)
+        return of_values, 2 * root * (rest * values.mT).sum(1)
+
+
 def window(radius: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
     """Weight ω(r) = (1 − (r/1.1)²)⁴ of a neighbour at r = |y|/ρ ∈ [0, 1].
 
@@ -70,68 +118,6 @@ def window(radius: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
 def _root_window(radius: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
     """√ω."""
     return (1 - (radius / 1.1).square()).clamp_min(0).square()
-
-
-def finish(
-    weights: Float[Tensor, "B K F"],
-    residual: Float[Tensor, " B"],
-    radius: Float[Tensor, " B"],
-    condition: Float[Tensor, " B"],
-    height_residual: Float[Tensor, " B"],
-    dim: int,
-) -> Weights:
-    """Rescale weights from scaled coordinates to units of length."""
-    rho = radius[:, None, None]
-    return Weights(
-        gradient=weights[..., :dim] / rho,
-        laplacian=weights[..., dim] / rho[..., 0].square(),
-        radius=radius,
-        condition=condition,
-        residual=residual,
-        height_residual=height_residual,
-        slope=torch.zeros_like(radius, dtype=torch.int64),
-    )
-
-
-def height_residual(
-    values: Float[Tensor, "B neighbors M"],
-    coefficients: Float[Tensor, "B M neighbors"],
-    root: Float[Tensor, "B neighbors"],
-    coords: Float[Tensor, "B neighbors d"],
-    heights: Float[Tensor, "B neighbors n"],
-) -> Float[Tensor, " B"]:
-    """Scatter of the heights about their fit over root mean square distance, both weighted by ω.
-
-    The scatter is per degree of freedom, thus independent of their number.
-    """
-    left = root[..., None] * _left_by_fit(values, coefficients @ heights, heights)
-    freedom = max(values.shape[1] - values.shape[2], 1) / values.shape[1]
-    square = coords.norm(dim=-1).square() + heights.norm(dim=-1).square()
-    distance = (root.square() * square).sum(1)
-    return left.flatten(1).norm(dim=1) / (freedom * distance).sqrt()
-
-
-def _left_by_fit(
-    values: Float[Tensor, "B neighbors M"],
-    graph: Float[Tensor, "B M n"],
-    heights: Float[Tensor, "B neighbors n"],
-) -> Float[Tensor, "B neighbors n"]:
-    # a product with few long rows takes half the time of one with few long columns
-    return heights - (graph.mT @ values.mT).mT
-
-
-def scaled_system(
-    coords: Float[Tensor, "B neighbors d"],
-    degree: int,
-    keep: Bool[Tensor, "B neighbors"] | None = None,
-) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Radius ρ of the kept neighbours, scaled coordinates y/ρ, their monomials V, and √ω."""
-    distance = coords.norm(dim=-1)
-    radius = (distance if keep is None else distance * keep).amax(-1)
-    scaled = coords / radius[:, None, None]
-    root = _root_window(distance / radius[:, None])
-    values = monomials(scaled, degree)
-    return radius, scaled, values, root if keep is None else root * keep
 
 
 @dataclass(frozen=True)
@@ -148,6 +134,8 @@ class CenteredFit:
         (B, K − 1, M − 1), the monomials V at the neighbours.
     root
         (B, K − 1), √ω.
+    condition
+        (B,), by `left_inverse`.
     degree
         Degree m.
     """
@@ -156,7 +144,14 @@ class CenteredFit:
     radius: Float[Tensor, " B"]
     values: Float[Tensor, "B neighbors M"]
     root: Float[Tensor, "B neighbors"]
+    condition: Float[Tensor, " B"]
     degree: int
+
+    @classmethod
+    def of(cls, radius: Tensor, values: Tensor, root: Tensor, degree: int) -> CenteredFit:
+        """Solve the system of `scaled_system`."""
+        coefficients, condition = left_inverse(values, root)
+        return cls(coefficients, radius, values, root, condition, degree)
 
     def residual(self, dim: int) -> Float[Tensor, " B"]:
         """Largest violation of the moment equations of the `dim` first derivatives."""
@@ -169,12 +164,61 @@ class CenteredFit:
         rows = cardinal(kept, places / self.radius[:, None, None], degree)
         return rows.abs().sum(-1).amax(1)
 
+    def _left(
+        self, heights: Float[Tensor, "B neighbors n"], graph: Float[Tensor, "B M n"]
+    ) -> Float[Tensor, "B neighbors n"]:
+        """Distances √ω (h − V c) of the heights from the polynomials `graph` fitted to them."""
+        # a product with few long rows takes half the time of one with few long columns
+        return self.root[..., None] * (heights - (graph.mT @ self.values.mT).mT)
+
     def misfit(
         self, heights: Float[Tensor, "B neighbors n"], graph: Float[Tensor, "B M n"]
     ) -> Float[Tensor, " B"]:
         """Largest weighted distance of the heights from the polynomials `graph` fitted to them, relative to ρ."""
-        left = _left_by_fit(self.values, graph, heights)
-        return (self.root * left.norm(dim=-1)).amax(1) / self.radius
+        return self._left(heights, graph).norm(dim=-1).amax(1) / self.radius
+
+    def scatter(
+        self, heights: Float[Tensor, "B neighbors n"], coords: Float[Tensor, "B neighbors d"]
+    ) -> Float[Tensor, " B"]:
+        """Scatter of the heights about their fit, per degree of freedom, over root mean square distance."""
+        left = self._left(heights, self.coefficients @ heights)
+        count, terms = self.values.shape[1:]
+        square = coords.norm(dim=-1).square() + heights.norm(dim=-1).square()
+        distance = max(count - terms, 1) / count * (self.root.square() * square).sum(1)
+        return left.flatten(1).norm(dim=1) / distance.sqrt()
+
+    def weights(
+        self,
+        weights: Float[Tensor, "B K F"],
+        residual: Float[Tensor, " B"],
+        coords: Float[Tensor, "B neighbors d"],
+        heights: Float[Tensor, "B neighbors n"] | None,
+    ) -> Weights:
+        """Weights in units of length, from those in units of the radius."""
+        dim, rho = coords.shape[2], self.radius[:, None, None]
+        none = torch.zeros_like(self.radius)
+        return Weights(
+            gradient=weights[..., :dim] / rho,
+            laplacian=weights[..., dim] / rho[..., 0].square(),
+            radius=self.radius,
+            condition=self.condition,
+            residual=residual,
+            height_residual=none if heights is None else self.scatter(heights, coords),
+            slope=none.long(),
+        )
+
+
+def scaled_system(
+    coords: Float[Tensor, "B neighbors d"],
+    degree: int,
+    keep: Bool[Tensor, "B neighbors"] | None = None,
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Radius ρ of the kept neighbours, the monomials V of y/ρ, and √ω."""
+    distance = coords.norm(dim=-1)
+    radius = (distance if keep is None else distance * keep).amax(-1)
+    root = _root_window(distance / radius[:, None])
+    values = monomials(coords / radius[:, None, None], degree)
+    return radius, values, root if keep is None else root * keep
 
 
 def centered_fit(
@@ -182,17 +226,13 @@ def centered_fit(
     degree: int,
     keep: Bool[Tensor, "B neighbors"] | None = None,
 ) -> CenteredFit:
-    """Polynomials behind `least_squares_weights`, as linear functions of the values.
-
-    Arguments are as there; K − 1 ≥ M − 1. Neighbours outside `keep` have zero coefficients.
+    """Fits of degree m to K − 1 ≥ M − 1 neighbours; those outside `keep` have zero coefficients.
 
     >>> line = torch.tensor([[[-1.0], [1.0]]], dtype=torch.float64)
     >>> centered_fit(line, 2).coefficients.round(decimals=12).tolist()
     [[[-0.5, 0.5], [0.5, 0.5]]]
     """
-    radius, _, values, root = scaled_system(coords, degree, keep)
-    coefficients, _ = left_inverse(values, root)
-    return CenteredFit(coefficients, radius, values, root, degree)
+    return CenteredFit.of(*scaled_system(coords, degree, keep), degree)
 
 
 def cardinal(
@@ -211,12 +251,11 @@ def cardinal(
 def least_squares_weights(
     coords: Float[Tensor, "B neighbors d"],
     degree: int,
-    keep: Bool[Tensor, "B neighbors"] | None = None,
     flux: Float[Tensor, "B K d"] | None = None,
     share: float | Float[Tensor, "B K"] = 0.0,
     heights: Float[Tensor, "B neighbors n"] | None = None,
 ) -> Weights:
-    r"""Centre-constrained moving least squares.
+    r"""Centre-constrained moving least squares, by coordinates of K − 1 ≥ M − 1 neighbours without the centre.
 
     For every functional D among the first derivatives and Δ,
 
@@ -227,36 +266,23 @@ def least_squares_weights(
     The polynomial passes through the centre's value, so that the operator is stable (`method.md`, section 2). Solved by
     `left_inverse` in coordinates scaled by ρ: w = Cᵀb. Without full rank `condition` is large; nothing is raised.
 
-    Parameters
-    ----------
-    coords
-        (B, K − 1, d), ℓ: the neighbours without the centre, K − 1 ≥ M − 1.
-    degree
-        m ≥ 1; Δ needs m ≥ 2.
-    keep
-        (B, K − 1), neighbours that may have a weight; all by default.
-    flux
-        (B, K, d), the conormal at each point of the stencil that lies on a boundary with the datum ∂_ν f + a f = 0
-        (centre first), zero at the others. Each adds an unknown v_b: minimise Σ w²/ω + Σ v²/ω subject to Σ w_j y_j^α +
-        Σ v_b (∂_ν + a) y^α(y_b) = (D y^α)(0), and w_i = −Σ w_j − a Σ v_b (`method.md`, section 6). Only w is returned.
-    share
-        a, 1/ℓ, a number or one per point of the stencil.
-    heights
-        (B, K − 1, n), heights of the neighbours over the tangent plane, ℓ; not together with `flux`.
+    `flux` (centre first) is the conormal at each point on a boundary with the datum ∂_ν f + a f = 0, and zero at the
+    others; `share` is a, 1/ℓ. Each such point adds an unknown v_b: minimise Σ w²/ω + Σ v²/ω subject to Σ w_j y_j^α +
+    Σ v_b (∂_ν + a) y^α(y_b) = (D y^α)(0), and w_i = −Σ w_j − a Σ v_b (`method.md`, section 6). Only w is returned.
+    `heights` over the tangent plane, ℓ, are not for systems with `flux`.
 
     >>> line = torch.tensor([[[-1.0], [1.0]]], dtype=torch.float64)
     >>> least_squares_weights(line, 2).laplacian.round(decimals=12).tolist()
     [[-2.0, 1.0, 1.0]]
     """
-    radius, scaled, values, root = scaled_system(coords, degree)
-    root = root if keep is None else root * keep
-    constant = torch.ones_like(root)
+    radius, values, root = scaled_system(coords, degree)
+    scaled, constant = coords / radius[:, None, None], torch.ones_like(root)
     if flux is not None:
         share = torch.as_tensor(share).to(coords).expand(flux.shape[:2]) * radius[:, None]
         values, constant, root = _with_data(scaled, values, root, flux, share, degree)
+    fit = CenteredFit.of(radius, values, root, degree)
     exact = functionals(coords.shape[-1], degree).to(coords)
-    coefficients, condition = left_inverse(values, root)
-    rows = exact.mT @ coefficients
+    rows = exact.mT @ fit.coefficients
     residual = (rows @ values - exact.mT).abs().amax((1, 2)) / exact.abs().max()
     if flux is not None:
         # The data would hide that points on a line, or in one place, do not determine derivatives across it.
@@ -264,10 +290,7 @@ def least_squares_weights(
         residual = torch.where(spread[:, -1] <= SINGLE * spread[:, 0], torch.inf, residual)
     center = -(constant[..., None] * rows.mT).sum(1, keepdim=True)
     weights = torch.cat([center, rows.mT[:, : coords.shape[1]]], dim=1)
-    left = torch.zeros_like(radius)
-    if heights is not None:
-        left = height_residual(values, coefficients, root, coords, heights)
-    return finish(weights, residual, radius, condition, left, coords.shape[-1])
+    return fit.weights(weights, residual, coords, heights)
 
 
 def _with_data(
@@ -294,38 +317,3 @@ def _with_data(
     weight = torch.cat([torch.ones_like(root[:, :1]), root], dim=1).gather(1, place) * on_boundary
     constant = torch.cat([torch.ones_like(root), share], dim=1)
     return torch.cat([values, data], dim=1), constant, torch.cat([root, weight], dim=1)
-
-
-def positive_weights(
-    coords: Float[Tensor, "B neighbors d"],
-    degree: int,
-    flux: Float[Tensor, "B K d"] | None = None,
-    share: float | Float[Tensor, "B K"] = 0.0,
-    heights: Float[Tensor, "B neighbors n"] | None = None,
-) -> Weights:
-    """Least squares over the neighbours whose weights of Δ are ≥ 0: a consistent row of an M-matrix.
-
-    Neighbours with a negative weight are dropped and the rest is solved again, until none is negative or the rank is
-    lost. This finds a positive stencil nearly wherever one exists (non-negative least squares finds 0–3 % more).
-    Positive weights exist up to degree 3 only, since Σ w |y|⁴ = 0 excludes them beyond. The height residual is that of
-    all neighbours.
-    """
-    keep = torch.ones(coords.shape[:2], dtype=torch.bool)
-    weights = least_squares_weights(coords, degree, None, flux, share, heights)
-    first, rows = weights.height_residual.clone(), torch.arange(len(coords))
-    for _ in range(coords.shape[1]):
-        last = weights[rows]
-        others = last.laplacian[:, 1:]
-        rounding = ROUNDING * others.abs().amax(1, keepdim=True)
-        negative = keep[rows] & (others < -rounding) & (last.residual <= NEGLIGIBLE)[:, None]
-        some = negative.any(1)
-        if not some.any():
-            break
-        rows = rows[some]
-        keep[rows] &= ~negative[some]
-        conormals = None if flux is None else flux[rows]
-        own = share[rows] if isinstance(share, Tensor) else share
-        again = least_squares_weights(coords[rows], degree, keep[rows], conormals, own)
-        for f in fields(Weights):
-            getattr(weights, f.name)[rows] = getattr(again, f.name)
-    return replace(weights, height_residual=first)

@@ -51,28 +51,6 @@ def list_candidates(
     return found
 
 
-def stencil_candidates(
-    dim: int, order: int, weights: str, num_neighbors: int | None, *, on_mesh: bool, triangles: bool
-) -> list[Candidate]:
-    """Candidates for a row of order p: degree p + 1, then the even degrees below, then positive weights of order 1.
-
-    On evenly spread points rows of even order are no better than rows of the odd order below. Rows of order 1 are no
-    better than the triangles of a mesh, and positive ones no better than those of a surface through a cloud: there they
-    are tried only if asked for. Least squares follow any other `weights`.
-
-    >>> [c.degree for c in stencil_candidates(2, 5, "least_squares", 60, on_mesh=False, triangles=False)]
-    [6, 4, 2, 2]
-    """
-    rules = list(dict.fromkeys([weights, "least_squares"]))
-    lowest = 4 if on_mesh else 2
-    degrees = [order + 1, *range(order // 2 * 2, lowest - 1, -2)]
-    positive = [2] if order == 1 or not triangles else []
-    return [
-        *list_candidates(dim, degrees, rules, num_neighbors),
-        *list_candidates(dim, positive, ["positive"], num_neighbors),
-    ]
-
-
 class Search:
     """Search in which every centre tries the candidates in turn until one is accepted.
 

@@ -29,7 +29,6 @@ from torchlb.operator.options import Options
 from torchlb.operator.plan import Parts, Plan, operator_parts, stencils_of
 from torchlb.stencils.assemble import assemble
 from torchlb.stencils.conditions import Condition
-from torchlb.stencils.low_order import MeshLowOrder
 from torchlb.stencils.rows import Reason, Rows, matrix_rows
 from torchlb.stencils.shape import Shape, mesh_shape
 
@@ -152,7 +151,6 @@ def finished(
         )
     points, faces, order, moved = places
     if pair_plan is not None and shape.plan is not None:
-        assert isinstance(shape.low_order, MeshLowOrder)
         planned = None if certificate else stencils.plan(rows), pair_plan, shape.low_order.flips
         of_cells = faces, order, shape.on_mesh, moved
         plan = Plan(numbering, shape.plan, *planned, *of_cells, source, options)
@@ -188,7 +186,7 @@ def build_cotangent(vertices: ArrayLike, faces: ArrayLike) -> Parts:
     corners = mended_faces(vertices, corners)
     _warn_of_long_triangles(vertices, corners)
     matrix, mass = cotangent_laplacian(vertices, corners)
-    shape = mesh_shape(vertices, corners, 0, condition=None, areas=mass)
+    shape = replace(mesh_shape(vertices, corners, 0, condition=None), areas=mass)
     centers = torch.arange(len(vertices))
     rows = matrix_rows(matrix, shape.points, shape.frames, centers)
     row = centers.repeat_interleave(rows.length)

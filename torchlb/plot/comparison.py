@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -14,11 +14,6 @@ from torchlb.operator.laplace_beltrami import LaplaceBeltrami
 from torchlb.plot.figures import LINE_COLORS, MARKERS, plot_orders
 
 SIDES = [(20.0, -55.0), (20.0, 125.0)]
-
-
-def spectra(operators: Mapping[str, LaplaceBeltrami], k: int) -> dict[str, Float[Tensor, " k"]]:
-    """The k smallest eigenvalues of −Δ of each operator, 1/ℓ²."""
-    return {name: lb.eigenbasis(k).eigenvalues.double() for name, lb in operators.items()}
 
 
 def spectrum_table(values: Mapping[str, Float[Tensor, " k"]]) -> str:
@@ -68,24 +63,11 @@ def draw_comparison(
     values: Mapping[str, Float[Tensor, " k"]],
     path: str | Path,
     title: str,
-    view: Sequence[tuple[float, float]] = SIDES,
 ) -> None:
-    """Write a picture (PNG, or the format of the ending): the order that each point reached, and the spectra.
+    """Write a picture (PNG, or the format of the ending): the order that each point reached, and the eigenvalues.
 
-    Parameters
-    ----------
-    lb
-        Operator; for points in more than three dimensions only the spectra are drawn.
-    faces
-        (F, 3), or None for a cloud.
-    values
-        Eigenvalues, from `spectra`.
-    path, title
-        File and title of the picture.
-    view
-        Elevations and azimuths, degrees.
-
-    Raises ImportError without matplotlib, OSError where the file cannot be written.
+    For points in more than three dimensions it has the spectra only. Raises ImportError without matplotlib, OSError
+    where the file cannot be written.
     """
     from matplotlib.figure import Figure  # without pyplot, which would choose a backend
 
@@ -95,6 +77,6 @@ def draw_comparison(
     plot_spectrum(values, axes[0, -1])
     if seen:
         order = lb.report.order.to(torch.int64)
-        plot_orders(lb.points.double(), faces, order, ax=axes[0, 0], view=view)
+        plot_orders(lb.points.double(), faces, order, ax=axes[0, 0], view=SIDES)
     figure.suptitle(title)
     figure.savefig(path, dpi=130)

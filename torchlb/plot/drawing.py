@@ -55,12 +55,12 @@ def cloud_of(points: Any, name: str = "points") -> np.ndarray:
     return np.pad(places, ((0, 0), (0, 3 - places.shape[1])))
 
 
-def mesh_of(vertices: Any, faces: Any) -> tuple[np.ndarray, np.ndarray]:
-    """Vertices (N, 3) and the indices of their triangles (F, 3); ValueError if they are no mesh."""
-    points = _numpy(vertices)
+def shape_of(points: Any, faces: Any) -> tuple[np.ndarray, np.ndarray | None]:
+    """Points as (N, 3), and the indices of their triangles (F, 3), None for a cloud; InputError for what is neither."""
+    points = cloud_of(points)
+    if faces is None:
+        return points, None
     corners = torch.as_tensor(faces).detach().cpu().numpy()
-    if points.ndim != 2 or points.shape[1] != 3:
-        raise InputError(f"vertices: expected (N, 3), got {points.shape}")
     if corners.ndim != 2 or corners.shape[1] != 3 or len(corners) == 0:
         raise InputError(f"faces: expected (F, 3), at least one, got {corners.shape}")
     if corners.min() < 0 or corners.max() >= len(points):
@@ -89,11 +89,9 @@ def color_map(
     from matplotlib import cm, colormaps, colors
 
     finite = values[np.isfinite(values)]
-    if len(finite) == 0:
-        finite = np.zeros(1)
+    finite = finite if len(finite) else np.zeros(1)
     low, high = np.percentile(finite, [1, 99])
-    if symmetric is None:
-        symmetric = bool(low < 0 < high)
+    symmetric = bool(low < 0 < high) if symmetric is None else symmetric
     if symmetric:
         high = max(abs(low), abs(high))
         low = -high
@@ -103,7 +101,7 @@ def color_map(
         low, high = limits
     slack = 0.02 * (high - low)  # point an end only where values are cut off
     beyond = finite.min() < low - slack, finite.max() > high + slack
-    extend = {(0, 0): "neither", (1, 0): "min", (0, 1): "max", (1, 1): "both"}[beyond]
+    extend = ("neither", "min", "max", "both")[beyond[0] + 2 * beyond[1]]
     table = colormaps[cmap or (diverging if symmetric else "viridis")].with_extremes(bad=MISSING)
     return cm.ScalarMappable(colors.Normalize(low, high), table), extend
 
@@ -142,12 +140,25 @@ def _stacked(points: np.ndarray, view: Views) -> Iterator[tuple[np.ndarray, Eye]
 def paint(
     ax: Any,
     points: np.ndarray,
-    faces: np.ndarray,
+    faces: np.ndarray | None,
     colors: np.ndarray,
     view: Views,
     isolines: tuple[np.ndarray, np.ndarray] | None = None,
+    size: float | None = None,
 ) -> None:
-    """Draw shaded triangles, and segments on them as `isolines_of` returns them, back to front."""
+    """Draw a surface in the colours of its triangles, or a cloud in those of its points, from back to front.
+
+    Triangles are shaded, with segments on them by `isolines_of`; points are disks of the area `size`, paler with
+    distance.
+    """
+    if faces is None:
+        area = float(np.clip(60000 / len(points), 2, 60)) if size is None else size
+        for flat, _ in _stacked(points, view):
+            order = flat[:, 2].argsort()
+            x, y = flat[order, :2].T
+            pale = _faded(colors, flat)[order]
+            ax.scatter(x, y, s=area, c=pale, linewidths=0, rasterized=True)
+        return
     from matplotlib.collections import PolyCollection
 
     light = np.array(LIGHT) / np.linalg.norm(LIGHT)
@@ -200,18 +211,6 @@ def _faded(colors: np.ndarray, flat: np.ndarray) -> np.ndarray:
     pale = colors.copy()
     pale[:, :3] += (1 - pale[:, :3]) * 0.5 * depth[:, None]
     return pale
-
-
-def draw_dots(
-    ax: Any, points: np.ndarray, colors: np.ndarray, view: Views, size: float | None
-) -> None:
-    """Draw a disk for each point, back to front, paler with distance."""
-    area = float(np.clip(60000 / len(points), 2, 60)) if size is None else size
-    for flat, _ in _stacked(points, view):
-        order = flat[:, 2].argsort()
-        x, y = flat[order, :2].T
-        pale = _faded(colors, flat)[order]
-        ax.scatter(x, y, s=area, c=pale, linewidths=0, rasterized=True)
 
 
 def _evenly_spread(points: np.ndarray, count: int) -> tuple[np.ndarray, float]:

@@ -23,12 +23,11 @@ from torchlb.plot.drawing import (
     cloud_of,
     color_map,
     draw_arrows,
-    draw_dots,
     finish,
     isolines_of,
-    mesh_of,
     paint,
     plain,
+    shape_of,
     values_of,
 )
 
@@ -90,9 +89,10 @@ def plot_surface(
     Returns the axes. Raises ValueError for values or faces that do not fit the vertices.
     """
     ax = axes_of(ax)
-    points, corners = mesh_of(vertices, faces)
+    points, corners = shape_of(vertices, faces)
     numbers = values_of(values, points)
     shades, extend = color_map(numbers, cmap, symmetric, limits)
+    assert corners is not None
     isolines = isolines_of(numbers, corners, levels) if len(levels) else None
     paint(ax, points, corners, shades.to_rgba(numbers[corners].mean(axis=1)), view, isolines)
     return finish(ax, title, shades, extend, label)
@@ -131,7 +131,7 @@ def plot_points(
     numbers = values_of(values, places)
     # The middle of "coolwarm" is not white.
     shades, extend = color_map(numbers, cmap, symmetric, limits, "coolwarm")
-    draw_dots(ax, places, shades.to_rgba(numbers), view, size)
+    paint(ax, places, None, shades.to_rgba(numbers), view, size=size)
     return finish(ax, title, shades, extend, label)
 
 
@@ -172,16 +172,15 @@ def plot_vectors(
     Returns the axes. Raises ValueError for vectors, values or faces that do not fit the vertices.
     """
     ax = axes_of(ax)
-    places, field = cloud_of(vertices), cloud_of(vectors, "vectors")
+    (places, corners), field = shape_of(vertices, faces), cloud_of(vectors, "vectors")
     if field.shape != places.shape:
         raise InputError(f"vectors: expected {places.shape}, one a point, got {field.shape}")
-    corners = None if faces is None else mesh_of(places, faces)[1]
     lengths = np.linalg.norm(field, axis=1)
     numbers = lengths if values is None else values_of(values, places)
     shades, extend = color_map(numbers, cmap, symmetric, limits)
     painted = numbers if corners is None else numbers[corners].mean(axis=1)  # by dot or triangle
     ground = plain(PALE, len(painted)) if values is None else shades.to_rgba(painted)
-    _fill(ax, places, corners, ground, view)
+    paint(ax, places, corners, ground, view)
     inks = shades.to_rgba(lengths) if values is None else plain(INK, len(places))
     draw_arrows(ax, places, corners, field, inks, view, count)
     return finish(ax, title, shades, extend, label)
@@ -217,11 +216,10 @@ def plot_orders(
 
     palette = colors.to_rgba_array(ORDER_COLORS)
     last = len(palette) - 1
-    places = cloud_of(vertices)
+    places, corners = shape_of(vertices, faces)
     reached = values_of(order, places).astype(int)
-    corners = None if faces is None else mesh_of(vertices, faces)[1]
     shown = reached if corners is None else reached[corners].min(axis=1)  # by dot or triangle
-    _fill(ax, places, corners, palette[shown.clip(0, last)], view)
+    paint(ax, places, corners, palette[shown.clip(0, last)], view)
     handles = []
     for p, count in reversed(list(enumerate(np.bincount(reached)))):
         if count:
@@ -229,16 +227,6 @@ def plot_orders(
             handles.append(Patch(facecolor=palette[min(p, last)], edgecolor="0.6", label=label))
     ax.legend(handles=handles, loc="center left", bbox_to_anchor=(1.0, 0.5), frameon=False)
     return finish(ax, title)
-
-
-def _fill(
-    ax: Any, points: np.ndarray, faces: np.ndarray | None, colors: np.ndarray, view: Views
-) -> None:
-    """Draw a surface in the colours of its triangles, or a cloud in those of its points."""
-    if faces is None:
-        draw_dots(ax, points, colors, view, None)
-    else:
-        paint(ax, points, faces, colors, view)
 
 
 def plot_convergence(

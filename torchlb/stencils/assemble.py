@@ -1,9 +1,9 @@
 """From a shape to the rows of a sparse operator: every point takes the first candidate that passes.
 
-The candidates of a point at order p (`method.md`, section 4): least-squares (or polyharmonic) stencils of degree p + 1
-with K = 1.6, 2, …, 10 times as many points as polynomials; then the same at every odd order below; then positive
-weights of order 1; then the low-order row. On a mesh the low-order row is better than order 1, which is tried there
-only on request. The candidate of each point, and the reason for no better one, are part of the result.
+The candidates of a point at order p (`method.md`, section 4): stencils of degree p + 1, then of every even degree
+below, with K = 1.6, 2, …, 10 times as many points as polynomials; then the low-order row. On a mesh the low-order row
+is better than degree 2, which is tried there only at order 1. The candidate of each point, and the reason for no better
+one, are part of the result.
 """
 
 from __future__ import annotations
@@ -18,14 +18,12 @@ from tqdm import tqdm
 
 from torchlb.errors import StencilError, first_few
 from torchlb.fits.polynomials import num_monomials
-from torchlb.fits.rules import WEIGHT_RULES
-from torchlb.fits.weights import Weights, least_squares_weights, positive_weights
-from torchlb.geometry.candidates import Candidate, Search, list_candidates, stencil_candidates
+from torchlb.fits.rules import SIZE_FACTORS, WEIGHT_RULES, reference
+from torchlb.fits.weights import Weights, least_squares_weights
+from torchlb.geometry.candidates import Candidate, Search, list_candidates
 from torchlb.geometry.frames import local_heights, local_offsets
 from torchlb.geometry.thresholds import FACTOR
 from torchlb.linalg.precision import AT_ONCE, NEGLIGIBLE, rows_at_once
-from torchlb.stencils.acceptance import Acceptance
-from torchlb.stencils.low_order import MeshLowOrder
 from torchlb.stencils.rows import (
     Reason,
     Rows,
@@ -37,10 +35,30 @@ from torchlb.stencils.rows import (
 from torchlb.stencils.shape import Shape
 
 RULES = list(WEIGHT_RULES)
+RESOLVED_ON_MESH, RESOLVED_ON_CLOUD = 1.8, 4.1
+"""Largest height residual of a stencil times the growth g∞, which turns it into an error of Δ. The bound is lower on a
+mesh, whose triangles follow a surface that its points do not resolve better than a fit; along normals half of it."""
+RESOLVING_DEGREE = 4
+"""Degree up to which the bound stays constant: the residual of a low degree does not justify the next rows."""
 GRADIENT_GROWTH = 30.0
 """Largest ρ Σ|w| of a first derivative beside a boundary; well-placed points have 5 to 15."""
 Gradients = tuple[Int[Tensor, " b"], Int[Tensor, "b K"], Float[Tensor, "b K d"], int]
 """Gradients of some rows: (positions of the rows, points, weights in the frames, degree of the fit)."""
+
+
+def stencil_candidates(
+    dim: int, order: int, weights: str, num_neighbors: int | None, *, on_mesh: bool
+) -> list[Candidate]:
+    """Candidates for a row of order p: degree p + 1, then the even degrees below; least squares after other `weights`.
+
+    On evenly spread points rows of even order are no better than rows of the odd order below.
+
+    >>> [c.degree for c in stencil_candidates(2, 5, "least_squares", 60, on_mesh=False)]
+    [6, 4, 2]
+    """
+    degrees = [order + 1, *range(order // 2 * 2, 3 if on_mesh else 1, -2)]
+    rules = list(dict.fromkeys([weights, "least_squares"]))
+    return list_candidates(dim, degrees, rules, num_neighbors)
 
 
 class Stencils:
@@ -59,147 +77,166 @@ class Stencils:
         weights: str = "least_squares",
         num_neighbors: int | None = None,
     ) -> None:
-        dim, on_mesh = shape.frames.shape[-1], shape.on_mesh
         self.shape, self.order, self.projection = shape, order, projection
         self.num_neighbors, self.placed = num_neighbors, (shape.points, shape.frames)
-        triangles = isinstance(shape.low_order, MeshLowOrder)
+        self.dim = shape.frames.shape[-1]
         self.candidates = stencil_candidates(
-            dim, order, weights, num_neighbors, on_mesh=on_mesh, triangles=triangles
+            self.dim, order, weights, num_neighbors, on_mesh=shape.on_mesh
         )
-        self.acceptance = Acceptance(dim, on_mesh, projection)
         share, boundary = shape.condition.share, shape.boundary
         self.share = None if share is None or boundary is None else share * boundary.folds
 
     def rows(self, centers: Int[Tensor, " B"], start: Int[Tensor, " B"] | None = None) -> Rows:
         """Rows of `centers`, each by the first candidate (from `start` on) that passes, else the low-order row."""
-        blocks, taken = [], []
+        blocks, left = [], torch.ones(len(centers), dtype=torch.bool)
         reason = torch.full_like(centers, Reason.FEW)  # until something is tried
         assert self.shape.neighborhoods is not None
         search = Search(self.shape.neighborhoods, centers, self.candidates, start)
         for number, tried, index in search:
-            candidate = self.candidates[number]
-            holds = self._holds_boundary(index)
+            candidate, touching = self.candidates[number], self._touching(index)
             if candidate.degree > 2 and candidate.factor > FACTOR:  # too wide beside a boundary
-                tried, index, holds = tried[~holds], index[~holds], holds[~holds]
+                tried, index, touching = tried[~touching], index[~touching], touching[~touching]
                 if len(tried) == 0:
                     continue
-            with_data = holds & (self.share is not None)
-            weights = self._weights(index, candidate, with_data)
-            failure, rejected = self.acceptance.judge(weights, candidate, holds)
-            if candidate.degree == self.order + 1 and candidate.rule != "positive":
+            weights = self._weights(index, candidate, touching)
+            failure, rejected = self.judge(weights, candidate, touching)
+            if candidate.degree == self.order + 1:
                 reason[tried] = failure
             passed = failure == 0
             search.reject_degree(tried[rejected], number)
             search.settle(tried[passed])
-            splines = candidate.rule == "polyharmonic"
-            rule = torch.full_like(tried, RULES.index(candidate.rule))
-            rule[with_data & splines] = RULES.index("least_squares")
-            parts = index[passed], weights[passed], number, candidate.degree - 1, rule[passed]
-            blocks.append(stencil_rows(*self.placed, *parts))
-            taken.append(tried[passed])
-        left = torch.ones(len(centers), dtype=torch.bool)
-        left[torch.cat([*taken, torch.empty(0, dtype=torch.int64)])] = False
+            left[tried[passed]] = False
+            block = self._stencil_rows(index[passed], weights[passed], number, touching[passed])
+            blocks.append((tried[passed], block))
         if left.any():
             low, why = centers[left], reason[left]
             fitted = ((why == Reason.RATIO) | (why == Reason.GROWTH)).nonzero()[:, 0]
-            blocks.append(self._low_order_rows(low, self._gradients(low, fitted)))
-            taken.append(left.nonzero()[:, 0])
-            self._check(low, blocks[-1])
-        rows = self._finished(centers, blocks, taken)
+            rows = self._low_order_rows(low, self._gradients(low, fitted))
+            bad = low[~rows.off_diagonal_ratio.isfinite()]
+            if len(bad):
+                raise StencilError(
+                    f"{len(bad)} points have neither a stencil after {len(self.candidates)} tries nor a low-order row: "
+                    f"{first_few(bad)}. Nothing compatible lies around them; remove them, or merge them with their "
+                    "neighbours"
+                )
+            blocks.append((left.nonzero()[:, 0], rows))
+        rows = self._finished(centers, blocks)
         return replace(rows, reason=torch.where(rows.order < self.order, reason, rows.reason))
-
-    def _finished(
-        self, centers: Int[Tensor, " B"], blocks: list[Rows], taken: list[Int[Tensor, " _"]]
-    ) -> Rows:
-        """Rows of `centers`, from blocks at the positions `taken`, with the effect of the boundary condition."""
-        rows, shape = Rows.stack(blocks)[torch.cat(taken).argsort()], self.shape
-        if shape.boundary is None:
-            return rows
-        return shape.condition.finish(shape.points, shape.areas, shape.boundary, centers, rows)
-
-    def _holds_boundary(self, index: Int[Tensor, "B K"]) -> Bool[Tensor, " B"]:
-        if self.shape.boundary is None:
-            return torch.zeros(len(index), dtype=torch.bool)
-        return self.shape.boundary.mask[index].any(1)
 
     def plan(self, rows: Rows) -> RowsPlan:
         """Plan of all rows."""
-        row = torch.arange(len(rows.length)).repeat_interleave(rows.length)
         own = (rows.candidate == len(self.candidates)) & (rows.slope > 0)
-        slope = (rows.gradient != 0).any(1)
-        # Dirichlet's condition removes weights of Δ; beside Neumann data ∇ is fitted to all points.
-        weights = slope if self.share is None else rows.laplacian != 0
-        positive = rows.rule == RULES.index("positive")
-        used = (~positive[row] | weights) & (~own[row] | slope)
-        kinds = rows.candidate, rows.rule, rows.slope, rows.reason
+        used = own.repeat_interleave(rows.length) & (rows.gradient != 0).any(1)
+        kinds = rows.candidate, rows.slope, rows.reason
         return RowsPlan(rows.length, rows.col.int(), *kinds, used)
 
     def evaluated(self, plan: RowsPlan) -> Rows:
         """Evaluate the planned rows of all points."""
-        every, blocks, taken = torch.arange(len(plan.length)), [], []
-        start = plan.length.cumsum(0) - plan.length
+        every, blocks = torch.arange(len(plan.length)), []
         for number, candidate in enumerate(self.candidates):
             rows = every[plan.candidate == number]
-            entry = candidate.size * num_monomials(self.shape.frames.shape[2], candidate.degree)
+            entry = candidate.size * num_monomials(self.dim, candidate.degree)
             for centers in rows.split(rows_at_once(entry)) if len(rows) else ():
-                places = start[centers, None] + torch.arange(int(plan.length[centers[0]]))
-                places = places.gather(1, _own_first(plan.col[places], centers))
-                index, used = plan.col[places].long(), plan.used[places][:, 1:]
-                with_data = self._holds_boundary(index) & (self.share is not None)
-                keep, slope = None if used.all() else used, plan.slope[centers]
-                weights = self._weights(index, candidate, with_data, keep, slope)
-                parts = index, weights, number, candidate.degree - 1, plan.rule[centers]
-                blocks.append(stencil_rows(*self.placed, *parts))
-                taken.append(centers)
+                places = plan.crow[centers, None] + torch.arange(candidate.size)
+                index = _own_first(plan.col[places].long(), centers)
+                touching, slope = self._touching(index), plan.slope[centers]
+                weights = self._weights(index, candidate, touching, slope)
+                blocks.append((centers, self._stencil_rows(index, weights, number, touching)))
         low = every[plan.candidate == len(self.candidates)]
         if len(low):
-            blocks.append(self._low_order_rows(low, self._planned_gradients(low, plan)))
-            taken.append(low)
-        rows = self._finished(every, blocks, taken)
+            blocks.append((low, self._low_order_rows(low, self._planned_gradients(low, plan))))
+        rows = self._finished(every, blocks)
         rows = rows.on_pattern(plan) if len(low) else rows
         return replace(rows, reason=plan.reason)
+
+    def _finished(
+        self, centers: Int[Tensor, " B"], blocks: list[tuple[Int[Tensor, " _"], Rows]]
+    ) -> Rows:
+        """Rows of `centers`, from (positions, rows) in any order, with the effect of the boundary condition."""
+        taken, parts = zip(*blocks, strict=True)
+        rows, shape = Rows.stack(parts)[torch.cat(taken).argsort()], self.shape
+        if shape.boundary is None:
+            return rows
+        return shape.condition.finish(shape.points, shape.areas, shape.boundary, centers, rows)
+
+    def _touching(self, index: Int[Tensor, "B K"]) -> Bool[Tensor, " B"]:
+        """Whether stencils have boundary points."""
+        if self.shape.boundary is None:
+            return torch.zeros(len(index), dtype=torch.bool)
+        return self.shape.boundary.mask[index].any(1)
+
+    def judge(
+        self, weights: Weights, candidate: Candidate, touching: Bool[Tensor, " B"]
+    ) -> tuple[Int[Tensor, " B"], Bool[Tensor, " B"]]:
+        """Return the first test that each stencil fails, a `Reason`, and whether to reject its whole degree."""
+        inside = reference(self.dim, candidate.degree, candidate.rule)
+        edge = reference(self.dim, candidate.degree, one_sided=True) if touching.any() else inside
+        # at a boundary relative to the one-sided reference, or to the bound inside, since corners have more
+        at_edge = FACTOR * max(edge.growth, FACTOR * inside.growth)
+        max_growth = torch.where(touching, at_edge, FACTOR * inside.growth)
+        max_ratio = FACTOR * torch.where(touching, edge.off_diagonal_ratio, 1.0)
+        bound, loosest = self._resolved(candidate)
+        center, others = weights.laplacian[:, 0], weights.laplacian[:, 1:].abs().sum(1)
+        determined = weights.residual <= NEGLIGIBLE  # false for NaN
+        failure = torch.zeros(len(center), dtype=torch.int64)
+        for reason, passed in (
+            (Reason.MOMENTS, determined),
+            (Reason.UNRESOLVED, weights.height_residual <= bound),
+            (Reason.RATIO, others <= -max_ratio * center),
+            (Reason.GROWTH, weights.radius.square() * (others + center.abs()) <= max_growth),
+        ):
+            failure = torch.where((failure == 0) & ~passed, reason, failure)
+        return failure, determined & (weights.height_residual > loosest)
+
+    def _resolved(self, candidate: Candidate) -> tuple[float, float]:
+        """Bounds on the height residual: for this candidate, and for every candidate of its degree.
+
+        On a mesh the bound shrinks with the number of points beyond 3 per polynomial: a fit to folds does not improve
+        over more of them. On a cloud, noise may shrink by the ratio of the widest stencil to the first; a size fixed by
+        the user cannot widen.
+        """
+        growth = max(reference(self.dim, m).growth for m in (candidate.degree, RESOLVING_DEGREE))
+        if self.shape.on_mesh:
+            bound = RESOLVED_ON_MESH / (1 + (self.projection == "normal")) / growth
+            return bound * FACTOR / max(candidate.factor, FACTOR), bound
+        bound = RESOLVED_ON_CLOUD / growth
+        factors = SIZE_FACTORS["least_squares"]
+        widest = bound * (factors[-1] / factors[0]) ** (1 / self.dim)
+        return (bound if candidate.factor else widest), widest
 
     def _weights(
         self,
         index: Int[Tensor, "B K"],
         candidate: Candidate,
-        with_data: Bool[Tensor, " B"],
-        keep: Bool[Tensor, "B neighbors"] | None = None,
+        touching: Bool[Tensor, " B"],
         slope: Int[Tensor, " B"] | None = None,
     ) -> Weights:
-        """Weights of a batch, with boundary data where `with_data` is set.
+        """Weights of a batch, where it is `touching` with boundary data, if the condition has some.
 
-        For planned rows, positive weights are restricted to the neighbours `keep`, gradients beside data have the
-        degree `slope`, and height residuals are not computed.
+        For planned rows, gradients beside data have the degree `slope`, and height residuals are not computed.
         """
-        parts, order = [], []
-        for data, rows in ((False, ~with_data), (True, with_data)):
-            if rows.any():
-                options = [None if x is None else x[rows] for x in (keep, slope)]
-                fit = self._weights_with_data if data else self._free_weights
-                parts.append(fit(index[rows], candidate, *options))
-                order.append(rows.nonzero()[:, 0])
-        return Weights.stack(parts)[torch.cat(order).argsort()] if len(parts) > 1 else parts[0]
+        data = touching & (self.share is not None)
+        if not data.any():
+            return self._free_weights(index, candidate, slope is None)
+        beside = self._weights_with_data(
+            index[data], candidate, None if slope is None else slope[data]
+        )
+        if data.all():
+            return beside
+        free = self._free_weights(index[~data], candidate, slope is None)
+        order = torch.cat([x.nonzero()[:, 0] for x in (data, ~data)]).argsort()
+        return Weights.stack([beside, free])[order]
 
     def _free_weights(
-        self,
-        index: Int[Tensor, "B K"],
-        candidate: Candidate,
-        keep: Bool[Tensor, "B neighbors"] | None = None,
-        slope: Int[Tensor, " B"] | None = None,
+        self, index: Int[Tensor, "B K"], candidate: Candidate, judged: bool = True
     ) -> Weights:
+        """Weights without boundary data, with residuals of heights if they are to be `judged`."""
         coords = local_offsets(*self.placed, index, self.projection)
-        heights = self._heights(index, coords) if slope is None else None
-        if keep is not None:
-            return least_squares_weights(coords, candidate.degree, keep, heights=heights)
+        heights = self._heights(index, coords) if judged else None
         return WEIGHT_RULES[candidate.rule](coords, candidate.degree, heights=heights)
 
     def _weights_with_data(
-        self,
-        index: Int[Tensor, "B K"],
-        candidate: Candidate,
-        keep: Bool[Tensor, "B neighbors"] | None = None,
-        slope: Int[Tensor, " B"] | None = None,
+        self, index: Int[Tensor, "B K"], candidate: Candidate, slope: Int[Tensor, " B"] | None
     ) -> Weights:
         """Δ by a fit with the boundary data; first derivatives by one without, valid for every f.
 
@@ -212,10 +249,7 @@ class Stencils:
         assert share is not None
         coords = local_offsets(*self.placed, index, "tangent")
         flux = boundary.conormals[index] @ self.shape.frames[index[:, 0]]
-        if candidate.rule == "positive" and keep is None:
-            weights = positive_weights(coords, degree, flux=flux, share=share[index])
-        else:
-            weights = least_squares_weights(coords, degree, keep, flux, share[index])
+        weights = least_squares_weights(coords, degree, flux, share[index])
         heights = self._heights(index, coords) if slope is None else None
         free = part = least_squares_weights(coords, degree, heights=heights)
         gradient, left = free.gradient.clone(), torch.arange(len(index))
@@ -242,14 +276,25 @@ class Stencils:
             coords = local_offsets(*self.placed, index, "tangent")
         return local_heights(*self.placed, index, coords)
 
+    def _stencil_rows(
+        self,
+        index: Int[Tensor, "B K"],
+        weights: Weights,
+        number: int,
+        touching: Bool[Tensor, " B"],
+    ) -> Rows:
+        """Rows of stencils of the candidate `number`."""
+        candidate = self.candidates[number]
+        rule = torch.full_like(index[:, 0], RULES.index(candidate.rule))
+        rule[touching & (self.share is not None)] = RULES.index("least_squares")
+        return stencil_rows(*self.placed, index, weights, number, candidate.degree - 1, rule)
+
     def _low_order_rows(self, centers: Int[Tensor, " B"], gradients: Iterable[Gradients]) -> Rows:
         """Low-order rows, some of them with the gradients of fits."""
-        assert self.shape.low_order is not None
-        matrix = self.shape.low_order.rows(centers)
-        rows = matrix_rows(matrix, *self.placed, centers)
+        low = self.shape.low_order
+        rows = matrix_rows(low.rows(centers), *self.placed, centers)
         if self.shape.points.requires_grad:
-            row = centers.repeat_interleave(rows.length)
-            rows = replace(rows, laplacian=self.shape.low_order.entries(row, rows.col))
+            rows = replace(rows, laplacian=low.entries(centers[rows.row], rows.col))
         rows = replace(rows, candidate=torch.full_like(centers, len(self.candidates)))
         found = list(gradients)
         if not found:
@@ -261,16 +306,6 @@ class Stencils:
         gradient = torch.cat([gradient.flatten(0, 1) for *_, gradient, _ in found])
         return rows.with_gradient(torch.cat(local), index, gradient)
 
-    def _check(self, centers: Int[Tensor, " B"], rows: Rows) -> None:
-        """Raise StencilError for low-order rows without a centre."""
-        bad = centers[~rows.off_diagonal_ratio.isfinite()]
-        if len(bad):
-            raise StencilError(
-                f"{len(bad)} points have neither a stencil after {len(self.candidates)} tries nor a low-order row: "
-                f"{first_few(bad)}. Nothing compatible lies around them; remove them, or merge them with their "
-                "neighbours"
-            )
-
     def _gradients(
         self, centers: Int[Tensor, " B"], fitted: Int[Tensor, " b"]
     ) -> Iterator[Gradients]:
@@ -278,14 +313,14 @@ class Stencils:
 
         At degree 1 the low-order row is as good.
         """
-        dim, degrees = self.shape.frames.shape[-1], range(self.order + 1, 1, -1)
-        candidates = list_candidates(dim, degrees, num_neighbors=self.num_neighbors)
+        degrees = range(self.order + 1, 1, -1)
+        candidates = list_candidates(self.dim, degrees, num_neighbors=self.num_neighbors)
         candidates = [c for c in candidates if c.factor <= FACTOR]
         assert self.shape.neighborhoods is not None
         search = Search(self.shape.neighborhoods, centers[fitted], candidates)
         for number, tried, index in search:
             weights, candidate = self._free_weights(index, candidates[number]), candidates[number]
-            bound, _ = self.acceptance.resolved(candidate)
+            bound, _ = self._resolved(candidate)
             passed = _good_slope(weights) & (weights.height_residual <= bound)
             search.settle(tried[passed])
             if passed.any():
@@ -295,17 +330,13 @@ class Stencils:
 
     def _planned_gradients(self, centers: Int[Tensor, " B"], plan: RowsPlan) -> Iterator[Gradients]:
         """Yield the planned gradients of low-order rows."""
-        length = plan.length[centers]
-        start = (plan.length.cumsum(0) - plan.length)[centers]
-        row = torch.arange(len(centers)).repeat_interleave(length)
-        entry = start[row] + torch.arange(len(row)) - (length.cumsum(0) - length)[row]
-        entry, row = entry[plan.used[entry]], row[plan.used[entry]]
-        size, slope = torch.bincount(row, minlength=len(centers)), plan.slope[centers]
+        row, col, slope = plan.row[plan.used], plan.col[plan.used].long(), plan.slope[centers]
+        size = torch.bincount(row, minlength=len(plan.length))[centers]
         for degree, count in torch.stack([slope, size], 1)[slope > 0].unique(dim=0).tolist():
             local = ((slope == degree) & (size == count)).nonzero()[:, 0]
-            index = plan.col[entry[torch.isin(row, local)]].long().view(-1, count)
-            index = index.gather(1, _own_first(index, centers[local]))
-            weights = self._free_weights(index, Candidate(degree, count, RULES[0]))
+            index = col[torch.isin(row, centers[local])].view(-1, count)
+            index = _own_first(index, centers[local])
+            weights = self._free_weights(index, Candidate(degree, count, RULES[0]), judged=False)
             yield local, index, tangent_weights(*self.placed, index, weights.gradient), degree
 
 
@@ -315,17 +346,17 @@ def _good_slope(weights: Weights) -> Bool[Tensor, " B"]:
     return (weights.residual <= NEGLIGIBLE) & (growth <= GRADIENT_GROWTH)
 
 
+def _own_first(index: Int[Tensor, "B K"], centers: Int[Tensor, " B"]) -> Int[Tensor, "B K"]:
+    """Columns of each row, reordered to begin with its own point."""
+    others = index != centers[:, None]
+    return index.gather(1, others.byte().argsort(dim=1, stable=True))
+
+
 def assemble(stencils: Stencils, *, progress: bool = True) -> Rows:
     """Rows of all points, in chunks.
 
     Memory beyond the result is about 0.1 GB for any N (`precision.BYTES`); the result takes 16 + 8 d bytes an entry.
     """
-    shape = stencils.shape
-    parts = torch.arange(len(shape.points)).split(AT_ONCE)
+    parts = torch.arange(len(stencils.shape.points)).split(AT_ONCE)
     bar = tqdm(parts, "stencils", delay=2, disable=not progress, leave=False)
     return Rows.stack(stencils.rows(centers) for centers in bar)
-
-
-def _own_first(index: Int[Tensor, "B K"], centers: Int[Tensor, " B"]) -> Int[Tensor, "B K"]:
-    """Columns of each row, reordered to begin with its own point."""
-    return (index == centers[:, None]).byte().argsort(dim=1, descending=True, stable=True)

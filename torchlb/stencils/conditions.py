@@ -87,8 +87,7 @@ class Condition:
         if self.share is None or self.conserves:
             return rows
         lost = self.share * boundary.sizes / areas
-        local = torch.arange(len(centers)).repeat_interleave(rows.length)
-        own = (centers[local] == rows.col) & (rows.order == 0)[local]
+        own = (centers[rows.row] == rows.col) & (rows.order == 0)[rows.row]
         return replace(rows, laplacian=rows.laplacian - torch.where(own, lost[rows.col], 0.0))
 
 
@@ -123,8 +122,7 @@ class Dirichlet(Condition):
     ) -> Rows:
         """Decouple the rows from the boundary."""
         mask, dim = boundary.mask, rows.gradient.shape[1]
-        local = torch.arange(len(centers)).repeat_interleave(rows.length)
-        row, col = centers[local], rows.col
+        local, row, col = rows.row, centers[rows.row], rows.col
         square = (points[col] - points[row]).square().sum(1)
         farthest = square.new_zeros(len(centers)).scatter_reduce(0, local, square, "amax")
         square = torch.where(row == col, torch.inf, square)

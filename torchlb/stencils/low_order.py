@@ -62,10 +62,24 @@ class MeshLowOrder:
 
     @cached_property
     def _elements(self) -> tuple[sparse.csr_array, Float[Tensor, " N"], list[Tensor]]:
-        """Stiffness, lumped mass, and flips."""
+        """Rows of Δ, lumped masses, none of them zero, and flips."""
         cells, blocks, flips = self._blocks()
         pair = summed(blocks.detach(), cells, len(self.points))
-        return pair.real, torch.from_numpy(pair.imag.sum(axis=1)), flips
+        mass = torch.from_numpy(pair.imag.sum(axis=1))
+        least = ROUNDING * mass.mean()
+        tiny = (mass < least).nonzero()[:, 0]
+        if len(tiny):
+            warn(
+                f"{len(tiny)} points ({first_few(tiny)}) have next to no area, their triangles are degenerate; "
+                f"{ROUNDING:.0e} of the mean is taken, so that rows stay finite"
+            )
+        mass = mass.clamp_min(least)
+        strong = -sparse.diags_array(1 / mass.numpy()) @ pair.real
+        return with_diagonal(sparse.csr_array(strong)), mass, flips
+
+    def rows(self, centers: Int[Tensor, " B"]) -> sparse.csr_array:
+        """Rows (B, N) of Δ, 1/ℓ²."""
+        return sparse.csr_array(self._elements[0][centers.numpy()])
 
     def entries(self, row: Int[Tensor, " e"], col: Int[Tensor, " e"]) -> Float[Tensor, " e"]:
         """Entries of Δ, 1/ℓ², differentiable in the points."""
@@ -94,26 +108,4 @@ class MeshLowOrder:
         square = lengths.amax(1).square().repeat_interleave(corners)
         longest = torch.zeros_like(shares).scatter_reduce(0, cells.flatten(), square, "amax")
         sound = corners != 3 or (shares > ROUNDING * longest).all()
-        return shares if sound else self._masses
-
-    @cached_property
-    def _masses(self) -> Float[Tensor, " N"]:
-        """Lumped masses of the triangulation, none of them zero."""
-        mass = self._elements[1]
-        least = ROUNDING * mass.mean()
-        tiny = (mass < least).nonzero()[:, 0]
-        if len(tiny):
-            warn(
-                f"{len(tiny)} points ({first_few(tiny)}) have next to no area, their triangles are degenerate; "
-                f"{ROUNDING:.0e} of the mean is taken, so that rows stay finite"
-            )
-        return mass.clamp_min(least)
-
-    def rows(self, centers: Int[Tensor, " B"]) -> sparse.csr_array:
-        """Rows (B, N) of Δ, 1/ℓ²."""
-        return sparse.csr_array(self._matrix[centers.numpy()])
-
-    @cached_property
-    def _matrix(self) -> sparse.csr_array:
-        strong = -sparse.diags_array(1 / self._masses.numpy()) @ self._elements[0]
-        return with_diagonal(sparse.csr_array(strong))
+        return shares if sound else self._elements[1]

@@ -41,8 +41,8 @@ class Reason(IntEnum):
 
 
 @dataclass(frozen=True)
-class Rows:
-    """Consecutive rows of the operator in CSR, with a record of each stencil.
+class Pattern:
+    """Which columns consecutive rows of a sparse matrix have.
 
     Attributes
     ----------
@@ -50,14 +50,32 @@ class Rows:
         (B,), number of entries of each row.
     col
         (nnz,), columns, ascending within a row.
-    laplacian
-        (nnz,), 1/ℓ².
-    gradient
-        (nnz, d), 1/ℓ, in the frame of the row's point.
-    candidate
-        (B,), index into the list of candidates; its length for a low-order row.
-    rule
-        (B,), index into `WEIGHT_RULES`; its length for a low-order row.
+    """
+
+    length: Int[Tensor, " B"]
+    col: Int[Tensor, " nnz"]
+
+    @property
+    def crow(self) -> Int[Tensor, " B_plus_1"]:
+        """Row pointers."""
+        return torch.cat([self.length.new_zeros(1), self.length.cumsum(0)])
+
+    @property
+    def row(self) -> Int[Tensor, " nnz"]:
+        """Position of the row of each entry."""
+        return torch.arange(len(self.length)).repeat_interleave(self.length)
+
+
+@dataclass(frozen=True)
+class Rows(Pattern):
+    """Consecutive rows of the operator in CSR, with a record of each stencil.
+
+    Attributes
+    ----------
+    laplacian, gradient
+        (nnz,), 1/ℓ²; (nnz, d), 1/ℓ, in the frame of the row's point.
+    candidate, rule
+        (B,), index into the list of candidates, and into `WEIGHT_RULES`; their lengths for a low-order row.
     order
         (B,), order of accuracy p; 0 for a low-order row.
     growth
@@ -72,8 +90,6 @@ class Rows:
         (B,), a `Reason`.
     """
 
-    length: Int[Tensor, " B"]
-    col: Int[Tensor, " nnz"]
     laplacian: Float[Tensor, " nnz"]
     gradient: Float[Tensor, "nnz d"]
     candidate: Int[Tensor, " B"]
@@ -85,36 +101,30 @@ class Rows:
     slope: Int[Tensor, " B"]
     reason: Int[Tensor, " B"]
 
-    @property
-    def crow(self) -> Int[Tensor, " B_plus_1"]:
-        """Row pointers."""
-        return torch.cat([self.length.new_zeros(1), self.length.cumsum(0)])
-
     def __getitem__(self, rows: Tensor) -> Rows:
-        """The given rows (a mask, or positions in any order)."""
-        rows = rows.nonzero()[:, 0] if rows.dtype == torch.bool else rows
+        """The given rows, by positions in any order."""
         length = self.length[rows]
-        first = (self.length.cumsum(0) - self.length)[rows] - (length.cumsum(0) - length)
+        first = self.crow[rows] - (length.cumsum(0) - length)
         return self._taken(first.repeat_interleave(length) + torch.arange(int(length.sum())), rows)
 
     def _taken(self, entries: Int[Tensor, " e"], rows: Int[Tensor, " b"]) -> Rows:
         """The fields of these entries, and of these rows."""
-        names = (f.name for f in fields(Rows))
-        return Rows(*(getattr(self, n)[entries if n in ENTRIES else rows] for n in names))
+        per_entry, names = {"col", "laplacian", "gradient"}, (f.name for f in fields(Rows))
+        return Rows(*(getattr(self, n)[entries if n in per_entry else rows] for n in names))
 
     def with_gradient(
         self, local: Int[Tensor, " e"], index: Int[Tensor, " e"], gradient: Float[Tensor, "e d"]
     ) -> Rows:
         """Replace the gradient of the rows `local` by entries at the points `index`."""
         taken = torch.zeros_like(self.length, dtype=torch.bool).index_fill(0, local, True)
-        row = torch.arange(len(self.length)).repeat_interleave(self.length)
-        old = torch.where(taken[row, None], 0.0, self.gradient)
+        old = torch.where(taken[self.row, None], 0.0, self.gradient)
         span = int(max(self.col.max(), index.max())) + 1
-        key = torch.cat([row * span + self.col, local * span + index])
+        key = torch.cat([self.row * span + self.col, local * span + index])
         key, place = key.unique(return_inverse=True)
         values = torch.zeros(len(key), 1 + old.shape[1], dtype=old.dtype)
-        values.index_add_(0, place[: len(row)], torch.cat([self.laplacian[:, None], old], 1))
-        values[:, 1:].index_add_(0, place[len(row) :], gradient)
+        first, second = place.split([len(old), len(local)])
+        values.index_add_(0, first, torch.cat([self.laplacian[:, None], old], 1))
+        values[:, 1:].index_add_(0, second, gradient)
         length = torch.bincount(key // span, minlength=len(self.length))
         entries = {"col": key % span, "laplacian": values[:, 0], "gradient": values[:, 1:]}
         return replace(self, length=length, **entries)
@@ -124,22 +134,19 @@ class Rows:
         _, col, entry = numbering.restored_pattern(self.crow, self.col)
         return replace(self._taken(entry, numbering.here), col=col)
 
-    def on_pattern(self, other: Rows | RowsPlan) -> Rows:
+    def on_pattern(self, other: Pattern) -> Rows:
         """Rows on the pattern of `other`; entries outside it are added to the diagonal."""
         span = int(max(self.col.max(), other.col.max())) + 1
-        ours, theirs = (
-            torch.arange(len(rows.length)).repeat_interleave(rows.length) * span + rows.col
-            for rows in (self, other)
-        )
+        ours, theirs = (rows.row * span + rows.col for rows in (self, other))
         place = torch.searchsorted(theirs, ours).clamp_max(len(theirs) - 1)
         there = theirs[place] == ours
         values = torch.cat([self.laplacian[:, None], self.gradient], 1)
         found = values.new_zeros(len(theirs), values.shape[1])
         found.index_add_(0, place[there], values[there])
-        diagonal = theirs // span == theirs % span
+        diagonal = other.row == other.col
         lost = values.new_zeros(len(self.length), values.shape[1])
-        lost.index_add_(0, ours[~there] // span, values[~there])
-        found[diagonal] += lost[theirs[diagonal] // span]
+        lost.index_add_(0, self.row[~there], values[~there])
+        found[diagonal] += lost[other.row[diagonal]]
         entries = {"laplacian": found[:, 0], "gradient": found[:, 1:]}
         return replace(self, length=other.length, col=other.col.long(), **entries)
 
@@ -151,23 +158,13 @@ class Rows:
 
 
 @dataclass(frozen=True)
-class RowsPlan:
-    """Plan of rows; attributes are those of `Rows`.
+class RowsPlan(Pattern):
+    """Plan of rows; attributes are those of `Rows`. Entries are `used` in the own fit of a low-order row's gradient."""
 
-    Entries are `used` where positive weights are non-zero, and for the gradient of a low-order row.
-    """
-
-    length: Int[Tensor, " B"]
-    col: Int[Tensor, " nnz"]
     candidate: Int[Tensor, " B"]
-    rule: Int[Tensor, " B"]
     slope: Int[Tensor, " B"]
     reason: Int[Tensor, " B"]
     used: Bool[Tensor, " nnz"]
-
-
-ENTRIES = {"col", "laplacian", "gradient"}
-"""Fields of `Rows` with one value per entry; the others have one per row."""
 
 
 def to_tangent_vectors(
@@ -247,7 +244,7 @@ def matrix_rows(
     """
     crow, col, laplacian = from_scipy(matrix)
     length = crow.diff()
-    local = torch.arange(len(centers)).repeat_interleave(length)
+    local = Pattern(length, col).row
     offset = points[col] - points[centers[local]]
     coords = torch.einsum("en,end->ed", offset, frames[centers[local]])
 

@@ -42,7 +42,7 @@ class Shape(Placed):
     areas
         (N,), positive, shares of the area to first order, ℓ^d.
     low_order
-        Rows for points without a stencil; None if there are none.
+        Rows for points without a stencil.
     condition
         Boundary condition.
     on_mesh
@@ -54,7 +54,7 @@ class Shape(Placed):
     normal_order: Int[Tensor, " N"]
     neighborhoods: GraphNeighborhoods | None
     areas: Float[Tensor, " N"]
-    low_order: MeshLowOrder | None
+    low_order: MeshLowOrder
     condition: Condition
     on_mesh: bool = False
     plan: ShapePlan | None = None
@@ -74,7 +74,6 @@ def mesh_shape(
     num_neighbors: int | None = None,
     boundary: Bool[Tensor, " N"] | None = None,
     condition: Condition | None = NEUMANN,
-    areas: Float[Tensor, " N"] | None = None,
     fit_degrees: tuple[int, ...] = (),
     progress: bool = True,
     shares: Float[Tensor, " F"] | None = None,
@@ -82,14 +81,13 @@ def mesh_shape(
 ) -> Shape:
     """Shape of a mesh of segments, triangles or tetrahedra in Rⁿ, with graph and frames from its cells.
 
-    `condition` holds on the boundary, or on the part of it in the mask `boundary`; None imposes nothing. With `areas`
-    given there are no low-order rows. `fit_degrees` requests `fits` of the first of these degrees that passes. Where
-    faces overlap, `shares` weights each of them, and `boundary` alone marks where the shape ends. Triangles
-    reconstructed from a cloud are not `on_mesh`.
+    `condition` holds on the boundary, or on the part of it in the mask `boundary`; None imposes nothing. `fit_degrees`
+    requests `fits` of the first of these degrees that passes. Where faces overlap, `shares` weights each of them, and
+    `boundary` alone marks where the shape ends. Triangles reconstructed from a cloud are not `on_mesh`.
     """
     sides = None
     hypersurface = faces.shape[1] == vertices.shape[1] and faces.shape[1] < 4
-    if hypersurface and areas is None and consistently_wound(faces):
+    if hypersurface and consistently_wound(faces):
         candidates = nearest_neighbors(vertices, min(NEAREST, len(vertices)))
         sides = thin_sides(vertices, vertex_normals(vertices, faces), candidates)
     neighborhoods = GraphNeighborhoods(
@@ -104,14 +102,11 @@ def mesh_shape(
     elif condition is not None or boundary is not None:
         edge = boundary_of_mesh(vertices, faces, normal_order)
         edge = edge if boundary is None else _part(edge, boundary)
-    low_order = None
-    if areas is None:
-        low_order = MeshLowOrder(vertices, faces, shares=shares)
-        areas = low_order.areas()
     side = torch.ones(len(vertices), dtype=torch.int8) if hypersurface else None
     whole = ShapePlan(faces, shares, plan, None, side, None if condition is None else edge)
     on_mesh = on_mesh and faces.shape[1] == 3
-    return _shape(whole, fits, neighborhoods, areas, low_order, condition, on_mesh)
+    low_order = MeshLowOrder(vertices, faces, shares=shares)
+    return _shape(whole, fits, neighborhoods, low_order, condition, on_mesh)
 
 
 def surface_shape(
@@ -156,17 +151,15 @@ def surface_shape(
         assert own is not None
         against = (own * vertex_normals(points, triangles)).sum(1) < 0
         side = torch.where(against, -1, 1).to(torch.int8)
-    low_order = MeshLowOrder(points, triangles)
     whole = ShapePlan(triangles, None, plan, beside, side, edge)
-    return _shape(whole, fits, neighborhoods, low_order.areas(), low_order, condition)
+    return _shape(whole, fits, neighborhoods, MeshLowOrder(points, triangles), condition)
 
 
 def _shape(
     plan: ShapePlan,
     fits: LocalFits,
     neighborhoods: GraphNeighborhoods,
-    areas: Float[Tensor, " N"],
-    low_order: MeshLowOrder | None,
+    low_order: MeshLowOrder,
     condition: Condition | None,
     on_mesh: bool = False,
 ) -> Shape:
@@ -179,7 +172,7 @@ def _shape(
         **vars(placed),
         normal_order=plan.fits.order,
         neighborhoods=replace(neighborhoods, frames=placed.frames, sides=sides),
-        areas=areas,
+        areas=low_order.areas(),
         low_order=low_order,
         condition=Condition() if condition is None else condition,
         on_mesh=on_mesh,
