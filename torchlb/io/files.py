@@ -1,4 +1,4 @@
-"""Shapes from files and to files: by `formats`, by NumPy, and through trimesh, nibabel and meshio."""
+"""Shapes from files and to files: by `formats`, by NumPy, and through trimesh, nibabel and pyvista."""
 
 from __future__ import annotations
 
@@ -17,8 +17,8 @@ from torchlb.io.formats import READERS, numbers_of
 from torchlb.operator.cleaning import merged, proper_faces, triangles_of
 from torchlb.operator.inputs import ArrayLike, as_tensor, check_corners, check_points
 
-OTHERS = (".gii", ".glb", ".gltf", ".npy", ".npz", ".stl", ".vtk", ".vtu")
-SUFFIXES = tuple(sorted([*OTHERS, *READERS]))
+OTHERS = (".gii", ".glb", ".gltf", ".npy", ".npz", ".stl")
+SUFFIXES = tuple(sorted([*OTHERS, *libraries.VTK, *READERS]))
 """Endings of the files that `read_shape` takes."""
 STEPS = 4
 """Largest difference of coinciding corners in an .stl, in steps of float32 at the largest coordinate."""
@@ -48,11 +48,11 @@ def read_shape(path: str | Path) -> Shape:
     path
         A mesh (.ply, .obj, .off, .stl, .glb, .gltf), whose polygons are split into triangles, along the shorter
         diagonal of a quad; without faces it is a cloud. A surface of GIFTI (.gii) or FreeSurfer (lh.pial, …), through
-        nibabel. An unstructured grid of VTK (.vtk, .vtu), through meshio: tetrahedra, else triangles, else lines. A
-        cloud in .pcd, or a table of numbers (.xyz, .txt, .csv, .pts, .asc) with the coordinates in the columns x, y, z,
-        or in the first three. An array (N, n) of points in .npy; or a .npz with `vertices` (or `points`, or `pos`) and,
-        for a mesh, `faces`. The corners of an .stl, which has no vertices, are merged where they coincide, and along
-        open edges where they differ by rounding.
+        nibabel. Polydata or an unstructured grid of VTK (.vtk, .vtp, .vtu), through pyvista: tetrahedra, else
+        triangles, else lines. A cloud in .pcd, or a table of numbers (.xyz, .txt, .csv, .pts, .asc) with the
+        coordinates in the columns x, y, z, or in the first three. An array (N, n) of points in .npy; or a .npz with
+        `vertices` (or `points`, or `pos`) and, for a mesh, `faces`. The corners of an .stl, which has no vertices, are
+        merged where they coincide, and along open edges where they differ by rounding.
 
     Raises
     ------
@@ -63,55 +63,61 @@ def read_shape(path: str | Path) -> Shape:
     """
     vertices, faces, data = _read(path)
     if vertices is None:
-        names = f"neither vertices nor points among {list(data)}"
         raise InputError(
-            f"{path}: not a mesh or cloud, {names}; torchlb.read_point_data reads data"
+            f"{path}: not a mesh or cloud, neither vertices nor points among {list(data)}; "
+            "torchlb.read_point_data reads data"
         )
-    return vertices.double(), faces
+    return as_tensor(vertices).double(), None if faces is None else as_tensor(faces).long()
 
 
 def read_point_data(path: str | Path) -> dict[str, Tensor]:
     """Data of the points in the file `path` by name, (N,) or (N, C), in the type and order of the file.
 
-    Arrays of a .npz besides the shape; those of .vtk and .vtu, through meshio; of .gii, and FreeSurfer's maps
-    (lh.thickness, lh.curv, …), through nibabel. Raises a ValueError for a file without data, else as `read_shape`.
+    Arrays of a .npz besides the shape; those of .vtk, .vtp and .vtu, through pyvista; of .gii, and FreeSurfer's maps
+    (lh.thickness, .mgh, .mgz) and labels (.annot, as numbers of its table), through nibabel. Raises a ValueError for a
+    file without data, else as `read_shape`.
     """
     data = _read(path)[2]
     if not data:
-        raise InputError(f"{path}: no data of points; .npz, .vtk, .vtu, .gii, lh.curv, … hold some")
+        raise InputError(f"{path}: no data of points; .npz, .vtk, .gii, .mgz, lh.curv, … hold some")
     return {name: as_tensor(values) for name, values in data.items()}
 
 
 def _read(path: str | Path) -> libraries.Contents:
     """The vertices, cells and data in a file, if any."""
-    path, data = Path(path).expanduser(), {}
+    path = Path(path).expanduser()
     suffix = path.suffix.lower()
     if not path.is_file():
         raise FileNotFoundError(f"{path}: no such file")
     try:
         if suffix == ".npy":
-            vertices, faces = as_tensor(np.load(path, allow_pickle=False)), None
+            found = np.load(path, allow_pickle=False), None, {}
         elif suffix == ".npz":
-            vertices, faces, data = _npz(path)
+            found = _npz(path)
         elif suffix in READERS:
-            vertices, faces = _triangulated(*READERS[suffix](path))
-        elif (found := libraries.read(path)) is not None:
-            vertices, faces, data = found
-        else:
-            import trimesh
-
-            loaded = trimesh.load(path, process=False, maintain_order=True, skip_materials=True)
-            vertices, faces = arrays_of(loaded)
-            if suffix == ".stl" and faces is not None:
-                vertices, faces = _sewn(vertices, faces)
-        if vertices is not None and (vertices.ndim != 2 or vertices.numel() == 0):
-            raise InputError(f"vertices of shape {tuple(vertices.shape)}, expected (N, n)")
+            found = *_triangulated(*READERS[suffix](path)), {}
+        elif (found := libraries.read(path)) is None:
+            found = *_by_trimesh(path), {}
+        shape = (1, 1) if found[0] is None else found[0].shape
+        if len(shape) != 2 or 0 in shape:
+            raise InputError(f"vertices of shape {tuple(shape)}, expected (N, n)")
     except Exception as error:  # each reader raises its own
         raise InputError(
             f"{path}: not a mesh or cloud that can be read; {', '.join(SUFFIXES)} and FreeSurfer's surfaces can "
             f"({error})"
         ) from error
-    return vertices, faces, data
+    return found
+
+
+def _by_trimesh(path: Path) -> Shape:
+    """What trimesh reads; the corners of an .stl become vertices."""
+    import trimesh
+
+    shape = trimesh.load(path, process=False, maintain_order=True, skip_materials=True)
+    vertices, faces = arrays_of(shape)
+    if path.suffix.lower() == ".stl" and faces is not None:
+        return _sewn(vertices, faces)
+    return vertices, faces
 
 
 def write_shape(
@@ -119,7 +125,7 @@ def write_shape(
 ) -> None:
     """Write a mesh or cloud, with data of its points, in the format that the ending of `path` names.
 
-    .npz holds every shape; .vtk and .vtu, through meshio, those of R² and R³; .gii, through nibabel, triangles, in
+    .npz holds every shape; .vtk and .vtu, through pyvista, those of R² and R³; .gii, through nibabel, triangles, in
     single precision, and .func.gii and .shape.gii the data alone; .ply, .obj, .off, .stl and .glb, through trimesh,
     triangles and points of R³ without data. `points` are (N, n), `cells` (F, 3) triangles, (F, 2) segments, (F, 4)
     tetrahedra or None, `point_data` (N,) or (N, C), by name: ``write_shape("a.vtu", points, faces, thickness=f)``.
@@ -140,7 +146,7 @@ def write_shape(
     flat = places.shape[1] == corners.shape[1] == 3
     if suffix == ".npz":
         np.savez(path, **{"vertices": places, "faces": corners, **data})
-    elif (suffix in libraries.BY_MESHIO and places.shape[1] < 4) or (suffix == ".gii" and flat):
+    elif (suffix in (".vtk", ".vtu") and places.shape[1] < 4) or (suffix == ".gii" and flat):
         libraries.write(path, places, corners, data)
     elif suffix in (".ply", ".obj", ".off", ".stl", ".glb") and flat and not data:
         import trimesh
@@ -210,7 +216,7 @@ def _sewn(vertices: Float[Tensor, "N 3"], faces: Int[Tensor, "F 3"]) -> tuple[Te
 def _npz(path: Path) -> libraries.Contents:
     with np.load(path, allow_pickle=False) as archive:
         arrays = dict(archive)
-    data = {name: array for name, array in arrays.items() if name not in OF_THE_SHAPE}
-    shape = [as_tensor(arrays[name]) for name in OF_THE_SHAPE if name in arrays]
-    faces = shape.pop().long() if "faces" in arrays and arrays["faces"].size else None
-    return shape[0] if shape else None, faces, data
+    shape = {name: arrays.pop(name) for name in OF_THE_SHAPE if name in arrays}
+    faces = shape.pop("faces", None)
+    vertices = next(iter(shape.values()), None)
+    return vertices, None if faces is None or faces.size == 0 else faces, arrays
