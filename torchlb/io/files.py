@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -11,20 +12,23 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from torchlb.errors import InputError
-from torchlb.geometry.complex import edges_of
-from torchlb.io import libraries
 from torchlb.io.formats import READERS, numbers_of
-from torchlb.operator.cleaning import merged, proper_faces, triangles_of
+from torchlb.operator.cleaning import merged, triangles_of
 from torchlb.operator.inputs import ArrayLike, as_tensor, check_corners, check_points
 
+VTK, CELLS = (".vtk", ".vtp", ".vtu"), ("VERTEX", "LINE", "TRIANGLE", "TETRA")
 OTHERS = (".gii", ".glb", ".gltf", ".npy", ".npz", ".stl")
-SUFFIXES = tuple(sorted([*OTHERS, *libraries.VTK, *READERS]))
+SUFFIXES = tuple(sorted([*OTHERS, *VTK, *READERS]))
 """Endings of the files that `read_shape` takes."""
 STEPS = 4
 """Largest difference of coinciding corners in an .stl, in steps of float32 at the largest coordinate."""
 OF_THE_SHAPE = ("vertices", "points", "pos", "faces")
 """Names in a .npz that are not of data."""
+SURFACE, MAP = b"\xff\xff\xfe", b"\xff\xff\xff"
+"""Beginnings of FreeSurfer's files, whose endings may be any."""
 Shape = tuple[Float[Tensor, "N n"], Int[Tensor, "F v"] | None]
+Contents = tuple[Any, Any, dict[str, Any]]
+"""Vertices and cells, or None, and the data of the points by name."""
 
 
 def arrays_of(shape: Any) -> Shape:
@@ -52,7 +56,7 @@ def read_shape(path: str | Path) -> Shape:
         triangles, else lines. A cloud in .pcd, or a table of numbers (.xyz, .txt, .csv, .pts, .asc) with the
         coordinates in the columns x, y, z, or in the first three. An array (N, n) of points in .npy; or a .npz with
         `vertices` (or `points`, or `pos`) and, for a mesh, `faces`. The corners of an .stl, which has no vertices, are
-        merged where they coincide, and along open edges where they differ by rounding.
+        merged where they coincide to rounding.
 
     Raises
     ------
@@ -83,7 +87,7 @@ def read_point_data(path: str | Path) -> dict[str, Tensor]:
     return {name: as_tensor(values) for name, values in data.items()}
 
 
-def _read(path: str | Path) -> libraries.Contents:
+def _read(path: str | Path) -> Contents:
     """The vertices, cells and data in a file, if any."""
     path = Path(path).expanduser()
     suffix = path.suffix.lower()
@@ -96,7 +100,13 @@ def _read(path: str | Path) -> libraries.Contents:
             found = _npz(path)
         elif suffix in READERS:
             found = *_triangulated(*READERS[suffix](path)), {}
-        elif (found := libraries.read(path)) is None:
+        elif suffix in VTK:
+            found = _vtk(path)
+        elif suffix == ".gii":
+            found = _gifti(path)
+        elif suffix in (".annot", ".mgh", ".mgz") or _start(path) in (SURFACE, MAP):
+            found = _freesurfer(path)
+        else:
             found = *_by_trimesh(path), {}
         shape = (1, 1) if found[0] is None else found[0].shape
         if len(shape) != 2 or 0 in shape:
@@ -107,6 +117,62 @@ def _read(path: str | Path) -> libraries.Contents:
             f"({error})"
         ) from error
     return found
+
+
+def _library(name: str) -> Any:
+    """The module; InputError that says how to install it where it is missing."""
+    try:
+        return import_module(name)
+    except ImportError as error:
+        raise InputError(f"{name} is needed: pip install {name}, or torchlb[files]") from error
+
+
+def _start(path: Path) -> bytes:
+    with open(path, "rb") as file:
+        return file.read(len(SURFACE))
+
+
+def _vtk(path: Path) -> Contents:
+    """A polydata or unstructured grid: its cells of the highest dimension, polygons and strips as triangles."""
+    pyvista = _library("pyvista")
+    with pyvista.VtkErrorCatcher(send_to_logging=False) as heard:
+        mesh = pyvista.read(path)
+    if heard.events:  # of a damaged file VTK makes up the rest
+        raise InputError(f"VTK says: {heard.events[0]}")
+    if isinstance(mesh, pyvista.PolyData):
+        mesh = mesh.triangulate(pass_lines=True)
+    grid = mesh.cast_to_unstructured_grid()
+    cells = {pyvista.CellType(kind).name: corners for kind, corners in grid.cells_dict.items()}
+    other = ", ".join(cells.keys() - {*CELLS}).lower()
+    if other:
+        raise InputError(f"cells {other}; expected tetrahedra, triangles or lines")
+    chosen = next((cells[kind] for kind in CELLS[:0:-1] if kind in cells), None)
+    return mesh.points, chosen, dict(mesh.point_data)
+
+
+def _gifti(path: Path) -> Contents:
+    """A surface and maps of GIFTI; maps without a name are numbered."""
+    data = {}
+    for number, array in enumerate(_library("nibabel").load(path).darrays):
+        role = {1008: "POINTSET", 1009: "TRIANGLE"}.get(array.intent)  # codes of NIfTI
+        name = role or array.meta.get("Name") or f"data_{number}"
+        data[f"{name}_{number}" if name in data else name] = array.data
+    return data.pop("POINTSET", None), data.pop("TRIANGLE", None), data
+
+
+def _freesurfer(path: Path) -> Contents:
+    """A surface, or labels or maps under the last part of their name, as of lh.thickness and lh.thickness.mgz."""
+    nibabel, suffix = _library("nibabel"), path.suffix.lower()
+    if _start(path) == SURFACE:
+        return *nibabel.freesurfer.read_geometry(path), {}
+    if suffix in (".mgh", ".mgz"):
+        values = np.asarray(nibabel.load(path).dataobj)
+        if values.shape[1:3] != (1, 1):
+            raise InputError(f"a volume of shape {values.shape}, not a map of points")
+        return None, None, {path.stem.rpartition(".")[2]: values.squeeze((1, 2))}
+    if suffix == ".annot":
+        return None, None, {path.stem.rpartition(".")[2]: nibabel.freesurfer.read_annot(path)[0]}
+    return None, None, {suffix[1:]: nibabel.freesurfer.read_morph_data(path)}
 
 
 def _by_trimesh(path: Path) -> Shape:
@@ -147,7 +213,7 @@ def write_shape(
     if suffix == ".npz":
         np.savez(path, **{"vertices": places, "faces": corners, **data})
     elif (suffix in (".vtk", ".vtu") and places.shape[1] < 4) or (suffix == ".gii" and flat):
-        libraries.write(path, places, corners, data)
+        _write(path, places, corners, data)
     elif suffix in (".ply", ".obj", ".off", ".stl", ".glb") and flat and not data:
         import trimesh
 
@@ -163,10 +229,34 @@ def write_shape(
         )
 
 
+def _write(path: Path, points: np.ndarray, cells: np.ndarray, data: dict[str, np.ndarray]) -> None:
+    """VTK's unstructured grid in three columns, or GIFTI, in float32 and int32 and by columns of the data."""
+    if path.suffix.lower() != ".gii":
+        pyvista, corners = _library("pyvista"), cells.shape[1] if len(cells) else 1
+        cells = cells if len(cells) else np.arange(len(points))[:, None]
+        points = np.pad(points, ((0, 0), (0, 3 - points.shape[1])))
+        grid = pyvista.UnstructuredGrid({pyvista.CellType[CELLS[corners - 1]]: cells}, points)
+        for name, values in data.items():
+            grid.point_data[name] = values.astype(np.int32) if values.dtype == bool else values
+        return grid.save(path)
+    nibabel, arrays = _library("nibabel"), [("", "POINTSET", points), ("", "TRIANGLE", cells)]
+    if path.name.lower().endswith((".func.gii", ".shape.gii")):
+        arrays = []
+    for name, values in data.items():
+        for c, column in enumerate(values.reshape(len(values), -1).T):
+            arrays.append((name if values.ndim == 1 else f"{name}_{c}", "NONE", column))
+    image, array_of = nibabel.GiftiImage(), nibabel.gifti.GiftiDataArray
+    for name, intent, values in arrays:
+        values = values.astype(np.int32 if values.dtype.kind in "biu" else np.float32)
+        array = array_of(values, f"NIFTI_INTENT_{intent}", meta={"Name": name})
+        image.darrays += [array] if len(values) else []
+    return nibabel.save(image, path)
+
+
 def may_be_shape(path: Path) -> bool:
     """Whether a file is taken for a shape, by its ending; .txt and .csv by three numbers in their first row."""
     if path.suffix.lower() not in (".csv", ".txt"):
-        return path.suffix.lower() in SUFFIXES or libraries.begins(path, libraries.SURFACE)
+        return path.suffix.lower() in SUFFIXES or _start(path) == SURFACE
     try:
         return len(next(numbers_of(path), ([], []))[1]) > 2
     except InputError:
@@ -194,26 +284,14 @@ def _triangulated(
 
 
 def _sewn(vertices: Float[Tensor, "N 3"], faces: Int[Tensor, "F 3"]) -> tuple[Tensor, Tensor]:
-    """Merge the corners of triangles into vertices: equal corners, and at open edges those that differ by rounding.
-
-    An open edge belongs to one triangle; ends of an edge are never merged. So a closed mesh keeps all its vertices.
-    """
-    vertices, number = torch.unique(vertices, dim=0, return_inverse=True)
-    faces = number[faces]
-    found = edges_of(proper_faces(faces).numpy(), len(vertices))
-    edges = np.stack(np.divmod(found.keys, len(vertices)), 1)
-    rim = np.unique(edges[found.uses == 1])
-    if len(rim) == 0:
-        return vertices, faces
-    between = torch.from_numpy(np.searchsorted(rim, edges[np.isin(edges, rim).all(1)]))
+    """Merge the corners of triangles that are equal, and that differ by rounding unless an edge is as short as that."""
+    edges = faces[:, [0, 1, 1, 2, 2, 0]].view(-1, 2)
     reach = STEPS * torch.finfo(torch.float32).eps * float(vertices.abs().max())
-    one, rim = torch.arange(len(vertices)), torch.from_numpy(rim)
-    one[rim] = rim[merged(vertices[rim], reach, between)]
-    kept, number = torch.unique(one, return_inverse=True)
+    kept, number = torch.unique(merged(vertices, reach, edges), return_inverse=True)
     return vertices[kept], number[faces]
 
 
-def _npz(path: Path) -> libraries.Contents:
+def _npz(path: Path) -> Contents:
     with np.load(path, allow_pickle=False) as archive:
         arrays = dict(archive)
     shape = {name: arrays.pop(name) for name in OF_THE_SHAPE if name in arrays}
