@@ -15,7 +15,7 @@ BIN := .venv/bin
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
 .NOTPARALLEL:
-.PHONY: help demo test lint format docs bench clean
+.PHONY: help demo test lint format docs pictures bench clean
 
 help: ## show this list
 	@awk -F ':.*## ' '/^[a-z]+:.*## / { printf "make %-8s %s\n", $$1, $$2 }' Makefile
@@ -37,6 +37,9 @@ format: .venv/installed-dev ## put the files in ruff's format
 
 docs: .venv/installed-dev ## build the documentation into site/
 	$(BIN)/mkdocs build --strict
+
+pictures: .venv/installed-dev ## draw the pictures of docs/ again
+	MPLBACKEND=Agg $(BIN)/python scripts/draw_docs.py
 
 bench: .venv/installed-bench ## run the benchmarks, with SHAPES="a.npz b.npz" those on limit shapes, too
 	@for file in accuracy curvature isospectralization layers learning robustness speed tangent_fields tangent_learning; do \

@@ -67,7 +67,7 @@ def main(arguments=None):
         print(f"{method:>17}" + "".join(f"{error:10.1e}" for error in errors))
         off = (spots(coarse[0], found[0]) - before).abs().clamp_min(1e-6).log10()
         title = f"error of the start, {method} (time off by {100 * errors[1]:.2g} %)"
-        scale = {"limits": (-4.5, -2.0), "label": "log₁₀", "cmap": "magma"}
+        scale = {"limits": (-4.5, -2.0), "label": "log₁₀ of |error|", "cmap": "magma"}
         plot_surface(*coarse, off, ax=ax, title=title, view=LEFT, **scale)
     save(figure, options.output, "find_heat_source.png")
 

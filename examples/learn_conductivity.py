@@ -68,7 +68,7 @@ def main(arguments=None):
         for ax, kind, kappa, error in kinds:
             off = (kappa / truth - 1).abs().clamp_min(1e-5).log10()
             title = f"{method}, {kind}: κ off by {100 * error:.2g} %"
-            scale = {"limits": (-4.0, -1.0), "label": "log₁₀", "cmap": "magma"}
+            scale = {"limits": (-4.0, -1.0), "label": "log₁₀ of relative error", "cmap": "magma"}
             plot_surface(*coarse, off, ax=ax, title=title, view=LEFT, **scale)
     save(figure, options.output, "learn_conductivity.png")
 

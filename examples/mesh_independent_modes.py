@@ -63,7 +63,8 @@ def main(arguments=None):
             errors[method].append(float(wrong.median()))
             if n == sizes[1] and method != "robust_laplacian":
                 share = (off[shown - 1].abs() / modes[:, shown].abs().max()).clamp_min(1e-4).log10()
-                scale = {"limits": (-3.5, -1.5), "label": "log₁₀", "cmap": "magma"}
+                label = "log₁₀ of |error| / largest |value|"
+                scale = {"limits": (-3.5, -1.5), "label": label, "cmap": "magma"}
                 pictures.append((share, f"its error by {method}, {n:,} vertices", scale))
 
     figure, axes = plt.subplots(2, 2, figsize=(11, 8), layout="constrained")
