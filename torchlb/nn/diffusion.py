@@ -11,7 +11,7 @@ from torch import Tensor, nn
 from torch.nn.functional import softplus
 
 from torchlb.errors import InputError
-from torchlb.linalg.precision import ROOT_EPS, SINGLE
+from torchlb.linalg.precision import SINGLE
 from torchlb.nn.pointwise import check_features
 from torchlb.operator.pair_methods import PairMethods
 from torchlb.pde.checks import check_choice
@@ -64,7 +64,7 @@ class Diffusion(LearnedTimes):
     init_time
         Initial time, ℓ². Shapes of radius about one are expected.
     tolerance
-        Tolerance of the methods other than "spectral", see `heat_flow`.
+        Tolerance of the methods other than "spectral", see `heat_flow`; that of single precision by default.
 
     Attributes
     ----------
@@ -88,7 +88,7 @@ class Diffusion(LearnedTimes):
         method: Method = "deflated",
         k: int = 128,
         init_time: float = 0.01,
-        tolerance: float = ROOT_EPS,
+        tolerance: float = SINGLE,
     ) -> None:
         super().__init__(channels, init_time)
         check_choice("method", method, Method)
