@@ -59,9 +59,6 @@ def stencil_candidates(
     On evenly spread points rows of even order are no better than rows of the odd order below. Rows of order 1 are no
     better than the triangles of a mesh, and positive ones no better than those of a surface through a cloud: there they
     are tried only if asked for. Least squares follow any other `weights`.
-
-    >>> [c.degree for c in stencil_candidates(2, 5, "least_squares", 60, on_mesh=False, triangles=False)]
-    [6, 4, 2, 2]
     """
     rules = list(dict.fromkeys([weights, "least_squares"]))
     lowest = 4 if on_mesh else 2
