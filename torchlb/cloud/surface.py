@@ -62,7 +62,8 @@ class SurfaceSummary:
     @classmethod
     def of(cls, entries: dict[str, Any]) -> SurfaceSummary:
         """Inverse of `dataclasses.asdict`, also after a round trip through JSON."""
-        return cls(**entries | {"places": tuple(map(tuple, entries.get("places", ())))})
+        places: Any = tuple(map(tuple, entries.get("places", ())))
+        return cls(**entries | {"places": places})
 
     def __str__(self) -> str:
         """Summary of two lines, or three."""
