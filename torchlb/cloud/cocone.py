@@ -17,8 +17,8 @@ from jaxtyping import Bool, Float, Int
 from torchlb.cloud.manifold import face_vectors
 from torchlb.geometry.complex import Faces, circumcenters, delaunay, edges_of
 from torchlb.geometry.thresholds import CREASE, LEVEL, WIDER
-from torchlb.geometry.vectors import Mask, Vectors, inner, largest, lengths, smallest
-from torchlb.linalg.precision import LOW, NEGLIGIBLE, ROUNDING, SINGLE, TINY
+from torchlb.geometry.vectors import Mask, Vectors, inner, largest, lengths, smallest, unit
+from torchlb.linalg.precision import LOW, NEGLIGIBLE, ROUNDING, SINGLE
 
 COCONE = np.sqrt((1 - LEVEL) / 2)
 """Sine of the largest angle, 22.5°, between the tangent plane and a direction in the cocone."""
@@ -118,9 +118,7 @@ class Tetrahedra:
         second, apex = beyond[first, number], cells[first, number]
         hull = second < 0
         a, b, c = moved[triangles[hull]].swapaxes(0, 1)
-        normal = np.cross(b - a, c - a)
-        normal /= np.maximum(lengths(normal), TINY)[:, None]
-        inside = a - moved[apex[hull]]
+        normal, inside = unit(np.cross(b - a, c - a)), a - moved[apex[hull]]
         away = np.sign(inner(inside, normal))[:, None] * normal
         second[hull] = len(cells) + np.arange(hull.sum())
         far = centers[first[hull]] + np.ptp(points, axis=0).max() / NEGLIGIBLE * away
@@ -144,7 +142,7 @@ class Tetrahedra:
             left = np.flatnonzero(tangent)
             apex, axis = (x.take(corner[left], 0) for x in (cloud.points, cloud.normals))
             offsets = [end.take(left, 0) - apex for end in ends]
-            one, two = (inner(x, axis) / np.maximum(lengths(x), TINY) for x in offsets)
+            one, two = (inner(unit(x), axis) for x in offsets)
             tangent[left] = (np.abs(one) <= COCONE) | (np.abs(two) <= COCONE) | (one * two < 0)
         one, two = (side[number[kept]] for number in self.sides)
         parting = one != two
@@ -182,10 +180,8 @@ def conormals(
 ) -> Float[np.ndarray, "*batch 3"]:
     """Unit vectors normal to the edges tail–head, towards the points `tip`."""
     start = points.take(tail, 0)
-    along, out = points.take(head, 0) - start, points.take(tip, 0) - start
-    along /= np.maximum(lengths(along), TINY)[..., None]
-    out -= inner(out, along)[..., None] * along
-    return out / np.maximum(lengths(out), TINY)[..., None]
+    along, out = unit(points.take(head, 0) - start), points.take(tip, 0) - start
+    return unit(out - inner(out, along)[..., None] * along)
 
 
 def best_manifold(points: Vectors, faces: Faces) -> Faces:

@@ -17,8 +17,8 @@ from torchlb.cloud.manifold import boundary_loops, ears_of
 from torchlb.cloud.voronoi import natural_neighbors, unrolled
 from torchlb.geometry.complex import Edges, Faces, edges_of, pieces_of, spanning_pairs
 from torchlb.geometry.thresholds import CREASE, NEAREST, ROUGH, SLIGHT
-from torchlb.geometry.vectors import Mask, inner, largest, lengths, smallest
-from torchlb.linalg.precision import LOW, TINY
+from torchlb.geometry.vectors import Mask, inner, largest, smallest, unit
+from torchlb.linalg.precision import LOW
 
 Pairs = tuple[Int[np.ndarray, " P"], Int[np.ndarray, " P"]]
 """Edges of the neighbour graph."""
@@ -140,12 +140,9 @@ def _wedges(
     sides = []
     for turn in (1, 2):
         side = cloud.points[faces[rows, (corner + turn) % 3]] - cloud.points[apex]
-        side -= inner(side, normal)[:, None] * normal
-        sides.append(side / np.maximum(lengths(side), TINY)[:, None])
-    middle = sides[0] + sides[1]
-    middle /= np.maximum(lengths(middle), TINY)[:, None]
-    turn = np.sign(inner(np.cross(sides[0], sides[1]), normal))[:, None] * normal
-    return sides[0], sides[1], middle, turn
+        sides.append(unit(side - inner(side, normal)[:, None] * normal))
+    turn = np.sign(inner(np.cross(*sides), normal))[:, None] * normal
+    return *sides, unit(sides[0] + sides[1]), turn
 
 
 def _meet(one: Float[np.ndarray, "P 4 3"], two: Float[np.ndarray, "P 4 3"]) -> np.ndarray:

@@ -8,8 +8,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from torchlb.geometry.complex import Faces, components, edges_of, tree_sides
-from torchlb.geometry.vectors import Vectors, inner, lengths
-from torchlb.linalg.precision import TINY
+from torchlb.geometry.vectors import Vectors, inner, unit
 
 
 def with_single_fans(faces: Faces, count: int) -> Faces:
@@ -55,8 +54,7 @@ def wound_alike(points: Vectors, faces: Faces) -> tuple[Faces, Bool[np.ndarray, 
     edges = edges_of(faces, len(points))
     one, two = edges.twins
     against = edges.ends[0][one] == edges.ends[0][two]
-    normals = face_vectors(points, faces)
-    normals /= np.maximum(lengths(normals), TINY)[:, None]
+    normals = unit(face_vectors(points, faces))
     i, j, size = one // 3, two // 3, len(faces)
     bend = 1.001 - inner(normals.take(i, 0), normals.take(j, 0)) * np.where(against, -1, 1)
     order = np.argsort(bend, kind="stable")

@@ -102,21 +102,18 @@ class Poles:
 
     def _touching(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Pairs of spheres that share a triangle, or an edge of the hull, and the cosine between their radii there."""
-        tetrahedra = self.tetrahedra
-        apex, outer = tetrahedra.points[tetrahedra.triangles[:, 0]], tetrahedra.hull
-        radii = [torch.from_numpy(end - apex) for end in tetrahedra.ends()]
-        near, far = tetrahedra.ends(outer)
-        away = torch.from_numpy(far - near)
-        left, right = (
-            half // 3
-            for half in edges_of(tetrahedra.triangles[outer], len(tetrahedra.points)).twins
+        every = self.tetrahedra
+        apex, hull = every.points[every.triangles[:, 0]], every.hull
+        radii = [torch.from_numpy(end - apex) for end in every.ends()]
+        near, far = every.ends(hull)
+        away, number = torch.from_numpy(far - near), every.sides[1][hull]
+        edges = edges_of(every.triangles[hull], len(every.points))
+        left, right = (half // 3 for half in edges.twins)
+        one, two = (
+            np.concatenate([side, number[face]])
+            for side, face in zip(every.sides, (left, right), strict=True)
         )
-        number = tetrahedra.sides[1][outer]
-        return (
-            np.concatenate([tetrahedra.sides[0], number[left]]),
-            np.concatenate([tetrahedra.sides[1], number[right]]),
-            torch.cat([_cosine(*radii), _cosine(away[left], away[right])]).numpy(),
-        )
+        return one, two, torch.cat([_cosine(*radii), _cosine(away[left], away[right])]).numpy()
 
 
 def _vote(
@@ -129,12 +126,13 @@ def _vote(
     count, free = len(outside), np.flatnonzero(~outside)
     ends = i.astype(np.int32), j.astype(np.int32)
     one: Any = sparse.coo_array((weight.astype(np.float32), ends), shape=(count, count))
-    total = np.bincount(np.concatenate(ends), np.tile(np.abs(weight), 2), count)
-    around = total.astype(np.float32)
+    total = np.bincount(np.concatenate(ends), np.tile(np.abs(weight), 2), count)[free]
+    around = np.maximum(total.astype(np.float32), np.finfo(np.float32).tiny)
     rows = sparse.csr_array(one + one.T)[free]
-    matrix = sparse.csr_array(sparse.diags_array(around[free]) - rows[:, free])
-    scale = sparse.diags_array(1 / np.maximum(around[free], np.finfo(np.float32).tiny))
-    x, _ = cg(matrix, rows @ outside, rtol=RESIDUAL, maxiter=STEPS, M=scale)
+    matrix = sparse.csr_array(sparse.diags_array(around) - rows[:, free])
+    x, _ = cg(
+        matrix, rows @ outside, rtol=RESIDUAL, maxiter=STEPS, M=sparse.diags_array(1 / around)
+    )
     side = np.ones(count)
     side[free] = np.where(x > 0, 1.0, -1.0)
     return side

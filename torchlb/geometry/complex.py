@@ -104,11 +104,7 @@ def _order(key: Int[np.ndarray, " K"], count: int) -> Int[np.ndarray, " K"]:
 
 
 def edges_of(faces: Faces, count: int) -> Edges:
-    """The edges of triangles.
-
-    >>> edges_of(np.array([[0, 1, 2], [1, 3, 2]]), 4).uses.tolist()
-    [1, 1, 2, 1, 1]
-    """
+    """The edges of triangles."""
     ends = np.roll(faces, -1, 1).ravel(), np.roll(faces, -2, 1).ravel()
     low, high = np.minimum(*ends), np.maximum(*ends)
     order = _order(high, count)
@@ -128,11 +124,7 @@ def components(i: np.ndarray, j: np.ndarray, count: int) -> Int[np.ndarray, " co
 
 
 def spanning_pairs(i: np.ndarray, j: np.ndarray, count: int) -> Int[np.ndarray, " T"]:
-    """Numbers of the pairs (i, j), sorted best first, in the minimum spanning forest of `count` nodes.
-
-    >>> spanning_pairs(np.array([0, 0, 1, 2]), np.array([1, 1, 2, 0]), 4).tolist()
-    [0, 2]
-    """
+    """Numbers of the pairs (i, j), sorted best first, in the minimum spanning forest of `count` nodes."""
     order = _order(i, count)  # repeated pairs stay separate entries
     ends = np.append(0, np.bincount(i, minlength=count).cumsum()).astype(np.int32)
     rows = order + 1.0, j.astype(np.int32)[order], ends
@@ -157,12 +149,7 @@ def two_orientations(
 def tree_sides(
     i: np.ndarray, j: np.ndarray, against: Bool[np.ndarray, " P"], count: int
 ) -> Bool[np.ndarray, " count"]:
-    """Side of each node along the spanning forest of the pairs (i, j), best first; False for the first of a component.
-
-    >>> against = np.array([True, False, False])
-    >>> tree_sides(np.array([0, 1, 2]), np.array([1, 2, 0]), against, 3).tolist()
-    [False, True, True]
-    """
+    """Side of each node along the spanning forest of the pairs, best first; False for the first of a component."""
     chosen = spanning_pairs(i, j, count)
     own, other = two_orientations(i[chosen], j[chosen], against[chosen], count)
     return own > other
@@ -175,11 +162,7 @@ def pieces_of(faces: Faces, count: int) -> Int[np.ndarray, " N"]:
 
 
 def consistently_wound(faces: Int[Tensor, "F v"]) -> bool:
-    """Whether neighbouring triangles (or segments) are consistently oriented: no directed edge is used twice.
-
-    >>> [consistently_wound(torch.tensor([[0, 1, 2], other])) for other in ([2, 1, 3], [1, 2, 3])]
-    [True, False]
-    """
+    """Whether neighbouring triangles (or segments) are consistently oriented: no directed edge is used twice."""
     if faces.shape[1] == 2:
         return all(len(torch.unique(end)) == len(end) for end in faces.T)
     edges = torch.cat([faces[:, a] * (faces.max() + 1) + faces[:, a - 2] for a in range(3)])

@@ -26,11 +26,7 @@ from torchlb.geometry.vectors import Frames, Near, Points, at
 
 
 def nearest_neighbors(points: Points, size: int) -> Near:
-    """The `size` nearest points of each point by distance, itself first even where others coincide with it.
-
-    >>> nearest_neighbors(torch.tensor([[0.0], [1.0], [3.0]]), 2).tolist()
-    [[0, 1], [1, 0], [2, 1]]
-    """
+    """The `size` nearest points of each point by distance, itself first even where others coincide with it."""
     tree = KDTree(points.numpy())
     _, index = tree.query(points.numpy(), k=size, workers=torch.get_num_threads())
     found = torch.from_numpy(np.asarray(index, dtype=np.int64).reshape(len(points), size))
@@ -51,11 +47,7 @@ def adjacency(i: np.ndarray, j: np.ndarray, num_points: int) -> sparse.csr_array
 
 
 def mesh_graph(faces: Int[Tensor, "F v"], num_points: int) -> sparse.csr_array:
-    """Symmetric (N, N) adjacency matrix of the edges of a mesh of simplices.
-
-    >>> mesh_graph(torch.tensor([[0, 1, 2]]), 4).toarray().astype(int).tolist()
-    [[0, 1, 1, 0], [1, 0, 1, 0], [1, 1, 0, 0], [0, 0, 0, 0]]
-    """
+    """Symmetric (N, N) adjacency matrix of the edges of a mesh of simplices."""
     corners = faces.numpy()
     i, j = np.concatenate([corners[:, pair] for pair in combinations(range(corners.shape[1]), 2)]).T
     return adjacency(i, j, num_points)

@@ -21,10 +21,6 @@ class Numbering:
 
     `given` is the user's number of each point in the order of the tree, `here` the position of each of the user's
     points in that order.
-
-    >>> numbering = Numbering.along_tree(torch.rand(50, 3))
-    >>> numbering.given[numbering.here].equal(torch.arange(50))
-    True
     """
 
     given: Int[Tensor, " N"]

@@ -8,6 +8,8 @@ import numpy as np
 from jaxtyping import Bool, Float, Int, Shaped
 from torch import Tensor
 
+from torchlb.linalg.precision import TINY
+
 Points = Float[Tensor, "N n"]
 """A point or a vector, as a normal, of every point."""
 Frames = Float[Tensor, "N n d"]
@@ -42,6 +44,11 @@ def inner(a: Float[np.ndarray, "*#batch n"], b: Float[np.ndarray, "*#batch n"]) 
 def lengths(x: Float[np.ndarray, "*batch n"]) -> Float[np.ndarray, "*batch"]:
     """|x| along the last axis of an array."""
     return np.sqrt(inner(x, x))
+
+
+def unit(x: Float[np.ndarray, "*batch n"]) -> Float[np.ndarray, "*batch n"]:
+    """x over its length along the last axis; zero stays zero."""
+    return x / np.maximum(lengths(x), TINY)[..., None]
 
 
 def smallest(x: Shaped[np.ndarray, "*batch n"]) -> Shaped[np.ndarray, "*batch"]:
