@@ -66,7 +66,6 @@ def main(arguments=None):
                 label = "log₁₀ of |error| / largest |value|"
                 scale = {"limits": (-3.5, -1.5), "label": label, "cmap": "magma"}
                 pictures.append((share, f"its error by {method}, {n:,} vertices", scale))
-
     figure, axes = plt.subplots(2, 2, figsize=(11, 8), layout="constrained")
     errors["torchlb"].append(float("nan"))  # the reference
     ylabel = f"median relative error, eigenvalues 1 to {k}"

@@ -7,6 +7,7 @@ import subprocess
 import sys
 import warnings
 from functools import cache
+from importlib.metadata import metadata
 from pathlib import Path
 
 import pytest
@@ -247,6 +248,13 @@ def test_every_public_name_is_in_the_reference():
     assert set(torchlb.__all__) - {"__version__"} <= listed
     modules = {f"interop.{p.stem}" for p in (ROOT / "torchlb" / "interop").glob("[a-z]*.py")}
     assert modules <= listed
+
+
+def test_every_extra_is_described():
+    page = (ROOT / "docs" / "install.md").read_text("utf-8")
+    extras = metadata("torchlb").get_all("Provides-Extra")
+    assert extras
+    assert [name for name in extras if f"| `{name}` |" not in page] == []
 
 
 def test_the_site_builds_without_a_network(tmp_path):

@@ -39,18 +39,12 @@ class ShapeResult:
 
     Attributes
     ----------
-    name
-        File, relative to the folder, or "shape 7" for arrays.
-    status
-        "built", "cached" (stored before) or "failed".
-    points
-        Number of points; 0 if failed.
-    seconds
-        Time taken.
-    file
-        File of its operator, for `load_operator`; empty if failed.
-    message
-        Reason of the failure, or the warnings.
+    name, status
+        File, relative to the folder, or "shape 7" for arrays; "built", "cached" (stored before) or "failed".
+    points, seconds
+        Number of points, 0 if failed; time taken.
+    file, message
+        File of its operator, for `load_operator`, empty if failed; reason of the failure, or the warnings.
     """
 
     name: str
@@ -236,7 +230,7 @@ def _solve(
     index: int, name: str, source: Any, *, clean: bool, cache: str, settings: dict[str, Any]
 ) -> tuple[int, ShapeResult]:
     """Compute and store the operator of one shape on one thread; any exception becomes its result."""
-    start, path, points = time.perf_counter(), Path(), 0
+    start = time.perf_counter()
     try:
         with threads_for(0), warnings.catch_warnings(record=True) as caught:
             warnings.simplefilter("always", UserWarning)
@@ -246,14 +240,12 @@ def _solve(
             options = {name: value for name, value in settings.items() if name != "k"}
             path = Path(cache) / f"{operator_key(vertices, faces, **options)}.npz"
             before = path.stat().st_mtime_ns if path.exists() else None
-            points = load_or_build(
-                vertices, faces, cache=cache, progress=False, **settings
-            ).num_points
+            lb = load_or_build(vertices, faces, cache=cache, progress=False, **settings)
             if not path.exists():
                 raise OSError("its operator was built and could not be written")
         status = "cached" if path.stat().st_mtime_ns == before else "built"
         notes = {str(w.message) for w in caught if concerns_the_shape(w.message)}
-        file, message = str(path), "; ".join(sorted(notes))
+        points, file, message = lb.num_points, str(path), "; ".join(sorted(notes))
     except Exception as error:
         status, points, file, message = "failed", 0, "", f"{type(error).__name__}: {error}"
     seconds = time.perf_counter() - start
