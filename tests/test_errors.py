@@ -49,6 +49,11 @@ def test_bad_points(points, message):
         LaplaceBeltrami.from_points(points)
 
 
+def test_a_mesh_in_the_place_of_points(unchecked):
+    with pytest.raises(TypeError, match=r"points alone.*from_mesh\(vertices, faces\)"):
+        LaplaceBeltrami.from_points(VERTICES, FACES)
+
+
 @pytest.mark.parametrize(
     ("faces", "message"),
     [

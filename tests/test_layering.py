@@ -111,7 +111,7 @@ def test_import_loads_what_it_needs():
         "torch._dynamo",
         "numba",
         "nibabel",
-        "meshio",
+        "pyvista",
     ]
     program = f"import sys, torchlb; print([name for name in {late} if name in sys.modules])"
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)

@@ -33,10 +33,17 @@ from torchlb.version import __version__
 __all__ = ["main"]
 
 FILE = click.Path(exists=True, dir_okay=False, path_type=Path)
+FOLDER = click.Path(file_okay=False, path_type=Path)
 COUNT = click.IntRange(min=1)
-PROJECTION = "Onto the tangent plane, or along the normals."
-CERTIFY = "Prove the stencil stable."
 SETTINGS = {"help_option_names": ["-h", "--help"], "show_default": True}
+PROJECTION, WEIGHTS = (click.Choice(get_args(names)) for names in (Projection, WeightsName))
+OF_THE_OPERATOR: dict[str, tuple[Any, Any, str]] = {
+    "order": (COUNT, 3, "Order p of accuracy."),
+    "projection": (PROJECTION, "tangent", "Onto the tangent plane, or along the normals."),
+    "weights": (WEIGHTS, "least_squares", "How they are found."),
+    "certify": (bool, False, "Prove the stencil stable."),
+    "clean": (bool, False, "Leave out vertices of no face, and points twice."),
+}
 
 
 class _Commands(click.Group):
@@ -58,17 +65,22 @@ def _show(message: Warning | str, category: type[Warning], *_: Any) -> None:
 
 
 def _stencil_options(command: Callable[..., Any]) -> Callable[..., Any]:
-    """Add the operator's options that the commands share."""
-    projections, weights = (click.Choice(get_args(names)) for names in (Projection, WeightsName))
-    for name, settings in (
-        ("--order", {"type": COUNT, "default": 3, "help": "Order p of accuracy."}),
-        ("--projection", {"type": projections, "default": "tangent", "help": PROJECTION}),
-        ("--weights", {"type": weights, "default": "least_squares", "help": "How they are found."}),
-        ("--certify/--no-certify", {"default": False, "help": CERTIFY}),
-        ("--clean", {"is_flag": True, "help": "Leave out vertices of no face, and points twice."}),
-    ):
-        command = click.option(name, **settings)(command)
+    """Add the options that the commands share."""
+    for name, (kind, default, text) in OF_THE_OPERATOR.items():
+        option = click.option(
+            f"--{name}", type=kind, is_flag=kind is bool, default=default, help=text
+        )
+        command = option(command)
     return command
+
+
+def _built(shape: Path, settings: dict[str, Any]) -> tuple[LaplaceBeltrami, Any]:
+    """The operator of the shape in a file, and its faces; its options are taken out of the settings."""
+    vertices, faces = read_shape(shape)
+    options = {name: settings.pop(name) for name in OF_THE_OPERATOR}
+    if options.pop("clean"):
+        vertices, faces = cleaned(vertices, faces)
+    return build_operator(vertices, faces, **options), faces
 
 
 def _stability(lb: LaplaceBeltrami) -> str:
@@ -99,7 +111,7 @@ def main() -> None:
     "--out", type=click.Path(path_type=Path), help="Picture; MESH_compare.png if left out."
 )
 @_stencil_options
-def compare(mesh: Path, k: int, out: Path | None, clean: bool, **options: Any) -> None:
+def compare(mesh: Path, k: int, out: Path | None, **settings: Any) -> None:
     """Report, stability and spectrum of MESH beside the cotangent operator's, and a picture.
 
     MESH is a mesh or a cloud, in any format of `read_shape`. A cloud has no cotangent operator.
@@ -109,24 +121,21 @@ def compare(mesh: Path, k: int, out: Path | None, clean: bool, **options: Any) -
       python -m torchlb compare bunny.ply
       python -m torchlb compare scan.xyz --order 2 -k 50 --out scan.png
     """
-    vertices, faces = read_shape(mesh)
-    if clean:
-        vertices, faces = cleaned(vertices, faces)
-    start = time.perf_counter()
-    lb = build_operator(vertices, faces, **options)
-    click.echo(f"{mesh.name}: {_size(vertices, faces)}\n{lb}")
+    start, order = time.perf_counter(), settings["order"]
+    lb, faces = _built(mesh, settings)
+    click.echo(f"{mesh.name}: {_size(lb.points, faces)}\n{lb}")
     click.echo(f"built in {time.perf_counter() - start:.1f} s\n\n{lb.report}\n{_stability(lb)}\n")
     operators = {"torchlb": lb}
     if faces is not None:
         try:
-            operators["cotangent"] = LaplaceBeltrami.from_cotangent(vertices, faces)
+            operators["cotangent"] = LaplaceBeltrami.from_cotangent(lb.points, faces)
         except ValueError as error:
             click.echo(f"no cotangent operator to compare with: {error}", err=True)
     values = spectra(operators, k)
     click.echo(f"smallest eigenvalues of −Δ, 1/length²\n{spectrum_table(values)}")
     out = out or Path(f"{mesh.stem}_compare.png")
     try:
-        draw_comparison(lb, faces, values, out, f"{mesh.name}, order {options['order']} requested")
+        draw_comparison(lb, faces, values, out, f"{mesh.name}, order {order} requested")
     except ImportError as error:
         click.echo(f'no picture: {error}; pip install ".[plot]" in a clone', err=True)
     else:
@@ -135,24 +144,13 @@ def compare(mesh: Path, k: int, out: Path | None, clean: bool, **options: Any) -
 
 @main.command()
 @click.argument("folder", type=click.Path(exists=True, file_okay=False, path_type=Path))
-@click.option(
-    "--out", type=click.Path(file_okay=False, path_type=Path), required=True, help="Cache to fill."
-)
+@click.option("--out", type=FOLDER, required=True, help="Cache to fill.")
 @click.option("--operator", type=click.Choice(get_args(Operator)), default="stencil")
 @click.option("-k", type=click.IntRange(min=0), default=0, help="Eigenpairs.")
 @click.option("--workers", type=int, default=-1, help="Processes; -1: all cores.")
 @click.option("--quiet", is_flag=True, help="No progress bar.")
 @_stencil_options
-def precompute(
-    folder: Path,
-    out: Path,
-    operator: Operator,
-    k: int,
-    workers: int,
-    quiet: bool,
-    clean: bool,
-    **options: Any,
-) -> None:
+def precompute(folder: Path, out: Path, operator: Operator, quiet: bool, **settings: Any) -> None:
     """Compute the operators of all shapes in FOLDER and store them, each once.
 
     What is in the cache is left as it is: after an interruption, give the same command again. A shape that fails stops
@@ -165,12 +163,10 @@ def precompute(
     """
     if operator == "cotangent":
         context = click.get_current_context()
-        default = ParameterSource.DEFAULT
-        given = [name for name in options if context.get_parameter_source(name) != default]
-        if given:
-            raise click.UsageError(f"the cotangent operator has no --{' --'.join(given)}")
-        options = {}
-    settings: dict[str, Any] = {"k": k, "workers": workers, "clean": clean, **options}
+        for name in OF_THE_OPERATOR.keys() - {"clean"}:
+            del settings[name]
+            if context.get_parameter_source(name) != ParameterSource.DEFAULT:
+                raise click.UsageError(f"the cotangent operator has no --{name}")
     report = precompute_operators(folder, out, operator=operator, progress=not quiet, **settings)
     click.echo(str(report))
     if report.failed:
@@ -212,12 +208,9 @@ def _to_file(compute: Callable[..., dict[str, Any]]) -> Callable[..., None]:
     @click.option("--out", type=click.Path(path_type=Path), required=True, help="Where to write.")
     @click.argument("shape", type=FILE)
     @wraps(compute)
-    def run(shape: Path, out: Path, clean: bool, **own: Any) -> None:
-        vertices, faces = read_shape(shape)
-        vertices, faces = cleaned(vertices, faces) if clean else (vertices, faces)
-        options = {name: own.pop(name) for name in ("order", "projection", "weights", "certify")}
-        lb = build_operator(vertices, faces, **options)
-        write_shape(out, lb.points, lb.faces, **compute(lb, **own))
+    def run(shape: Path, out: Path, **settings: Any) -> None:
+        lb, faces = _built(shape, settings)
+        write_shape(out, lb.points, lb.faces, **compute(lb, **settings))
         click.echo(f"{out}: {_size(lb.points, faces)}")
 
     return run

@@ -60,10 +60,8 @@ def load_or_build(
         "stencil" (`from_mesh` or `from_points`) or "cotangent" (`from_cotangent`).
     k
         Number of eigenpairs to have in the file. A file with fewer is completed; one with more serves.
-    overwrite
-        Whether to build the operator even if it is stored.
-    progress, **options
-        Arguments of the builder, such as ``order=5``.
+    overwrite, progress, **options
+        Whether to build the operator even if it is stored; arguments of the builder, such as ``order=5``.
 
     Returns what the builder returns, in the floating type of `vertices`, on the CPU, and raises what it raises; an
     InputError if `cache` is a file, an OSError if the folder cannot be read. A `CacheWarning` reports a file that is
@@ -79,9 +77,8 @@ def load_or_build(
     True
     """
     warn_of_gradients(vertices, "vertices")
-    builder, points, corners = builder_of(vertices, faces, operator)
-    options = complete_options(builder, options)
-    key = _key(operator, points, corners, options)
+    _, points, corners = builder_of(vertices, faces, operator)
+    key = operator_key(points, corners, operator=operator, **options)
     path = Path(cache).expanduser() / f"{key}.npz"
     if path.parent.exists() and not path.parent.is_dir():
         raise InputError(f"cache: expected a folder, {path.parent} is a file")
@@ -91,7 +88,10 @@ def load_or_build(
             lb = build_operator(points, corners, operator=operator, progress=progress, **options)
         if k > 0:
             lb.eigenbasis(k, store=True)
-        _store(lb, path, key)
+        try:
+            save_operator(lb, path, key=key)
+        except OSError as error:  # the result must not be lost
+            warn(f"{path}: not written ({error}), so the next call computes it again", CacheWarning)
     return lb.to(float_type(vertices))
 
 
@@ -113,28 +113,18 @@ def operator_key(
     True
     """
     builder, points, corners = builder_of(vertices, faces, operator)
-    return _key(operator, points, corners, complete_options(builder, options))
-
-
-def _key(operator: str, points: Tensor, faces: Tensor | None, options: dict[str, Any]) -> str:
-    """SHA-256 of a canonical form: JSON for plain values, little-endian bytes for arrays."""
+    values = {"points": points, "faces": corners, "operator": operator, "version": __version__}
     digest = hashlib.sha256()
-    arrays = {"points": points, "faces": faces}
-    plain: dict[str, Any] = {"operator": operator, "version": __version__}
-    for name, value in options.items():
+    for name, value in sorted((values | complete_options(builder, options)).items()):
         value = value.plain if isinstance(value, Condition) else value
         if isinstance(value, Tensor | np.ndarray | list | tuple):
-            arrays[f"option {name}"] = as_tensor(value)
+            array = as_tensor(value).detach().cpu()
+            kind = "<f8" if array.is_floating_point() else "<i8"
+            data = array.numpy().astype(kind, order="C") + 0  # −0.0 becomes 0.0
+            digest.update(f"{name} {kind} {data.shape}\n".encode() + data.tobytes())
         else:
-            plain[f"option {name}"] = value.item() if isinstance(value, np.generic) else value
-    digest.update(json.dumps(plain, sort_keys=True).encode())
-    for name, array in arrays.items():
-        if array is not None:
-            values = array.detach().cpu()
-            kind = "<f8" if values.is_floating_point() else "<i8"
-            data = values.numpy().astype(kind) + 0  # −0.0 becomes 0.0
-            digest.update(f"\n{name} {kind} {data.shape}\n".encode())
-            digest.update(np.ascontiguousarray(data).tobytes())
+            value = value.item() if isinstance(value, np.generic) else value
+            digest.update(f"{name} {json.dumps(value, sort_keys=True)}\n".encode())
     return digest.hexdigest()
 
 
@@ -150,14 +140,6 @@ def _cached(path: Path, key: str) -> LaplaceBeltrami | None:
     except OperatorFileError as error:
         warn(f"{error}. It is computed again and replaced", CacheWarning)
         return None
-
-
-def _store(lb: LaplaceBeltrami, path: Path, key: str) -> None:
-    """Store an operator in the cache; warn if that fails, since the result must not be lost."""
-    try:
-        save_operator(lb, path, key=key)
-    except OSError as error:
-        warn(f"{path}: not written ({error}), so the next call computes it again", CacheWarning)
 
 
 def save_operator(lb: LaplaceBeltrami, path: str | Path, *, key: str = "") -> None:
@@ -182,15 +164,12 @@ def save_operator(lb: LaplaceBeltrami, path: str | Path, *, key: str = "") -> No
     path = Path(path).expanduser()
     state = lb.state_dict()
     header = {"format": FORMAT, "version": __version__, "key": key}
-    header |= {"state": state.pop("_extra_state"), "types": {}}
-    arrays = {}
-    for name, tensor in state.items():
-        header["types"][name] = str(tensor.dtype).removeprefix("torch.")
-        arrays[name] = _compact(tensor.detach().cpu()).numpy()
-    arrays["header"] = np.array(json.dumps(header))
+    header |= {"state": state.pop("_extra_state")}
+    header["types"] = {name: str(x.dtype).removeprefix("torch.") for name, x in state.items()}
+    arrays: dict[str, Any] = {n: _compact(x.detach().cpu()).numpy() for n, x in state.items()}
     path.parent.mkdir(parents=True, exist_ok=True)
     with written_whole(path, "xb") as file:
-        np.savez(file, **arrays)
+        np.savez(file, **arrays, header=np.array(json.dumps(header)))
 
 
 @contextmanager
@@ -207,10 +186,6 @@ def written_whole(path: Path, mode: str, **options: Any) -> Iterator[IO[Any]]:
     except BaseException:
         beside.unlink(missing_ok=True)
         raise
-    if os.name == "posix":  # flush the directory entry, too
-        folder = os.open(path.parent, os.O_RDONLY)
-        os.fsync(folder)
-        os.close(folder)
 
 
 def _compact(tensor: Tensor) -> Tensor:

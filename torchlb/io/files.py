@@ -1,7 +1,8 @@
-"""Shapes from files and to files: by `formats`, by NumPy, and through trimesh, nibabel and meshio."""
+"""Shapes from files and to files: by `formats`, by NumPy, and through trimesh, nibabel and pyvista."""
 
 from __future__ import annotations
 
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -11,20 +12,23 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from torchlb.errors import InputError
-from torchlb.geometry.complex import edges_of
-from torchlb.io import libraries
 from torchlb.io.formats import READERS, numbers_of
-from torchlb.operator.cleaning import merged, proper_faces, triangles_of
+from torchlb.operator.cleaning import merged, triangles_of
 from torchlb.operator.inputs import ArrayLike, as_tensor, check_corners, check_points
 
-OTHERS = (".gii", ".glb", ".gltf", ".npy", ".npz", ".stl", ".vtk", ".vtu")
-SUFFIXES = tuple(sorted([*OTHERS, *READERS]))
+VTK, CELLS = (".vtk", ".vtp", ".vtu"), ("VERTEX", "LINE", "TRIANGLE", "TETRA")
+OTHERS = (".gii", ".glb", ".gltf", ".npy", ".npz", ".stl")
+SUFFIXES = tuple(sorted([*OTHERS, *VTK, *READERS]))
 """Endings of the files that `read_shape` takes."""
 STEPS = 4
 """Largest difference of coinciding corners in an .stl, in steps of float32 at the largest coordinate."""
 OF_THE_SHAPE = ("vertices", "points", "pos", "faces")
 """Names in a .npz that are not of data."""
+SURFACE, MAP = b"\xff\xff\xfe", b"\xff\xff\xff"
+"""Beginnings of FreeSurfer's files, whose endings may be any."""
 Shape = tuple[Float[Tensor, "N n"], Int[Tensor, "F v"] | None]
+Contents = tuple[Any, Any, dict[str, Any]]
+"""Vertices and cells, or None, and the data of the points by name."""
 
 
 def arrays_of(shape: Any) -> Shape:
@@ -48,11 +52,11 @@ def read_shape(path: str | Path) -> Shape:
     path
         A mesh (.ply, .obj, .off, .stl, .glb, .gltf), whose polygons are split into triangles, along the shorter
         diagonal of a quad; without faces it is a cloud. A surface of GIFTI (.gii) or FreeSurfer (lh.pial, …), through
-        nibabel. An unstructured grid of VTK (.vtk, .vtu), through meshio: tetrahedra, else triangles, else lines. A
-        cloud in .pcd, or a table of numbers (.xyz, .txt, .csv, .pts, .asc) with the coordinates in the columns x, y, z,
-        or in the first three. An array (N, n) of points in .npy; or a .npz with `vertices` (or `points`, or `pos`) and,
-        for a mesh, `faces`. The corners of an .stl, which has no vertices, are merged where they coincide, and along
-        open edges where they differ by rounding.
+        nibabel. Polydata or an unstructured grid of VTK (.vtk, .vtp, .vtu), through pyvista: tetrahedra, else
+        triangles, else lines. A cloud in .pcd, or a table of numbers (.xyz, .txt, .csv, .pts, .asc) with the
+        coordinates in the columns x, y, z, or in the first three. An array (N, n) of points in .npy; or a .npz with
+        `vertices` (or `points`, or `pos`) and, for a mesh, `faces`. The corners of an .stl, which has no vertices, are
+        merged where they coincide to rounding.
 
     Raises
     ------
@@ -63,55 +67,123 @@ def read_shape(path: str | Path) -> Shape:
     """
     vertices, faces, data = _read(path)
     if vertices is None:
-        names = f"neither vertices nor points among {list(data)}"
         raise InputError(
-            f"{path}: not a mesh or cloud, {names}; torchlb.read_point_data reads data"
+            f"{path}: not a mesh or cloud, neither vertices nor points among {list(data)}; "
+            "torchlb.read_point_data reads data"
         )
-    return vertices.double(), faces
+    return as_tensor(vertices).double(), None if faces is None else as_tensor(faces).long()
 
 
 def read_point_data(path: str | Path) -> dict[str, Tensor]:
     """Data of the points in the file `path` by name, (N,) or (N, C), in the type and order of the file.
 
-    Arrays of a .npz besides the shape; those of .vtk and .vtu, through meshio; of .gii, and FreeSurfer's maps
-    (lh.thickness, lh.curv, …), through nibabel. Raises a ValueError for a file without data, else as `read_shape`.
+    Arrays of a .npz besides the shape; those of .vtk, .vtp and .vtu, through pyvista; of .gii, and FreeSurfer's maps
+    (lh.thickness, .mgh, .mgz) and labels (.annot, as numbers of its table), through nibabel. Raises a ValueError for a
+    file without data, else as `read_shape`.
     """
     data = _read(path)[2]
     if not data:
-        raise InputError(f"{path}: no data of points; .npz, .vtk, .vtu, .gii, lh.curv, … hold some")
+        raise InputError(f"{path}: no data of points; .npz, .vtk, .gii, .mgz, lh.curv, … hold some")
     return {name: as_tensor(values) for name, values in data.items()}
 
 
-def _read(path: str | Path) -> libraries.Contents:
+def _read(path: str | Path) -> Contents:
     """The vertices, cells and data in a file, if any."""
-    path, data = Path(path).expanduser(), {}
+    path = Path(path).expanduser()
     suffix = path.suffix.lower()
     if not path.is_file():
         raise FileNotFoundError(f"{path}: no such file")
     try:
         if suffix == ".npy":
-            vertices, faces = as_tensor(np.load(path, allow_pickle=False)), None
+            found = np.load(path, allow_pickle=False), None, {}
         elif suffix == ".npz":
-            vertices, faces, data = _npz(path)
+            found = _npz(path)
         elif suffix in READERS:
-            vertices, faces = _triangulated(*READERS[suffix](path))
-        elif (found := libraries.read(path)) is not None:
-            vertices, faces, data = found
+            found = *_triangulated(*READERS[suffix](path)), {}
+        elif suffix in VTK:
+            found = _vtk(path)
+        elif suffix == ".gii":
+            found = _gifti(path)
+        elif suffix in (".annot", ".mgh", ".mgz") or _start(path) in (SURFACE, MAP):
+            found = _freesurfer(path)
         else:
-            import trimesh
-
-            loaded = trimesh.load(path, process=False, maintain_order=True, skip_materials=True)
-            vertices, faces = arrays_of(loaded)
-            if suffix == ".stl" and faces is not None:
-                vertices, faces = _sewn(vertices, faces)
-        if vertices is not None and (vertices.ndim != 2 or vertices.numel() == 0):
-            raise InputError(f"vertices of shape {tuple(vertices.shape)}, expected (N, n)")
+            found = *_by_trimesh(path), {}
+        shape = (1, 1) if found[0] is None else found[0].shape
+        if len(shape) != 2 or 0 in shape:
+            raise InputError(f"vertices of shape {tuple(shape)}, expected (N, n)")
     except Exception as error:  # each reader raises its own
         raise InputError(
             f"{path}: not a mesh or cloud that can be read; {', '.join(SUFFIXES)} and FreeSurfer's surfaces can "
             f"({error})"
         ) from error
-    return vertices, faces, data
+    return found
+
+
+def _library(name: str) -> Any:
+    """The module; InputError that says how to install it where it is missing."""
+    try:
+        return import_module(name)
+    except ImportError as error:
+        raise InputError(f"{name} is needed: pip install {name}, or torchlb[files]") from error
+
+
+def _start(path: Path) -> bytes:
+    with open(path, "rb") as file:
+        return file.read(len(SURFACE))
+
+
+def _vtk(path: Path) -> Contents:
+    """A polydata or unstructured grid: its cells of the highest dimension, polygons and strips as triangles."""
+    pyvista = _library("pyvista")
+    with pyvista.VtkErrorCatcher(send_to_logging=False) as heard:
+        mesh = pyvista.read(path)
+    if heard.events:  # of a damaged file VTK makes up the rest
+        raise InputError(f"VTK says: {heard.events[0]}")
+    if isinstance(mesh, pyvista.PolyData):
+        mesh = mesh.triangulate(pass_lines=True)
+    grid = mesh.cast_to_unstructured_grid()
+    cells = {pyvista.CellType(kind).name: corners for kind, corners in grid.cells_dict.items()}
+    other = ", ".join(cells.keys() - {*CELLS}).lower()
+    if other:
+        raise InputError(f"cells {other}; expected tetrahedra, triangles or lines")
+    chosen = next((cells[kind] for kind in CELLS[:0:-1] if kind in cells), None)
+    return mesh.points, chosen, dict(mesh.point_data)
+
+
+def _gifti(path: Path) -> Contents:
+    """A surface and maps of GIFTI; maps without a name are numbered."""
+    data = {}
+    for number, array in enumerate(_library("nibabel").load(path).darrays):
+        role = {1008: "POINTSET", 1009: "TRIANGLE"}.get(array.intent)  # codes of NIfTI
+        name = role or array.meta.get("Name") or f"data_{number}"
+        data[f"{name}_{number}" if name in data else name] = array.data
+    return data.pop("POINTSET", None), data.pop("TRIANGLE", None), data
+
+
+def _freesurfer(path: Path) -> Contents:
+    """A surface, or labels or maps under the last part of their name, as of lh.thickness and lh.thickness.mgz."""
+    nibabel, suffix = _library("nibabel"), path.suffix.lower()
+    if _start(path) == SURFACE:
+        return *nibabel.freesurfer.read_geometry(path), {}
+    if suffix in (".mgh", ".mgz"):
+        values = np.asarray(nibabel.load(path).dataobj)
+        if values.shape[1:3] != (1, 1):
+            raise InputError(f"a volume of shape {values.shape}, not a map of points")
+        return None, None, {path.stem.rpartition(".")[2]: values.squeeze((1, 2))}
+    if suffix == ".annot":
+        return None, None, {path.stem.rpartition(".")[2]: nibabel.freesurfer.read_annot(path)[0]}
+    return None, None, {suffix[1:]: nibabel.freesurfer.read_morph_data(path)}
+
+
+def _by_trimesh(path: Path) -> Shape:
+    """What trimesh reads; the corners of an .stl become vertices."""
+    import trimesh
+
+    shape = trimesh.load(path, process=False, maintain_order=True, skip_materials=True)
+    vertices, faces = arrays_of(shape)
+    if path.suffix.lower() == ".stl" and faces is not None:
+        return _sewn(vertices, faces)
+    return vertices, faces
 
 
 def write_shape(
@@ -119,7 +191,7 @@ def write_shape(
 ) -> None:
     """Write a mesh or cloud, with data of its points, in the format that the ending of `path` names.
 
-    .npz holds every shape; .vtk and .vtu, through meshio, those of R² and R³; .gii, through nibabel, triangles, in
+    .npz holds every shape; .vtk and .vtu, through pyvista, those of R² and R³; .gii, through nibabel, triangles, in
     single precision, and .func.gii and .shape.gii the data alone; .ply, .obj, .off, .stl and .glb, through trimesh,
     triangles and points of R³ without data. `points` are (N, n), `cells` (F, 3) triangles, (F, 2) segments, (F, 4)
     tetrahedra or None, `point_data` (N,) or (N, C), by name: ``write_shape("a.vtu", points, faces, thickness=f)``.
@@ -140,8 +212,8 @@ def write_shape(
     flat = places.shape[1] == corners.shape[1] == 3
     if suffix == ".npz":
         np.savez(path, **{"vertices": places, "faces": corners, **data})
-    elif (suffix in libraries.BY_MESHIO and places.shape[1] < 4) or (suffix == ".gii" and flat):
-        libraries.write(path, places, corners, data)
+    elif (suffix in (".vtk", ".vtu") and places.shape[1] < 4) or (suffix == ".gii" and flat):
+        _write(path, places, corners, data)
     elif suffix in (".ply", ".obj", ".off", ".stl", ".glb") and flat and not data:
         import trimesh
 
@@ -157,10 +229,34 @@ def write_shape(
         )
 
 
+def _write(path: Path, points: np.ndarray, cells: np.ndarray, data: dict[str, np.ndarray]) -> None:
+    """VTK's unstructured grid in three columns, or GIFTI, in float32 and int32 and by columns of the data."""
+    if path.suffix.lower() != ".gii":
+        pyvista, corners = _library("pyvista"), cells.shape[1] if len(cells) else 1
+        cells = cells if len(cells) else np.arange(len(points))[:, None]
+        points = np.pad(points, ((0, 0), (0, 3 - points.shape[1])))
+        grid = pyvista.UnstructuredGrid({pyvista.CellType[CELLS[corners - 1]]: cells}, points)
+        for name, values in data.items():
+            grid.point_data[name] = values.astype(np.int32) if values.dtype == bool else values
+        return grid.save(path)
+    nibabel, arrays = _library("nibabel"), [("", "POINTSET", points), ("", "TRIANGLE", cells)]
+    if path.name.lower().endswith((".func.gii", ".shape.gii")):
+        arrays = []
+    for name, values in data.items():
+        for c, column in enumerate(values.reshape(len(values), -1).T):
+            arrays.append((name if values.ndim == 1 else f"{name}_{c}", "NONE", column))
+    image, array_of = nibabel.GiftiImage(), nibabel.gifti.GiftiDataArray
+    for name, intent, values in arrays:
+        values = values.astype(np.int32 if values.dtype.kind in "biu" else np.float32)
+        array = array_of(values, f"NIFTI_INTENT_{intent}", meta={"Name": name})
+        image.darrays += [array] if len(values) else []
+    return nibabel.save(image, path)
+
+
 def may_be_shape(path: Path) -> bool:
     """Whether a file is taken for a shape, by its ending; .txt and .csv by three numbers in their first row."""
     if path.suffix.lower() not in (".csv", ".txt"):
-        return path.suffix.lower() in SUFFIXES or libraries.begins(path, libraries.SURFACE)
+        return path.suffix.lower() in SUFFIXES or _start(path) == SURFACE
     try:
         return len(next(numbers_of(path), ([], []))[1]) > 2
     except InputError:
@@ -188,29 +284,17 @@ def _triangulated(
 
 
 def _sewn(vertices: Float[Tensor, "N 3"], faces: Int[Tensor, "F 3"]) -> tuple[Tensor, Tensor]:
-    """Merge the corners of triangles into vertices: equal corners, and at open edges those that differ by rounding.
-
-    An open edge belongs to one triangle; ends of an edge are never merged. So a closed mesh keeps all its vertices.
-    """
-    vertices, number = torch.unique(vertices, dim=0, return_inverse=True)
-    faces = number[faces]
-    found = edges_of(proper_faces(faces).numpy(), len(vertices))
-    edges = np.stack(np.divmod(found.keys, len(vertices)), 1)
-    rim = np.unique(edges[found.uses == 1])
-    if len(rim) == 0:
-        return vertices, faces
-    between = torch.from_numpy(np.searchsorted(rim, edges[np.isin(edges, rim).all(1)]))
+    """Merge the corners of triangles that are equal, and that differ by rounding unless an edge is as short as that."""
+    edges = faces[:, [0, 1, 1, 2, 2, 0]].view(-1, 2)
     reach = STEPS * torch.finfo(torch.float32).eps * float(vertices.abs().max())
-    one, rim = torch.arange(len(vertices)), torch.from_numpy(rim)
-    one[rim] = rim[merged(vertices[rim], reach, between)]
-    kept, number = torch.unique(one, return_inverse=True)
+    kept, number = torch.unique(merged(vertices, reach, edges), return_inverse=True)
     return vertices[kept], number[faces]
 
 
-def _npz(path: Path) -> libraries.Contents:
+def _npz(path: Path) -> Contents:
     with np.load(path, allow_pickle=False) as archive:
         arrays = dict(archive)
-    data = {name: array for name, array in arrays.items() if name not in OF_THE_SHAPE}
-    shape = [as_tensor(arrays[name]) for name in OF_THE_SHAPE if name in arrays]
-    faces = shape.pop().long() if "faces" in arrays and arrays["faces"].size else None
-    return shape[0] if shape else None, faces, data
+    shape = {name: arrays.pop(name) for name in OF_THE_SHAPE if name in arrays}
+    faces = shape.pop("faces", None)
+    vertices = next(iter(shape.values()), None)
+    return vertices, None if faces is None or faces.size == 0 else faces, arrays

@@ -24,15 +24,14 @@ TYPES = {
     **{"int32": "i4", "uint32": "u4", "float32": "f4", "float64": "f8"},
 }
 """Types of .ply, as NumPy names them."""
+Property = tuple[str, str, str | None]
+"""Name of a property of .ply, its type, and that of its length if it is a list."""
 
 
-def _polygons(vertices: Any, faces: Any) -> Polygons:
-    """Vertices and polygons, from faces as rows of an array or as lists of corners."""
-    if isinstance(faces, np.ndarray):
-        sizes, corners = np.full(len(faces), faces.shape[1]), faces.ravel()
-    else:
-        sizes, corners = np.fromiter(map(len, faces), int), np.fromiter(chain(*faces), int)
-    return np.asarray(vertices, dtype=float), corners.astype(np.int64), sizes
+def _polygons(vertices: Any, faces: list[Any]) -> Polygons:
+    """Vertices and polygons, from faces as lists of corners."""
+    sizes, corners = np.fromiter(map(len, faces), int), np.fromiter(chain(*faces), int)
+    return np.asarray(vertices, dtype=float), corners, sizes
 
 
 def read_obj(path: Path) -> Polygons:
@@ -77,79 +76,63 @@ def read_ply(path: Path) -> Polygons:
     if end is None or not data.startswith(b"ply"):
         raise InputError("no header of a .ply")
     order, at = "", end.end()
-    elements: list[tuple[str, int, list[tuple[str, str, str | None]]]] = []
+    elements: list[tuple[str, int, list[Property]]] = []
     for line in data[: end.start()].decode("ascii", "replace").splitlines():
         match line.split():
             case ["format", kind, *_]:
                 order = {"binary_little_endian": "<", "binary_big_endian": ">"}.get(kind, "")
             case ["element", name, count]:
                 elements.append((name, int(count), []))
-            case ["property", "list", size, kind, name]:
-                elements[-1][2].append((name, _type(kind, order), _type(size, order)))
-            case ["property", kind, name]:
-                elements[-1][2].append((name, _type(kind, order), None))
-    if not order:
+            case [
+                "property",
+                *kinds,
+                name,
+            ]:  # a number, or a list: the types of its length and of its numbers
+                types = [
+                    order + TYPES[kind] if order else "<f8" for kind in kinds if kind != "list"
+                ]
+                elements[-1][2].append((name, types[-1], types[0] if len(types) == 2 else None))
+    if not order:  # an ascii file is read as a binary one of doubles
         data, at = np.array(data[at:].split()).astype("<f8").tobytes(), 0
-    vertices, faces = np.zeros((0, 3)), None
+    vertices, faces = [np.zeros((0, 3))], [np.zeros((0, 3))]
     for name, count, properties in elements:
-        columns, at = _element(data, at, count, properties)
+        blocks, at = _blocks(data, at, count, properties)
         if name == "vertex":
-            vertices = np.stack([np.ravel(columns[axis]) for axis in "xyz"], 1)
-        elif name in ("face", "tristrips") and count:
+            vertices = [np.hstack([block[axis] for axis in "xyz"]) for block in blocks]
+        elif name in ("face", "tristrips"):
             lists = [title for title, _, size in properties if size]
-            corners = columns[next((n for n in lists if n.startswith("vertex_ind")), lists[0])]
-            if name == "tristrips":
-                strips = (_strip(strip.astype(np.int32)) for strip in corners)
-                corners = list(chain.from_iterable(strips))
-            faces = corners if faces is None else [*faces, *corners]
-    return _polygons(vertices, [] if faces is None else faces)
+            title = next((n for n in lists if n.startswith("vertex_ind")), lists[0])
+            rows = [block[title].astype(int) for block in blocks]
+            strips = chain(*rows) if name == "tristrips" else ()
+            faces += [t[None] for strip in strips for t in _strip(strip)] or rows
+    sizes = np.concatenate([np.full(len(rows), rows.shape[1]) for rows in faces])
+    corners = np.concatenate([rows.ravel() for rows in faces]).astype(int)
+    return np.concatenate(vertices).astype(float), corners, sizes
 
 
-def _type(name: str, order: str) -> str:
-    """NumPy's name of a type; an ascii file is read as a binary one of doubles."""
-    return order + TYPES[name] if order else "<f8"
-
-
-def _element(
-    data: bytes, at: int, count: int, properties: list[tuple[str, str, str | None]]
-) -> tuple[dict[str, Any], int]:
-    """Values of each property in every row, a list of arrays for a list, and the offset of the next element.
-
-    If all rows are as long as the first, they are read at once.
-    """
-    if count == 0:
-        return {name: [] for name, *_ in properties}, at
-    first, _ = _row(data, at, properties)
-    fields: list[Any] = []
-    for (name, kind, size), values in zip(properties, first, strict=True):
-        fields += [(f"size of {name}", size)] if size else []
-        fields.append((name, kind, (len(values),)) if size else (name, kind))
-    row = np.dtype(fields)
-    if at + count * row.itemsize <= len(data):
-        table = np.frombuffer(data, row, count, at)
-        sizes = [(table[f"size of {name}"], table[name].shape[1]) for name, _, s in properties if s]
-        if all((size == width).all() for size, width in sizes):
-            return {name: table[name] for name, *_ in properties}, at + table.nbytes
-    rows = []
-    for _ in range(count):
-        values, at = _row(data, at, properties)
-        rows.append(values)
-    columns = zip(*rows, strict=True)
-    return {name: list(c) for (name, *_), c in zip(properties, columns, strict=True)}, at
-
-
-def _row(
-    data: bytes, at: int, properties: list[tuple[str, str, str | None]]
+def _blocks(
+    data: bytes, at: int, count: int, properties: list[Property]
 ) -> tuple[list[np.ndarray], int]:
-    values = []
-    for _, kind, size in properties:
-        count = 1
-        if size:
-            count = int(np.frombuffer(data, size, 1, at)[0])
-            at += np.dtype(size).itemsize
-        values.append(np.frombuffer(data, kind, count, at))
-        at += values[-1].nbytes
-    return values, at
+    """Rows of an element, in blocks within which lists are as long as in the first row, and where they end."""
+    blocks, ahead = [], count
+    while count:
+        fields: list[tuple[str, str, tuple[int, ...]]] = []
+        for name, kind, size in properties:
+            length = 1
+            if size:
+                length = int(np.frombuffer(data, size, 1, at + np.dtype(fields).itemsize)[0])
+                fields.append((f"size of {name}", size, ()))
+            fields.append((name, kind, (length,)))
+        row = np.dtype(fields)
+        rows = max(1, min(ahead, count, (len(data) - at) // row.itemsize))
+        table = np.frombuffer(data, row, rows, at)
+        alike = np.ones(rows, dtype=bool)
+        for name in (name for name, _, size in properties if size):
+            alike &= table[f"size of {name}"] == table[name].shape[1]
+        blocks.append(table if alike.all() else table[: alike.argmin()])
+        ahead = 2 * len(blocks[-1])  # one row in a thousand of another length costs no more
+        count, at = count - len(blocks[-1]), at + blocks[-1].nbytes
+    return blocks, at
 
 
 def _strip(corners: Int[np.ndarray, " C"]) -> Iterator[np.ndarray]:

@@ -12,6 +12,7 @@ import time
 import warnings
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import suppress
 from dataclasses import asdict, dataclass, fields
 from functools import partial
 from pathlib import Path
@@ -90,10 +91,8 @@ class PrecomputeReport:
         counts = Counter(result.status for result in self.results)
         parts = [f"{counts[status]} {status}" for status in ("built", "cached", "failed")]
         lines = [", ".join([f"{len(self.results)} shapes", *parts])]
-        for title, chosen in (
-            ("failed", self.failed),
-            ("warned", [r for r in self.results if r.message and r.status != "failed"]),
-        ):
+        warned = [r for r in self.results if r.message and r.status != "failed"]
+        for title, chosen in (("failed", self.failed), ("warned", warned)):
             width = max((len(result.name) for result in chosen), default=0)
             lines += [title] if chosen else []
             lines += [f"  {r.name:<{width}}  {' '.join(r.message.split())}" for r in chosen]
@@ -142,10 +141,13 @@ def precompute_operators(
     check_options_of(operator, options)
     cache = Path(out).expanduser()
     sources, skipped = _sources(shapes, cache)
-    settings: dict[str, Any] = {"operator": operator, "k": k, "options": options}
-    work = partial(_solve, cache=str(cache.resolve()), clean=clean, **settings)
+    settings: dict[str, Any] = {"operator": operator, "k": k, **options}
+    work = partial(_solve, clean=clean, cache=str(cache.resolve()), settings=settings)
     cache.mkdir(parents=True, exist_ok=True)
-    _remove_stale(cache)
+    for path in cache.glob(".*.tmp"):  # of writers that were killed; another run may be faster
+        with suppress(FileNotFoundError):
+            if time.time() - path.stat().st_mtime > STALE:
+                path.unlink()
     results: dict[int, ShapeResult] = {}
     try:
         with tqdm(total=len(sources), unit="shape", disable=None if progress else True) as bar:
@@ -166,34 +168,35 @@ def _sources(
     shapes: str | Path | Iterable[Any], cache: Path
 ) -> tuple[list[tuple[str, Any]], tuple[str, ...]]:
     """Name and file, or arrays, of every shape, and the names of other files in the folder."""
-    if isinstance(shapes, str | Path):
-        folder = Path(shapes).expanduser()
-        if not folder.is_dir():
-            raise InputError(
-                f"{folder}: no such folder; give a folder, or a list of files or of arrays"
-            )
-        files = [
-            (str(path.relative_to(folder)), path.resolve())
-            for path in sorted(folder.rglob("*"))
-            if path.is_file()
-            and not path.name.startswith(".")
-            and cache.resolve() not in path.resolve().parents
-        ]
-        found = [file for file in files if may_be_shape(file[1])]
-        if not found:
-            raise InputError(f"{folder}: no shapes in it; they end in {', '.join(SUFFIXES)}")
-        return found, tuple(name for name, path in files if (name, path) not in found)
-    named = []
-    for i, shape in enumerate(shapes):
-        if isinstance(shape, str | Path):
-            named.append((str(shape), Path(shape).expanduser().resolve()))
-        elif isinstance(shape, tuple | list) and len(shape) == 2:
-            named.append((f"shape {i}", tuple(shape)))
-        else:
-            raise InputError(f"shape {i}: expected a file or (vertices, faces), got {type(shape)}")
-    if not named:
-        raise InputError("shapes: got none")
-    return named, ()
+    if not isinstance(shapes, str | Path):
+        named = [_source(i, shape) for i, shape in enumerate(shapes)]
+        if not named:
+            raise InputError("shapes: got none")
+        return named, ()
+    folder, skipped, found = Path(shapes).expanduser(), [], []
+    if not folder.is_dir():
+        raise InputError(
+            f"{folder}: no such folder; give a folder, or a list of files or of arrays"
+        )
+    for path in sorted(folder.rglob("*")):
+        name, place = str(path.relative_to(folder)), path.resolve()
+        if path.is_file() and path.name[0] != "." and cache.resolve() not in place.parents:
+            if may_be_shape(place):
+                found.append((name, place))
+            else:
+                skipped.append(name)
+    if not found:
+        raise InputError(f"{folder}: no shapes in it; they end in {', '.join(SUFFIXES)}")
+    return found, tuple(skipped)
+
+
+def _source(number: int, shape: Any) -> tuple[str, Any]:
+    """Name of a shape in a list, and its file or arrays."""
+    if isinstance(shape, str | Path):
+        return str(shape), Path(shape).expanduser().resolve()
+    if isinstance(shape, tuple | list) and len(shape) == 2:
+        return f"shape {number}", tuple(shape)
+    raise InputError(f"shape {number}: expected a file or (vertices, faces), got {type(shape)}")
 
 
 def _run(
@@ -202,51 +205,55 @@ def _run(
     """Yield results as they come. Where a worker dies, the tasks that may have killed it run again, each by itself."""
     import joblib
 
-    pending = dict(enumerate(sources))
+    backend, _ = joblib.parallel.get_active_backend()
+    lazy = getattr(backend, "supports_return_generator", False)
+    way = "generator_unordered" if lazy else "list"
+    settings: dict[str, Any] = {"batch_size": 1, "return_as": way}
+
+    def results(indices: Iterable[int], workers: int) -> Any:
+        parallel: Any = joblib.Parallel(n_jobs=workers, **settings)
+        return parallel([joblib.delayed(work)(i, *sources[i]) for i in indices])
+
+    pending = dict.fromkeys(range(len(sources)))
     while pending:
         try:
-            for index, result in _parallel(work, workers, pending):
+            for index, result in results(pending, workers):
                 del pending[index]
                 yield index, result
         except Exception:  # the worker catches errors of a shape: here the worker itself died
             number = joblib.effective_n_jobs(workers)
             for index in list(pending)[: 2 * number]:
-                task = {index: pending.pop(index)}
+                del pending[index]
                 try:
-                    [(_, result)] = _parallel(work, max(2, number), task)
+                    [(_, result)] = results([index], max(2, number))
                 except Exception as error:
                     reason = f"its process died: {type(error).__name__}: {error}".partition("\n")[0]
-                    result = ShapeResult(task[index][0], "failed", 0, 0.0, "", reason)
+                    result = ShapeResult(sources[index][0], "failed", 0, 0.0, "", reason)
                 yield index, result
 
 
-def _parallel(
-    work: Callable[..., Any], workers: int, tasks: dict[int, tuple[str, Any]]
-) -> Iterable[tuple[int, ShapeResult]]:
-    import joblib
-
-    backend, _ = joblib.parallel.get_active_backend()
-    lazy = getattr(backend, "supports_return_generator", False)
-    way = "generator_unordered" if lazy else "list"
-    settings: dict[str, Any] = {"n_jobs": workers, "batch_size": 1, "return_as": way}
-    parallel: Any = joblib.Parallel(**settings)
-    return parallel([joblib.delayed(work)(index, *task) for index, task in tasks.items()])
-
-
 def _solve(
-    index: int, name: str, source: Any, *, clean: bool, **settings: Any
+    index: int, name: str, source: Any, *, clean: bool, cache: str, settings: dict[str, Any]
 ) -> tuple[int, ShapeResult]:
-    """Compute one shape on one thread; any exception becomes its result."""
-    start = time.perf_counter()
+    """Compute and store the operator of one shape on one thread; any exception becomes its result."""
+    start, path, points = time.perf_counter(), Path(), 0
     try:
         with threads_for(0), warnings.catch_warnings(record=True) as caught:
             warnings.simplefilter("always", UserWarning)
             vertices, faces = read_shape(source) if isinstance(source, Path) else source
             if clean:
                 vertices, faces = cleaned(vertices, faces)
-            status, points, file = _stored(vertices, faces, **settings)
+            options = {name: value for name, value in settings.items() if name != "k"}
+            path = Path(cache) / f"{operator_key(vertices, faces, **options)}.npz"
+            before = path.stat().st_mtime_ns if path.exists() else None
+            points = load_or_build(
+                vertices, faces, cache=cache, progress=False, **settings
+            ).num_points
+            if not path.exists():
+                raise OSError("its operator was built and could not be written")
+        status = "cached" if path.stat().st_mtime_ns == before else "built"
         notes = {str(w.message) for w in caught if concerns_the_shape(w.message)}
-        message = "; ".join(sorted(notes))
+        file, message = str(path), "; ".join(sorted(notes))
     except Exception as error:
         status, points, file, message = "failed", 0, "", f"{type(error).__name__}: {error}"
     seconds = time.perf_counter() - start
@@ -256,36 +263,3 @@ def _solve(
 def concerns_the_shape(warning: Warning | str) -> bool:
     """Whether a warning concerns the shape; torch's about its own sparse tensors does not."""
     return isinstance(warning, UserWarning) and not str(warning).startswith("Sparse ")
-
-
-def _stored(
-    vertices: Any, faces: Any, cache: str, operator: Operator, k: int, options: dict[str, Any]
-) -> tuple[str, int, str]:
-    """Store the operator of one shape; return its status, number of points and file."""
-    path = Path(cache) / f"{operator_key(vertices, faces, operator=operator, **options)}.npz"
-    before = _identity(path)
-    settings: dict[str, Any] = {"cache": cache, "operator": operator, "k": k, **options}
-    lb = load_or_build(vertices, faces, progress=False, **settings)
-    after = _identity(path)
-    if after is None:
-        raise OSError("its operator was built and could not be written")
-    return "cached" if after == before else "built", lb.num_points, str(path)
-
-
-def _identity(path: Path) -> tuple[int, int] | None:
-    """Inode and time of a file, which change when it is replaced; None without a file."""
-    try:
-        found = path.stat()
-    except FileNotFoundError:
-        return None
-    return found.st_ino, found.st_mtime_ns
-
-
-def _remove_stale(cache: Path) -> None:
-    """Remove old temporary files of writers that were killed."""
-    for path in cache.glob(".*.tmp"):
-        try:
-            if time.time() - path.stat().st_mtime > STALE:
-                path.unlink()
-        except FileNotFoundError:
-            continue  # another run was faster

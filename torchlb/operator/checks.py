@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import operator
+from collections.abc import Sequence
 from typing import Any
 
 import torch
@@ -10,7 +11,7 @@ from jaxtyping import Bool, Float, Int
 from scipy.spatial import KDTree
 from torch import Tensor
 
-from torchlb.errors import InputError, first_few, warn
+from torchlb.errors import InputError, InputTypeError, first_few, warn
 from torchlb.fits.polynomials import num_monomials
 from torchlb.linalg.precision import NEGLIGIBLE, ROUNDING, SMALL
 from torchlb.operator.cleaning import (
@@ -24,6 +25,15 @@ from torchlb.operator.inputs import ArrayLike, check_corners, check_mask, check_
 
 MAX_EXTENT = 1e30
 """Largest extent of the points, and inverse of the smallest, for which all libraries called keep their digits."""
+
+
+def check_none(given: Sequence[Any], what: str) -> None:
+    """Refuse arguments by place, such as a mesh where points are expected."""
+    if given:
+        raise InputTypeError(
+            f"{what}; an operator is built by LaplaceBeltrami.from_mesh(vertices, faces), from_points(points) or "
+            "from_cotangent(vertices, faces)"
+        )
 
 
 def check_scale(points: Float[Tensor, "N n"]) -> None:

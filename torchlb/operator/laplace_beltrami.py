@@ -24,6 +24,7 @@ from torchlb.operator.batching import (
     split_parts,
 )
 from torchlb.operator.build_cloud import Reconstruction, build_cloud, built_again
+from torchlb.operator.checks import check_none
 from torchlb.operator.connection import Connection, connection_of
 from torchlb.operator.inputs import ArrayLike, check_points, float_type, warn_of_gradients
 from torchlb.operator.medium import checked_fields, pair_in, split_fields
@@ -76,18 +77,14 @@ class LaplaceBeltrami(StencilMethods, PairMethods):
     """
 
     def __init__(self, *given: Any) -> None:
-        if given:
-            raise InputTypeError(
-                "LaplaceBeltrami() takes no arguments; an operator is built by LaplaceBeltrami.from_mesh(vertices, "
-                "faces), from_points(points) or from_cotangent(vertices, faces)"
-            )
+        check_none(given, "LaplaceBeltrami() takes no arguments")
         super().__init__()
 
     @classmethod
     def from_points(
         cls,
         points: ArrayLike,
-        *,
+        *surplus: Any,
         dim: int | None = None,
         order: int = 3,
         normal_order: int | None = None,
@@ -133,9 +130,9 @@ class LaplaceBeltrami(StencilMethods, PairMethods):
         progress
             Whether to show a bar, on a terminal.
 
-        Raises InputError for bad input, naming the points and the remedy; StencilError where not even the low-order row
-        of a point can be built.
+        Raises InputError for bad input; StencilError where not even the low-order row of a point can be built.
         """
+        check_none(surplus, "from_points() takes points alone, and options by name")
         options = Options(
             order, normal_order, projection, weights, num_neighbors, condition, weak_form, certify
         )
@@ -178,10 +175,7 @@ class LaplaceBeltrami(StencilMethods, PairMethods):
             As for `from_points`. The order chooses the weak pair, too (degree of elements, of fits of functions): 1 and
             2 (2, 2), 3 (2, 3), 4 (3, 4), 5 and above (4, 6); its surface is that of the frames, of degree q.
 
-        Raises
-        ------
-        InputError
-            For bad input, such as vertices that belong to no face.
+        Raises InputError for bad input, such as vertices that belong to no face; `torchlb.submesh` cuts a part out.
         """
         options = Options(
             order, normal_order, projection, weights, num_neighbors, condition, weak_form, certify
