@@ -147,12 +147,16 @@ def test_commands_write_what_they_compute(mesh, tmp_path, monkeypatch):
     lb = LaplaceBeltrami.from_mesh(vertices, faces, order=2)
     gaps = torch.where(vertices[:, 2] > 0, vertices[:, 0], torch.nan)
     np.savez("maps.npz", f=vertices[:, 0].numpy(), gaps=gaps.numpy())
+    np.savez("zeros.npz", gaps=gaps.nan_to_num().numpy())  # as FreeSurfer has them
     curvatures = lb.curvatures()
     for arguments, expected in {
         ("modes", "-k", "5"): {"modes": lb.eigenbasis(5).eigenvectors},
         ("smooth", "--data", "maps.npz", "--fwhm", "0.4"): {
             "f": torchlb.smooth(lb, vertices[:, 0], 0.4),
             "gaps": torchlb.smooth(lb, gaps, 0.4, mask=~gaps.isnan()),
+        },
+        ("smooth", "--data", "zeros.npz", "--missing", "0", "--fwhm", "0.4"): {
+            "gaps": torchlb.smooth(lb, gaps, 0.4, mask=~gaps.isnan())
         },
         ("distance", "--source", "3", "--source", "7"): {
             "distance": torchlb.geodesic_distance(lb, [3, 7])

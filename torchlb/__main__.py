@@ -6,6 +6,7 @@ stderr, without a traceback.
 
 from __future__ import annotations
 
+import math
 import sys
 import time
 import warnings
@@ -98,7 +99,7 @@ def main() -> None:
     \b
     Examples:
       python -m torchlb compare bunny.ply
-      python -m torchlb smooth lh.pial --data lh.thickness --fwhm 10 --out smooth.func.gii
+      python -m torchlb smooth lh.pial --data lh.thickness --missing 0 --fwhm 10 --out smooth.func.gii
       python -m torchlb precompute shapes/ --out operators/ -k 128
       python -m torchlb info operators/0a1b….npz
     """
@@ -228,12 +229,14 @@ def modes(lb: LaplaceBeltrami, k: int) -> dict[str, Any]:
 @_to_file
 @click.option("--data", type=FILE, required=True, help="Maps, as read_point_data reads them.")
 @click.option("--fwhm", type=float, required=True, help="Full width at half maximum.")
-def smooth(lb: LaplaceBeltrami, data: Path, fwhm: float) -> dict[str, Any]:
-    """Write maps on SHAPE smoothed by a Gaussian; where they are NaN they count nothing and stay NaN."""
-    return {
-        name: heat.smooth(lb, f.double(), fwhm, mask=f.isfinite().view(len(f), -1).all(1))
-        for name, f in read_point_data(data).items()
-    }
+@click.option("--missing", type=float, default=math.nan, help="Value of points without data.")
+def smooth(lb: LaplaceBeltrami, data: Path, fwhm: float, missing: float) -> dict[str, Any]:
+    """Write maps on SHAPE smoothed by a Gaussian; points without data count nothing and become NaN."""
+    smoothed = {}
+    for name, f in read_point_data(data).items():
+        known = (f.isfinite() & (f != missing)).view(len(f), -1).all(1)
+        smoothed[name] = heat.smooth(lb, f.double(), fwhm, mask=known)
+    return smoothed
 
 
 @_to_file

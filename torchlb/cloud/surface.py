@@ -68,7 +68,7 @@ class SurfaceSummary:
     def __str__(self) -> str:
         """Summary of two lines, or three."""
         noise = f"; noise of {self.noise:.2g} smoothed" if self.noise else ""
-        noise += f"; {self.lone} lone points left out" if self.lone else ""
+        noise += f"; lone points: {self.lone}" if self.lone else ""
         text = (
             f"surface through the cloud: {self.reached} of {self.points} points, {self.stars} triangles of local stars"
             f"{noise}\n  {self.components} components, {self.boundary_loops} boundary loops, {self.holes_closed} gaps "
