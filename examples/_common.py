@@ -10,6 +10,7 @@ mpl.use("Agg")  # pictures go to files; no screen is needed
 import matplotlib.pyplot as plt
 import numpy as np
 import torch
+from PIL import Image
 
 from torchlb.plot.figures import LINE_COLORS
 from torchlb.surfaces import StarShaped, limit_surface
@@ -96,8 +97,11 @@ def minimize(loss, unknowns, steps):
 
 
 def save(figure, folder, name):
-    """Write a figure as a picture, close it, and say where it is."""
+    """Write a figure as a picture of 256 colours, which is small, close it, and say where it is."""
     folder.mkdir(parents=True, exist_ok=True)
     figure.savefig(folder / name, dpi=90)
     plt.close(figure)
+    with Image.open(folder / name) as picture:
+        small = picture.convert("RGB").quantize(256, Image.Quantize.MAXCOVERAGE, kmeans=4)
+    small.save(folder / name, optimize=True)
     print(folder / name)

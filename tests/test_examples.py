@@ -197,6 +197,21 @@ GALLERY = {  # options of a small run, and what it prints
         ["--points", "300", "--steps", "4", "--sphere", "60", "--times", "1"],
         "it falls in 20 of 20 steps",
     ),
+    "growing_pattern": (
+        ["--points", "100", "--steps", "8", "--sphere", "100"],
+        "20 steps: a harmonic that decays to 0.252 is off by 1.3",
+    ),
+    "largest_eigenvalue": (
+        ["--points", "150", "--steps", "8", "--degree", "3"],
+        "evaluation 9  0.99",
+    ),
+    "curvature_directions": (
+        ["--points", "400", "--torus", "400", "--k", "8"],
+        "torus, κ = 9 along parallels: 7 eigenvalues off by 2.",
+    ),
+    "scan_curvature": (["--points", "500"], "libigl, radius 5, as scanned: 0.2"),
+    "transport_over_scan": (["--points", "150"], "transport by torchlb, 594 vertices: 2."),
+    "hodge_parts": (["--level", "2"], "798 vertices, the first eigenvalues of Hodge's Laplacian:"),
     "isospectralization": (
         ["--points", "150", "--steps", "3", "--k", "8"],
         "0 of 296 triangles flipped",
@@ -209,7 +224,11 @@ GALLERY = {  # options of a small run, and what it prints
     "train_pyg": (["--points", "150", "--epochs", "2"], "right on a shape never seen: "),
     "spectral_gallery": (["--points", "400", "--k", "40"], "Eigenbasis(40 pairs of 400 points"),
 }
-NEEDS = {"cortical_eigenmodes": "lapy", "train_pyg": "torch_geometric"}
+NEEDS = {
+    "cortical_eigenmodes": "lapy",
+    "train_pyg": "torch_geometric",
+    "transport_over_scan": "potpourri3d",
+}
 
 
 @pytest.mark.parametrize("name", GALLERY)

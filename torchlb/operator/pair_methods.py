@@ -133,7 +133,7 @@ class PairMethods(OperatorStorage):
 
     @takes_arrays
     def inner(self, f: Tensor, g: Tensor) -> Tensor:
-        """∫fg = fᵀMg for functions of equal shape, with the density of a medium if any; shapes as for `integral`."""
+        """∫fg = fᵀMg for equal shapes, as for `integral`, with the density of a medium; by component for fields."""
         if f.shape != g.shape:
             raise InputError(
                 f"inner: expected equal shapes, got {tuple(f.shape)}, {tuple(g.shape)}"
