@@ -249,6 +249,9 @@ def test_the_basis_of_a_pair_projects_in_the_full_mass_and_keeps_its_errors():
     torch.testing.assert_close(basis.from_basis(basis.to_basis(f)), f)
     first, second = unstack_eigenbases(stack_eigenbases([basis, basis.truncate(4)]))
     assert len(second.relative_errors) == 4
+    values, vectors = basis
+    assert values is basis.eigenvalues
+    assert vectors is basis.eigenvectors
     torch.testing.assert_close(first.relative_errors, basis.relative_errors)
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from numbers import Integral
 from typing import Protocol, runtime_checkable
@@ -76,6 +77,10 @@ class Eigenbasis:
         shapes = "" if self.sizes is None else f", {len(self.sizes)} shapes"
         last = float(self.eigenvalues.max()) if k else 0.0
         return f"Eigenbasis({k} pairs of {n} points{shapes}, eigenvalues 0 to {last:.4g})"
+
+    def __iter__(self) -> Iterator[Tensor]:
+        """Eigenvalues and eigenvectors, as in ``values, vectors = lb.eigenbasis(k)``."""
+        return iter((self.eigenvalues, self.eigenvectors))
 
     def truncate(self, k: int) -> Eigenbasis:
         """The first k of the pairs; the basis itself if it has no more."""
