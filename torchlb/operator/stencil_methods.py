@@ -110,7 +110,7 @@ class StencilMethods(OperatorStorage):
         check_tensor(f)
         with torch.autocast(f.device.type, enabled=False):
             parts = [self.stencil.product(c, f) for c in range(1, 1 + self.dim)]
-        return torch.stack(parts, dim=1 if f.ndim < 3 else 2)
+            return torch.stack(parts, dim=1 if f.ndim < 3 else 2)
 
     @takes_arrays
     def gradient(self, f: Tensor) -> Tensor:
