@@ -49,14 +49,13 @@ def check_scale(points: Float[Tensor, "N n"]) -> None:
 def check_distinct(points: Float[Tensor, "N n"]) -> None:
     """Raise a ValueError that names coincident points."""
     spacing, other, bad = coincident(points)
+    _warn_of_rounding(points, spacing)
     if len(bad):
-        _warn_of_rounding(points, spacing)
         pair = sorted((int(bad[0]), int(other[bad[0]])))
         raise InputError(
             f"points: {len(bad)} points share a place with another, such as {pair[0]}, {pair[1]} (all: "
             f"{first_few(bad)}); remove duplicates with points, kept = torchlb.clean_points(points)"
         )
-    _warn_of_rounding(points, spacing)
 
 
 def _warn_of_rounding(points: Float[Tensor, "N n"], spacing: Float[Tensor, " N"]) -> None:

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import Any, NamedTuple
+from collections.abc import Callable, Sequence
+from typing import Any
 
 import torch
 from jaxtyping import Float
@@ -17,28 +17,6 @@ from torchlb.operator.batching import remember_shapes, shapes_of
 from torchlb.operator.medium import elements_of, plain
 from torchlb.operator.pair_methods import PairMethods, check_pair
 from torchlb.operator.parts import Modes, PairMatrices
-
-
-class _TangentPlan(NamedTuple):
-    """What the pair of tangent fields on a shape follows from, with the operator of functions there."""
-
-    lb: Any
-    hodge: bool
-
-    def bilinear(self, *given: Any) -> Float[Tensor, ""]:
-        """Σ of forms, as `Plan.bilinear` at other points or `Forms.bilinear`; DerivativeError for Hodge's."""
-        if self.hodge:
-            raise DerivativeError("Hodge's Laplacian has no derivatives in points and medium")
-        if len(given) == 3:
-            return self.lb.plan.bilinear(*given, tangent=True)
-        forms, medium = given
-        frames = self.lb.frames.detach().cpu().double()
-        return elements_of(self.lb).bilinear(in_space(forms, frames), medium)
-
-    def forms(self, points: Tensor) -> _TangentPlan:
-        """Forms at the points of the operator, which are these."""
-        assert len(points) == self.lb.num_points
-        return self
 
 
 class Connection(PairMethods):
@@ -56,10 +34,19 @@ class Connection(PairMethods):
         self._lb: tuple[Any, ...] = ()
         self._is_hodge = False
 
-    @property
-    def plan(self) -> Any:
-        """What the matrices follow from."""
-        return _TangentPlan(self._lb[0], self._is_hodge)
+    def _bilinear(self) -> Callable[..., Float[Tensor, ""]]:
+        lb, moved, hodge = self._lb[0], self.points.requires_grad, self._is_hodge
+
+        def bilinear(*given: Any) -> Float[Tensor, ""]:
+            if hodge:
+                raise DerivativeError("Hodge's Laplacian has no derivatives in points and medium")
+            if moved:
+                return lb.plan.bilinear(*given, tangent=True)
+            forms, medium = given
+            forms = in_space(forms, lb.frames.detach().cpu().double())
+            return elements_of(lb).bilinear(forms, medium)
+
+        return bilinear
 
     @property
     def hodge(self) -> Connection:

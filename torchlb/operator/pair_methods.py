@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 from typing import Any, Literal, get_args
 
@@ -16,6 +17,7 @@ from torchlb.linalg.sparse import csr_tensor, to_scipy
 from torchlb.linalg.threads import threads_for
 from torchlb.operator.batching import shapes_of
 from torchlb.operator.checks import check_tolerance
+from torchlb.operator.medium import elements_of
 from torchlb.operator.storage import OperatorStorage
 from torchlb.operator.through import (
     BEYOND,
@@ -53,6 +55,10 @@ class PairMethods(OperatorStorage):
     def _has_weak_form(self) -> bool:
         """Whether the operator has a weak pair; only one built with weak_form=False has none."""
         return self.weak.num_rows > 0
+
+    def _bilinear(self) -> Callable[..., Tensor]:
+        """The sum of bilinear forms, of (forms, medium), or of (points, forms, medium) where points need a gradient."""
+        return self.plan.bilinear if self.points.requires_grad else elements_of(self).bilinear
 
     @property
     def stiffness(self) -> Tensor:
@@ -195,23 +201,16 @@ class PairMethods(OperatorStorage):
         count = k + (0 if origins(self) is None else BEYOND)
         return through_eigenpairs(self, self._known_basis(count, tolerance, store), k)
 
-    def _invariant_basis(
-        self, k: int, *, tolerance: float | None = None, store: bool = False
-    ) -> Eigenbasis:
-        """All eigenpairs known, at least k, so that their span is invariant under Δ; otherwise as `eigenbasis`.
-
-        They have no derivatives in points and medium.
-        """
-        basis = self._known_basis(check_num_pairs(k), tolerance, store)
-        if origins(self) is None:
-            return basis
-        held = {
-            name: without(self, getattr(basis, name), "the deflated flow")
-            for name in ("eigenvalues", "eigenvectors", "left")
-        }
+    def _invariant_basis(self, k: int) -> Eigenbasis:
+        """All eigenpairs known, at least k: their span is invariant under Δ. They have no derivatives in the shape."""
+        basis = self._known_basis(check_num_pairs(k))
+        names = ("eigenvalues", "eigenvectors", "left") if origins(self) else ()
+        held = {n: without(self, getattr(basis, n), "the deflated flow") for n in names}
         return replace(basis, **held)
 
-    def _known_basis(self, k: int, tolerance: float | None, store: bool) -> Eigenbasis:
+    def _known_basis(
+        self, k: int, tolerance: float | None = None, store: bool = False
+    ) -> Eigenbasis:
         """All eigenpairs known, at least k, solved anew where there are fewer, or where they are less exact."""
         check_tolerance(tolerance)
         errors = self.modes.relative_errors[..., :k]
@@ -220,7 +219,7 @@ class PairMethods(OperatorStorage):
             with torch.inference_mode(False), threads_for(self.num_points):
                 self._keep_basis(self._solved_basis(max(k, self.modes.count), tolerance))
         if store:
-            self._keep_basis(None, stored=True)
+            self._keep_basis(stored=True)
         basis = self._basis
         assert basis is not None
         return basis
@@ -230,16 +229,17 @@ class PairMethods(OperatorStorage):
         check_pair(self)
         shapes = shapes_of(self)
         if shapes:
-            bases = [shape._known_basis(k, tolerance, False) for shape in shapes]
+            bases = [shape._known_basis(k, tolerance) for shape in shapes]
             return stack_eigenbases([part for basis in bases for part in unstack_eigenbases(basis)])
         return self._pair_eigenbasis(k, tolerance)
 
     def _pair_eigenbasis(self, k: int, tolerance: float | None) -> Eigenbasis:
         """Eigenpairs of the weak pair of each shape; the default tolerance falls with the order."""
-        (stiffness, mass), linear = (
-            [to_scipy(crow, col, v.double(), self.shape) for v in values]
+        matrices = [
+            to_scipy(crow, col, v.double(), self.shape)
             for crow, col, values in (self.weak.pair, self.weak.linear_pair)
-        )
+            for v in values
+        ]
         fixed = torch.zeros_like(self.mass, dtype=torch.bool) if self.fixed is None else self.fixed
         losing = self.weak.losing(fixed).cpu().numpy()
         fixed = fixed.cpu().numpy()
@@ -249,19 +249,17 @@ class PairMethods(OperatorStorage):
         bases = []
         for start, end in zip(self.offsets[:-1], self.offsets[1:], strict=True):
             block = slice(start, end)
-            near = None if self.weak.linear.num_rows == 0 else [m[block, block] for m in linear]
-            k_of, m_of, shift = stiffness[block, block], mass[block, block], 0.0
+            (k_of, m_of, *near), shift = [m[block, block] for m in matrices], 0.0
             if not self.weak.of_functions:  # fields may be parallel
                 shift = float(self.mass[block].detach().sum() / self.dim) ** (-2 / self.dim)
-                k_of = k_of + shift * m_of
-                near = near and [near[0] + shift * near[1], near[1]]
+                k_of, near[0] = k_of + shift * m_of, near[0] + shift * near[1]
             basis = pencil_eigenbasis(
                 k_of,
                 m_of,
                 self.mass[block].detach().double(),
                 k,
                 dim=self.dim,
-                linear=None if near is None else (near[0], near[1]),
+                linear=(near[0], near[1]) if self.weak.linear.num_rows else None,
                 fixed=fixed[block],
                 losing=losing[block],
                 tolerance=tolerance,

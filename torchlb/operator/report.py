@@ -96,8 +96,9 @@ class StencilReport:
         numbers: dict[str, int | float] = {
             "points": len(self.order),
             "requested_order": self.requested_order,
+            "at_requested_order": reached,
+            "low_order": int((self.order == 0).sum()),
         }
-        numbers |= {"at_requested_order": reached, "low_order": int((self.order == 0).sum())}
         for name, (middle, _, most) in self._quantiles().items():
             numbers |= {f"median_{name}": middle, f"max_{name}": most}
         if self.requested_order:

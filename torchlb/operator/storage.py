@@ -188,7 +188,7 @@ class OperatorStorage(Tensors):
         modes = Modes(basis or self.modes, self.mass, stored=stored)
         vectors, fixed = modes.eigenvectors if loaded is None else loaded, self.fixed
         if len(vectors):
-            free = self.mass > 0 if fixed is None else ~fixed
+            free = torch.ones_like(self.mass) > 0 if fixed is None else ~fixed
             modes.set_count(vectors, free, self.sizes or (self.num_points,))
         self.modes = modes
 

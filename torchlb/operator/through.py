@@ -23,7 +23,7 @@ from torchlb.linalg.csr import side_by_side, tensors_of
 from torchlb.linalg.once import once_differentiable
 from torchlb.linalg.precision import ROOT_EPS
 from torchlb.operator.batching import shapes_of
-from torchlb.operator.medium import elements_of, plain
+from torchlb.operator.medium import plain
 from torchlb.operator.parts import PairMatrices
 from torchlb.operator.systems import pair_system
 from torchlb.spectral.eigenbasis import Eigenbasis, unstack_eigenbases
@@ -35,11 +35,11 @@ Forms = Callable[..., Sequence[BilinearForm]]
 
 
 class _Origin(NamedTuple):
-    """What the weak pair of one shape follows from: a plan at points that require a gradient, or elements; a medium."""
+    """What the weak pair of one shape follows from: points, a medium, and bilinear forms of both."""
 
     points: Tensor
     medium: dict[str, Field]
-    evaluated: Any
+    bilinear: Callable[..., Tensor] | None
     weak: PairMatrices
 
     @property
@@ -57,7 +57,8 @@ class _Origin(NamedTuple):
         if self.points.requires_grad:
             moved = [self.points.detach().cpu().double().requires_grad_()]
         with torch.enable_grad():
-            total = self.evaluated.bilinear(*moved, forms, medium)
+            assert self.bilinear is not None
+            total = self.bilinear(*moved, forms, medium)
             found = [torch.zeros_like(leaf) for leaf in (*moved, *leaves)]
             if total.requires_grad:  # M does not depend on the conductivity, for example
                 found = torch.autograd.grad(total, [*moved, *leaves], materialize_grads=True)
@@ -130,10 +131,8 @@ def origins(lb: Any) -> Origins | None:
         )
     parts = []
     for shape in shapes:
-        moved, medium = shape.points.requires_grad, shape._medium.fields(len(shape.points))
-        constant = not moved and not any(f.values.requires_grad for f in medium.values())
-        evaluated = None if constant else shape.plan if moved else elements_of(shape)
-        parts.append(_Origin(shape.points, medium, evaluated, shape.weak))
+        origin = _Origin(shape.points, shape._medium.fields(len(shape.points)), None, shape.weak)
+        parts.append(origin._replace(bilinear=shape._bilinear()) if origin.variables else origin)
     return Origins(parts, [shape.num_points for shape in shapes])
 
 
