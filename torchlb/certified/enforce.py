@@ -13,7 +13,6 @@ import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
 from scipy import sparse
-from scipy.sparse import csgraph
 from torch import Tensor
 from tqdm import tqdm
 
@@ -65,17 +64,14 @@ def certify(
         while True:
             bar.update()
             matrix = to_scipy(rows.crow, rows.col, rows.laplacian, (count, count))
+            mass, result, feed = check_certificate(matrix, areas, outflow=outflow)
             free = rows.candidate < bottom
-            marked, start = _into_closed_classes(matrix) & free, torch.full_like(times, bottom)
-            if not marked.any() or rounds == MOST_ROUNDS:  # else π is 0 outside those
-                mass, result, feed = check_certificate(matrix, areas, outflow=outflow)
-                marked = _marked(matrix, mass / areas, feed, free, spread=not result.holds)
-                if not marked.any() or rounds == MOST_ROUNDS:
-                    break
-                times += marked
-                start = first.candidate + candidates_skipped(times)
-            rounds += 1
-            rows = _lowered(rows, first, marked, start.clamp_max(bottom), lower)
+            marked = _marked(matrix, mass / areas, feed, free, spread=not result.holds)
+            if not marked.any() or rounds == MOST_ROUNDS:
+                break
+            times, rounds = times + marked, rounds + 1
+            start = (first.candidate + candidates_skipped(times)).clamp_max(bottom)
+            rows = _lowered(rows, first, marked, start, lower)
             bar.set_postfix_str(f"{int(marked.sum())} rows marked", refresh=False)
     below = rows.order < first.order
     widened = (rows.candidate > first.candidate) & ~below
@@ -90,30 +86,6 @@ def certify(
             StabilityWarning,
         )
     return rows, mass, result
-
-
-def _into_closed_classes(matrix: sparse.csr_array) -> Bool[Tensor, " N"]:
-    """Rows that lead into a closed class of the directed graph, a few points that refer to each other alone.
-
-    What flows in never leaves, so that all of π is there, and its zeros elsewhere carry no information. The largest
-    strongly connected class of each component is exempt.
-    """
-    matrix = sparse.csr_array(matrix, copy=True)
-    matrix.eliminate_zeros()
-    _, component = csgraph.connected_components(matrix, directed=False)
-    count, label = csgraph.connected_components(matrix, connection="strong")
-    leading = np.zeros(len(label), dtype=bool)
-    if count > component.max() + 1:
-        row, col = sparse.coo_array(matrix).coords
-        leaving = label[row] != label[col]
-        closed = np.ones(count, dtype=bool)
-        closed[label[row[leaving]]] = False
-        by_size = np.bincount(label)[label].argsort(kind="stable")
-        largest = np.zeros(component.max() + 1, dtype=np.int64)
-        largest[component[by_size]] = label[by_size]  # the last one written stays
-        closed[largest] = False
-        leading[row[leaving & closed[label[col]]]] = True
-    return torch.from_numpy(leading)
 
 
 def _marked(

@@ -30,9 +30,8 @@ from torchlb.operator.options import Options
 from torchlb.stencils.assemble import Stencils
 from torchlb.stencils.conditions import Condition
 from torchlb.stencils.low_order import MeshLowOrder
-from torchlb.stencils.placed import Placed, ShapePlan
 from torchlb.stencils.rows import Rows, RowsPlan
-from torchlb.stencils.shape import Shape
+from torchlb.stencils.shape import Placed, Shape, ShapePlan
 
 
 @dataclass(frozen=True)
