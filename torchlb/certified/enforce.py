@@ -24,21 +24,9 @@ from torchlb.stencils.rows import Reason, Rows
 
 MARGIN = 0.02
 """Fraction of a point's area below which its weight π is small, so that rows around it are marked."""
-SINGLY = 4
-"""Number of marks of a row that each skip one candidate; then the number to skip doubles with every second mark."""
 MOST_ROUNDS = 80
 """Largest number of rounds; then the operator is left as it is, with a warning."""
 Lower = Callable[[Int[Tensor, " J"], Int[Tensor, " J"]], Rows]
-
-
-def candidates_skipped(times: Int[Tensor, " N"]) -> Int[Tensor, " N"]:
-    """Number of candidates, from its first on, that a row skips when it is marked for the `times`-th time.
-
-    >>> candidates_skipped(torch.arange(13)).tolist()
-    [0, 1, 2, 3, 4, 6, 8, 12, 16, 23, 32, 46, 64]
-    """
-    doubled = SINGLY * 2 ** ((times - SINGLY) / 2)
-    return torch.where(times <= SINGLY, times, doubled.ceil().long())
 
 
 def certify(
@@ -59,7 +47,6 @@ def certify(
     Returns the rows, the mass π, (N,), ℓ^d, and the certificate; a `StabilityWarning` is issued if it does not hold.
     """
     first, count, rounds = rows, len(areas), 0
-    times = torch.zeros(count, dtype=torch.int64)
     with tqdm(desc="certificate", delay=2, disable=None if progress else True, leave=False) as bar:
         while True:
             bar.update()
@@ -69,9 +56,7 @@ def certify(
             marked = _marked(matrix, mass / areas, feed, free, spread=not result.holds)
             if not marked.any() or rounds == MOST_ROUNDS:
                 break
-            times, rounds = times + marked, rounds + 1
-            start = (first.candidate + candidates_skipped(times)).clamp_max(bottom)
-            rows = _lowered(rows, first, marked, start, lower)
+            rounds, rows = rounds + 1, _lowered(rows, first, marked, lower)
             bar.set_postfix_str(f"{int(marked.sum())} rows marked", refresh=False)
     below = rows.order < first.order
     widened = (rows.candidate > first.candidate) & ~below
@@ -117,8 +102,7 @@ def _around_small_weights(
 ) -> Bool[np.ndarray, " N"]:
     """Rows to mark for the points of small π.
 
-    For each such point these are the rows with a considerable negative weight on it; its own row if π is positive,
-    since π_i |L_ii| = Σ_{j≠i} π_j L_ji, the inflow, so that a smaller diagonal makes π_i larger and keeps its sign;
+    For each such point these are the rows with a considerable negative weight on it, as π_i |L_ii| = Σ_{j≠i} π_j L_ji;
     and, if its own is a low-order row, the rows of the points in it, which may not refer back, as across a crease.
     """
     small = np.flatnonzero(density <= MARGIN)
@@ -129,17 +113,14 @@ def _around_small_weights(
     np.minimum.at(worst, col, inflow)
     marked = np.zeros(len(density), dtype=bool)
     marked[row[(inflow < LOW * worst[col]) & (inflow < 0)]] = True
-    marked[small[density[small] > 0]] = True
     marked[matrix[small[~free[small]]].indices] = True
     return marked
 
 
-def _lowered(
-    rows: Rows, first: Rows, marked: Bool[Tensor, " N"], start: Int[Tensor, " N"], lower: Lower
-) -> Rows:
-    """Rebuild the marked rows from candidate `start` on, and at least one beyond their present one."""
+def _lowered(rows: Rows, first: Rows, marked: Bool[Tensor, " N"], lower: Lower) -> Rows:
+    """Rebuild the marked rows from the candidate after their present one on."""
     index = marked.nonzero()[:, 0]
-    rebuilt = lower(index, start[index].maximum(rows.candidate[index] + 1))
+    rebuilt = lower(index, rows.candidate[index] + 1)
     reason = torch.where(rebuilt.order < first.order[index], Reason.STABILITY, first.reason[index])
     place = torch.arange(len(first.order))
     place[index] = len(place) + torch.arange(len(index))
