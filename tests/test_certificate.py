@@ -318,7 +318,7 @@ def test_uncertified_operator_says_so():
 
 
 def test_a_certificate_that_does_not_hold_is_a_warning_with_names(monkeypatch):
-    monkeypatch.setattr("torchlb.certified.enforce.MOST_ROUNDS", 0)
+    monkeypatch.setattr("torchlb.certified.certificate.MOST_ROUNDS", 0)
     points = Sphere().random_points(500)
     message = r"does NOT hold.*where rounds end; the worst points: \d+, \d+"
     with pytest.warns(StabilityWarning, match=message):

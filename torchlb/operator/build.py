@@ -11,7 +11,7 @@ from torch import Tensor
 from torch.nn.functional import pad
 
 from torchlb.baseline.cotangent import cotangent_laplacian
-from torchlb.certified.enforce import certify
+from torchlb.certified.certificate import certify
 from torchlb.errors import InputError, first_few, renumbered, warn
 from torchlb.galerkin.coarse import lying_triangles, with_area
 from torchlb.galerkin.flips import flipped
