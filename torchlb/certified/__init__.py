@@ -1,5 +1,4 @@
-"""Proof, on request, that diffusion by the stencil contracts (`method.md`, section 5), and its enforcement.
+"""Proof, on request, that diffusion by the stencil contracts (`method.md`, section 5); only `operator.build` asks.
 
-Only `operator.build` requests it. `certificate`: π with πᵀL = 0, and the check of π > 0 and S ≤ 0. `enforce`: order
-reduction of rows until the certificate holds.
+`certificate`: π with πᵀL = 0, the check of π > 0 and S ≤ 0, and order reduction of rows until both hold.
 """

@@ -20,24 +20,20 @@ from torchlb.linalg.precision import SINGLE
 
 @dataclass(frozen=True)
 class Weights:
-    """Weights of the gradient and of the Laplacian at the centre of a batch of stencils.
+    """Weights of the gradient, 1/ℓ, and of the Laplacian, 1/ℓ², at the centre of a batch of stencils, centre first.
 
     Attributes
     ----------
-    gradient
-        (B, K, d), 1/ℓ; entry 0 along K is the centre, here and below.
-    laplacian
-        (B, K), 1/ℓ²: Δ = Σ_c ∂_c²; zero below degree 2.
     radius
-        (B,), ℓ: distance ρ of the farthest neighbour in local coordinates.
+        ρ, ℓ, the distance of the farthest neighbour in local coordinates.
     condition
-        (B,), condition of √ω V with unit columns, by `left_inverse`; above 1e10, or not finite, without full rank.
+        That of `left_inverse`; above 1e10, or not finite, without full rank.
     residual
-        (B,): largest violation of the moment equations, in units of the largest right-hand side.
+        Largest violation of the moment equations, in units of the largest right-hand side.
     height_residual
-        (B,): residual of the fit to the heights, relative to the distances; 0 without heights.
+        Scatter of the heights about their fit, relative to the distances; 0 without heights.
     slope
-        (B,), degree of the gradient's fit where it has one of its own, else 0.
+        Degree of the gradient's fit where it has one of its own, else 0.
     """
 
     gradient: Float[Tensor, "B K d"]
@@ -122,22 +118,10 @@ def _root_window(radius: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
 
 @dataclass(frozen=True)
 class CenteredFit:
-    """Batch of fits u(y) = u_i + Σ_α y^α Σ_j coefficients[α, j] (u_j − u_i), y in units of the radius.
+    """Batch of fits u(y) = u_i + Σ_α y^α Σ_j coefficients[α, j] (u_j − u_i), y in units of the radius ρ, ℓ.
 
-    Attributes
-    ----------
-    coefficients
-        (B, M − 1, K − 1); rows with |α| = 1, divided by the radius, are the weights of the gradient.
-    radius
-        (B,), ℓ: distance ρ of the farthest neighbour in local coordinates.
-    values
-        (B, K − 1, M − 1), the monomials V at the neighbours.
-    root
-        (B, K − 1), √ω.
-    condition
-        (B,), by `left_inverse`.
-    degree
-        Degree m.
+    Coefficients with |α| = 1, divided by the radius, are the weights of the gradient. `values` are the monomials V at
+    the neighbours, `root` is √ω.
     """
 
     coefficients: Float[Tensor, "B M neighbors"]

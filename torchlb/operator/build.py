@@ -11,7 +11,7 @@ from torch import Tensor
 from torch.nn.functional import pad
 
 from torchlb.baseline.cotangent import cotangent_laplacian
-from torchlb.certified.enforce import certify
+from torchlb.certified.certificate import certify
 from torchlb.cloud.doubts import warn_of_doubts, warn_of_joins
 from torchlb.cloud.surface import CloudSurface
 from torchlb.errors import InputError, first_few, renumbered, warn

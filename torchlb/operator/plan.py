@@ -35,9 +35,8 @@ from torchlb.operator.storage import FIT_FIELDS, ROW_FIELDS
 from torchlb.stencils.assemble import Stencils
 from torchlb.stencils.conditions import Condition, condition_of
 from torchlb.stencils.low_order import MeshLowOrder
-from torchlb.stencils.placed import Placed, ShapePlan
 from torchlb.stencils.rows import Rows, RowsPlan
-from torchlb.stencils.shape import Shape
+from torchlb.stencils.shape import Placed, Shape, ShapePlan
 
 Parts = dict[str, Any]
 """Attributes of an operator by name."""

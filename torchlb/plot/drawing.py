@@ -1,6 +1,6 @@
 """Drawing in three dimensions with matplotlib, for `plot`: projection, the painter's algorithm, colours, axes.
 
-The functions take checked input, as `cloud_of`, `mesh_of` and `values_of` return it: NumPy arrays of float64.
+The functions take checked input, as `cloud_of`, `shape_of` and `values_of` return it: NumPy arrays of float64.
 """
 
 from __future__ import annotations

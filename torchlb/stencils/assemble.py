@@ -94,10 +94,6 @@ class Stencils:
         search = Search(self.shape.neighborhoods, centers, self.candidates, start)
         for number, tried, index in search:
             candidate, touching = self.candidates[number], self._touching(index)
-            if candidate.degree > 2 and candidate.factor > FACTOR:  # too wide beside a boundary
-                tried, index, touching = tried[~touching], index[~touching], touching[~touching]
-                if len(tried) == 0:
-                    continue
             weights = self._weights(index, candidate, touching)
             failure, rejected = self.judge(weights, candidate, touching)
             if candidate.degree == self.order + 1:

@@ -20,13 +20,10 @@ from torchlb.stencils.rows import Rows
 class Condition:
     """No condition, with one-sided stencils at the boundary; base class of all conditions.
 
-    A class is registered under its `name`, for options, files and messages. Its constructor takes one argument of
-    numbers and lists, or none, which `data` gives back.
-
     Attributes
     ----------
     name
-        Name of the condition.
+        Name under which the class is registered, for options, files and messages.
     conserves
         Whether constants are preserved: rows sum to zero, and K1 = 0.
     fixes
@@ -35,7 +32,7 @@ class Condition:
         a ≥ 0 of ∂_ν f + a f = 0, 1/ℓ, a number or one per point: stencils use it as data, and K gains a along the
         boundary. None without such data.
     data
-        Constructor argument of the instance; None without one.
+        The one argument of the constructor, numbers and lists; None where it takes none.
     """
 
     known: ClassVar[dict[str | None, type[Condition]]] = {}

@@ -25,15 +25,8 @@ class MeshLowOrder:
 
     The rows are symmetric and negative semidefinite in the mass, so that the certificate holds for these rows alone;
     those of segments and of triangles are M-matrix rows, too. Where several segments meet, the fluxes balance.
-
-    Attributes
-    ----------
-    points, cells
-        (N, n), ℓ; (F, d + 1).
-    planned
-        Edge flips to the triangulation, the `flips` of the same shape before it moved; None to search for them.
-    shares
-        (F,), fraction of each cell that is integrated; None for all of it.
+    `planned` are the `flips` of the same shape before it moved, `shares` the fractions of the cells that are
+    integrated.
     """
 
     points: Float[Tensor, "N n"]

@@ -1,32 +1,164 @@
-"""Data of a shape for its stencils: points, frames, neighbourhoods, boundary, areas and low-order rows."""
+"""Data of a shape for its stencils, points, frames, neighbourhoods, boundary, areas, low-order rows; and their plan."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import torch
 from jaxtyping import Bool, Float, Int
 from scipy import sparse
 from torch import Tensor
+from torch.nn.functional import normalize, pad
 from tqdm import tqdm
 
 from torchlb.cloud.surface import CloudSurface
 from torchlb.cloud.voronoi import boundary_of_cloud
 from torchlb.errors import InputError, first_few
-from torchlb.geometry.boundary import BoundaryPlan, boundary_of_mesh
+from torchlb.geometry.boundary import Boundary, BoundaryPlan, boundary_of_mesh
 from torchlb.geometry.compatibility import thin_sides
 from torchlb.geometry.complex import consistently_wound
 from torchlb.geometry.fit_search import FitSearch
-from torchlb.geometry.frames import mesh_frames, normals_of_frames, vertex_normals
+from torchlb.geometry.frames import complete_frames, mesh_frames, normals_of_frames, vertex_normals
 from torchlb.geometry.local_fits import FitPlan, LocalFits
 from torchlb.geometry.neighbors import GraphNeighborhoods, mesh_graph, nearest_neighbors
 from torchlb.geometry.thresholds import NEAREST
-from torchlb.linalg.precision import AT_ONCE
+from torchlb.geometry.vectors import dot
+from torchlb.linalg.precision import AT_ONCE, TINY
 from torchlb.stencils.conditions import Condition, Neumann
 from torchlb.stencils.low_order import MeshLowOrder
-from torchlb.stencils.placed import Beside, Placed, ShapePlan, righthanded, turned
 
 NEUMANN = Neumann()
+
+
+@dataclass(frozen=True)
+class Placed:
+    """Points, frames, normals and boundary of a shape.
+
+    [frames, normal] is right-handed where there is a normal, which hypersurfaces have, oriented by the cells, or
+    consistently on a cloud. There is no boundary of a closed shape, nor where no condition holds.
+    """
+
+    points: Float[Tensor, "N n"]
+    frames: Float[Tensor, "N n d"]
+    normals: Float[Tensor, "N n"] | None
+    boundary: Boundary | None
+
+
+@dataclass(frozen=True)
+class ShapePlan:
+    """Plan of a shape of simplices.
+
+    Attributes
+    ----------
+    cells, shares
+        Simplices whose planes give the initial frames; the fraction of each that is integrated, None for all of it.
+    fits
+        Plan of the fits of heights, and of functions where a weak pair is built.
+    beside
+        Data of the surface through a cloud; None where points stay as given and frames start from the cells.
+    side
+        Sign of each normal along that of the cells around the vertex; None for shapes without sides.
+    boundary
+        Plan of the boundary, as in `Placed`.
+    """
+
+    cells: Int[Tensor, "F corners"]
+    shares: Float[Tensor, " F"] | None
+    fits: FitPlan
+    beside: Beside | None
+    side: Int[Tensor, " N"] | None
+    boundary: BoundaryPlan | None
+
+    def at(self, points: Float[Tensor, "N n"]) -> tuple[Placed, LocalFits]:
+        """Frames, normals and boundary at these points, and the fits behind them."""
+        if self.beside is None:
+            places, initial = points, mesh_frames(points, self.cells)
+        else:
+            places = self.beside.places(points, self.cells)
+            initial = self.beside.frames(places, self.cells)
+        fits = LocalFits.at(self.fits, places, initial)
+        return self.placed(fits), fits
+
+    def placed(self, fits: LocalFits) -> Placed:
+        """Frames, normals and boundary from given fits."""
+        reference = None
+        if self.side is not None:
+            reference = self.side[:, None] * vertex_normals(fits.points, self.cells)
+        frames, normals = righthanded(fits.frames, reference)
+        boundary = None if self.boundary is None else self.boundary.at(fits.points, frames)
+        return Placed(fits.points, frames, normals, boundary)
+
+
+class Beside(NamedTuple):
+    """Normals and displacements of a cloud's surface, relative to its triangles and so without a unit.
+
+    Components are along the normal of the triangles, the tangent towards `neighbor`, and their cross product: those of
+    the initial `normals`, and of the `offsets` of the points that were `moved`, as they are noisy or off the surface,
+    relative to the distance to the neighbour.
+    """
+
+    neighbor: Int[Tensor, " N"]
+    normals: Float[Tensor, "N 3"]
+    moved: Int[Tensor, " m"]
+    offsets: Float[Tensor, "m 3"]
+
+    @classmethod
+    def of(
+        cls,
+        given: Float[Tensor, "N n"],
+        places: Float[Tensor, "N 3"],
+        triangles: Int[Tensor, "F 3"],
+        nearest: Int[Tensor, " N"],
+        normals: Float[Tensor, "N 3"],
+    ) -> Beside:
+        """Encode the surface positions `places` of the given points, and the normals there."""
+        neighbor = nearest.clone()
+        neighbor[triangles.flatten()] = triangles.roll(1, 1).flatten()
+        given = pad(given, (0, 3 - given.shape[1]))
+        moved = (places != given).any(1).nonzero()[:, 0]
+        axes, size = _axes(given, triangles, neighbor)
+        offset = (places - given)[moved] / size[moved, None]
+        axes, offsets = _axes(places, triangles, neighbor)[0], (axes[moved] @ offset[..., None])
+        return cls(neighbor, (axes @ normals[..., None])[..., 0], moved, offsets[..., 0])
+
+    def places(
+        self, points: Float[Tensor, "N n"], triangles: Int[Tensor, "F 3"]
+    ) -> Float[Tensor, "N n"]:
+        """Positions on the surface for given points."""
+        if len(self.moved) == 0:
+            return points
+        space = pad(points, (0, 3 - points.shape[1]))
+        axes, size = _axes(space, triangles, self.neighbor)
+        offset = (self.offsets[:, None] @ axes[self.moved])[:, 0] * size[self.moved, None]
+        return space.index_add(0, self.moved, offset)[:, : points.shape[1]]
+
+    def frames(
+        self, places: Float[Tensor, "N n"], triangles: Int[Tensor, "F 3"]
+    ) -> Float[Tensor, "N n 2"]:
+        """Initial frames, orthogonal to the initial normals in R³."""
+        if places.shape[1] == 2:
+            return mesh_frames(places, triangles)
+        axes, _ = _axes(places, triangles, self.neighbor)
+        normal = normalize((self.normals[:, None] @ axes)[:, 0])
+        first = normalize(axes[:, 1] - dot(axes[:, 1], normal)[:, None] * normal)
+        return torch.stack([first, torch.linalg.cross(normal, first)], -1)
+
+
+def _axes(
+    points: Float[Tensor, "N 3"], triangles: Int[Tensor, "F 3"], neighbor: Int[Tensor, " N"]
+) -> tuple[Float[Tensor, "N 3 3"], Float[Tensor, " N"]]:
+    """Normal of the triangles around each point, two tangents, the first towards its neighbour, and the distance to it.
+
+    Where a direction is undefined, it is arbitrary.
+    """
+    normal = vertex_normals(points, triangles)
+    normal = torch.where((normal == 0).all(1, keepdim=True), normal.new_tensor([0.0, 0, 1]), normal)
+    edge = points[neighbor] - points
+    along = edge - dot(edge, normal)[:, None] * normal
+    flat = dot(along, along)[:, None] == 0
+    along = normalize(torch.where(flat, complete_frames(normal)[..., 0], along), eps=TINY)
+    return torch.stack([normal, along, torch.linalg.cross(normal, along)], 1), edge.norm(dim=1)
 
 
 @dataclass(frozen=True)
@@ -36,19 +168,15 @@ class Shape(Placed):
     Attributes
     ----------
     normal_order
-        (N,), degree q of the fit behind each frame; 0 for an initial frame.
-    neighborhoods
-        k-hop neighbourhoods; None where the rows are planned already.
+        Degree q of the fit behind each frame; 0 for an initial frame.
+    neighborhoods, plan, fits
+        k-hop neighbourhoods, plan of the shape and fits evaluated from it; None where the rows are planned already.
     areas
-        (N,), positive, shares of the area to first order, ℓ^d.
+        Positive shares of the area to first order, ℓ^d.
     low_order
         Rows for points without a stencil.
-    condition
-        Boundary condition.
     on_mesh
         Whether triangles are given, which follow the surface where its points do not resolve it.
-    plan, fits
-        Plan of the shape, and the fits evaluated from it; None for a cloud without simplices.
     """
 
     normal_order: Int[Tensor, " N"]
@@ -95,18 +223,14 @@ def mesh_shape(
     )
     plan, fits = _searched(neighborhoods, normal_order, num_neighbors, progress, fit_degrees)
     edge = None
-    if shares is not None:
-        dim = faces.shape[1] - 1
-        if boundary is not None:
-            edge = boundary_of_cloud(vertices, boundary, dim, normal_order)
-    elif condition is not None or boundary is not None:
+    if shares is not None and boundary is not None:
+        edge = boundary_of_cloud(vertices, boundary, faces.shape[1] - 1, normal_order)
+    elif shares is None and (condition is not None or boundary is not None):
         edge = boundary_of_mesh(vertices, faces, normal_order)
         edge = edge if boundary is None else _part(edge, boundary)
     side = torch.ones(len(vertices), dtype=torch.int8) if hypersurface else None
     whole = ShapePlan(faces, shares, plan, None, side, None if condition is None else edge)
-    on_mesh = on_mesh and faces.shape[1] == 3
-    low_order = MeshLowOrder(vertices, faces, shares=shares)
-    return _shape(whole, fits, neighborhoods, low_order, condition, on_mesh)
+    return _shape(whole, fits, neighborhoods, condition, on_mesh and faces.shape[1] == 3)
 
 
 def surface_shape(
@@ -152,14 +276,13 @@ def surface_shape(
         against = (own * vertex_normals(points, triangles)).sum(1) < 0
         side = torch.where(against, -1, 1).to(torch.int8)
     whole = ShapePlan(triangles, None, plan, beside, side, edge)
-    return _shape(whole, fits, neighborhoods, MeshLowOrder(points, triangles), condition)
+    return _shape(whole, fits, neighborhoods, condition)
 
 
 def _shape(
     plan: ShapePlan,
     fits: LocalFits,
     neighborhoods: GraphNeighborhoods,
-    low_order: MeshLowOrder,
     condition: Condition | None,
     on_mesh: bool = False,
 ) -> Shape:
@@ -168,6 +291,7 @@ def _shape(
     if sides is not None:  # by the normals of the refined frames
         marked = (sides != 0).any(1, keepdim=True)
         sides = turned(normals_of_frames(placed.frames), sides) * marked
+    low_order = MeshLowOrder(placed.points, plan.cells, shares=plan.shares)
     return Shape(
         **vars(placed),
         normal_order=plan.fits.order,
@@ -209,3 +333,20 @@ def _searched(
         for centers in tqdm(parts, "tangent frames", delay=2, disable=not progress, leave=False):
             search.refine(centers)
     return search.finish()
+
+
+def turned(normals: Tensor, reference: Tensor) -> Tensor:
+    """Flip the normals to the side of `reference`."""
+    return torch.where(((normals * reference).sum(1) < 0)[:, None], -normals, normals)
+
+
+def righthanded(
+    frames: Float[Tensor, "N n d"], reference: Float[Tensor, "N n"] | None
+) -> tuple[Float[Tensor, "N n d"], Float[Tensor, "N n"] | None]:
+    """Frames with [frames, normal] right-handed, and normals of a hypersurface on the side of `reference`."""
+    if frames.shape[2] != frames.shape[1] - 1:
+        return frames, None
+    righthanded = normals_of_frames(frames)
+    normals = righthanded if reference is None else turned(righthanded, reference)
+    hand = (normals * righthanded).sum(1)[:, None, None].sign()
+    return torch.cat([hand * frames[..., :1], frames[..., 1:]], -1), normals
