@@ -42,7 +42,7 @@ pictures: .venv/installed-dev ## draw the pictures of docs/ again
 	MPLBACKEND=Agg $(BIN)/python scripts/draw_docs.py
 
 bench: .venv/installed-bench ## run the benchmarks, with SHAPES="a.npz b.npz" those on limit shapes, too
-	@for file in accuracy curvature isospectralization layers learning robustness speed tangent_fields tangent_learning; do \
+	@for file in accuracy curvature device isospectralization layers learning robustness speed tangent_fields tangent_learning; do \
 		$(BIN)/python benchmarks/$$file.py || exit 1; done
 	@for file in $(if $(SHAPES),clouds conductivity limit_shapes) media time_to_accuracy; do \
 		$(BIN)/python benchmarks/$$file.py $(SHAPES) || exit 1; done

@@ -58,7 +58,7 @@ def measured(task: Callable[..., torch.Tensor], lb: LaplaceBeltrami) -> tuple[fl
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--device", default="cuda" if torch.cuda.is_available() else "cpu")
-    parser.add_argument("--sizes", type=int, nargs="*", default=[10_000, 77_000])
+    parser.add_argument("--sizes", type=int, nargs="*", default=[10_000])
     arguments = parser.parse_args()
     print(*versions(), sep="\n\n", end="\n\n")
     threads, there = torch.get_num_threads(), arguments.device != "cpu"
