@@ -14,13 +14,13 @@ from scipy import sparse
 from torch import Tensor
 
 from torchlb.galerkin.assembly import (
+    ElementMatrices,
     area_element,
     element_matrices,
     flat_metric,
     in_cells,
-    linear_elements,
+    linear_blocks,
     spread,
-    summed,
     upper_congruence,
 )
 from torchlb.galerkin.bilinear import BilinearForm, outer, weighted_products, weighted_slopes
@@ -71,6 +71,8 @@ class Forms:
 
     Attributes
     ----------
+    given
+        (N,), the vertices in an order along the shape, of which the computed triangles of matrices are.
     points, places
         (N, n), (NX, n), vertices and nodes, ℓ.
     cells, lengths
@@ -93,6 +95,7 @@ class Forms:
         Flat simplices beside these.
     """
 
+    given: Int[Tensor, " N"]
     points: Float[Tensor, "N n"]
     places: Float[Tensor, "NX n"]
     cells: Int[Tensor, "T corners"]
@@ -138,7 +141,8 @@ class Forms:
             parts, shares = [x[own] for x in parts], None if shares is None else shares[own]
         cells, lengths, faces, elements, metric = parts
         curved = p, elements, metric, simplex(nodes.dim, nodes.degree)
-        flat = fits.points, mesh.places, cells, lengths, faces, len(own)
+        every = torch.arange(len(fits.points))
+        flat = every, fits.points, mesh.places, cells, lengths, faces, len(own)
         return cls(*flat, *curved, shares, flats)
 
     @classmethod
@@ -160,11 +164,13 @@ class Forms:
         flats = [FlatCells(faces, lengths, 1.0, mass / shares, whole)]
         metric = spread(g[:0], element)
         curved = faces[:0], lengths[:0], faces[:0, 0], len(faces), same, faces[:0], metric, element
-        return cls(points, points, *curved, None, flats)
+        return cls(torch.arange(len(points)), points, points, *curved, None, flats)
 
     def restored(self, numbering: Numbering, order: Int[Tensor, " G"], num_faces: int) -> Forms:
         """Renumber to the user's points and `num_faces` faces; `order` has the user's numbers of the faces here."""
         given = numbering.given
+        beyond = torch.arange(len(given), len(self.places))  # nodes that are no vertices
+        rows = torch.cat([numbering.here, beyond])
         flats = [
             flat._replace(
                 cells=given[flat.cells],
@@ -175,11 +181,14 @@ class Forms:
         ]
         return replace(
             self,
+            given=given,
             points=numbering.restored(self.points),
+            places=self.places[rows],
+            nodes=torch.cat([given, beyond])[self.nodes],
             cells=given[self.cells],
             faces=order[self.faces],
             num_faces=num_faces,
-            prolongation=_renumbered(self.prolongation, given, len(given)),
+            prolongation=_renumbered(self.prolongation[rows.numpy()], given, len(given)),
             flats=flats,
         )
 
@@ -226,55 +235,62 @@ class Forms:
     def matrix(
         self, conductivity: list[Tensor] | None = None, density: list[Tensor] | None = None
     ) -> sparse.csr_array:
-        """Upper triangle of K + iM, (N, N), positive semidefinite in every medium; the rows of K sum to zero."""
-        elements = summed(
-            self.blocks(conductivity, density), self.nodes, self.prolongation.shape[0]
-        )
-        return upper_congruence(self.prolongation, elements) + self.flat(conductivity, density)
+        """Upper triangle of K + iM, as `upper` has it, positive semidefinite in every medium; K1 = 0."""
+        lots = [
+            self.curved_elements(conductivity, density),
+            *self.flat_elements(conductivity, density),
+        ]
+        return self.upper(self.prolongation, lots)
 
-    def blocks(
+    def near(
         self, conductivity: list[Tensor] | None = None, density: list[Tensor] | None = None
-    ) -> Tensor:
-        """Element matrices K_FE + iM_FE of the curved elements, (T, n²)."""
+    ) -> sparse.csr_array:
+        """Upper triangle of K₁ + iM₁ of P1 elements on flat simplices, with the mean of the medium on each."""
+        lots = [
+            self.linear_elements(conductivity, density),
+            *self.flat_elements(conductivity, density),
+        ]
+        return self.upper(sparse.eye_array(len(self.points), format="csr"), lots)
+
+    def upper(self, p: Any, lots: Sequence[ElementMatrices]) -> sparse.csr_array:
+        """Upper triangle of PᵀAP in the order of `given`; A is made of element matrices."""
+        return upper_congruence(_renumbered(p, self.given.argsort(), p.shape[1]), lots)
+
+    def curved_elements(
+        self, conductivity: list[Tensor] | None = None, density: list[Tensor] | None = None
+    ) -> ElementMatrices:
+        """Element matrices of the curved elements."""
         kappa = None if conductivity is None else self.on_curved(conductivity[0])
         rho = None if density is None else density[0]
         blocks = element_matrices(self.metric, self.element, kappa, rho)
-        return blocks if self.shares is None else self.shares[:, None] * blocks
+        return ElementMatrices(self.nodes, self.shared(blocks))
 
-    def near(
-        self,
-        conductivity: list[Tensor] | None = None,
-        density: list[Tensor] | None = None,
-        flat: Any = None,
-    ) -> sparse.csr_array:
-        """Upper triangle of K₁ + iM₁ of P1 elements on flat simplices, with the mean of the medium on each.
-
-        `flat` has the part of the flat cells, if it is known.
-        """
+    def linear_elements(
+        self, conductivity: list[Tensor] | None = None, density: list[Tensor] | None = None
+    ) -> ElementMatrices:
+        """P1 elements in place of the curved ones."""
         kappa, rho = (
             None if x is None else cell_mean(x[0], self.element) for x in (conductivity, density)
         )
         kappa = self.on_flat(kappa, self.cells, self.lengths)
-        own = linear_elements(
-            self.lengths, self.cells, len(self.points), kappa, rho, shares=self.shares
-        )
-        triangle: Any = sparse.triu(own, format="csr")
-        if not self.flats:
-            return triangle
-        return triangle + (self.flat(conductivity, density) if flat is None else flat)
+        blocks = linear_blocks(self.lengths, self.cells, kappa, rho)
+        return ElementMatrices(self.cells, self.shared(blocks))
 
-    def flat(
+    def flat_elements(
         self, conductivity: list[Tensor] | None = None, density: list[Tensor] | None = None
-    ) -> sparse.csr_array:
-        """Upper triangle of K + iM of the flat cells."""
-        count = len(self.points)
-        total: Any = sparse.csr_array((count, count), dtype=complex)
+    ) -> list[ElementMatrices]:
+        """P1 elements on the flat cells beside the curved ones, each lot of them."""
+        found = []
         for number, flat in enumerate(self.flats, 1):
             kappa, rho = (None if x is None else x[number] for x in (conductivity, density))
             kappa = self.on_flat(kappa, flat.cells, flat.lengths)
-            part = linear_elements(flat.lengths, flat.cells, count, kappa, rho, lumped=flat.lumped)
-            total = total + flat.share * sparse.triu(part, format="csr")
-        return total
+            blocks = linear_blocks(flat.lengths, flat.cells, kappa, rho, flat.lumped)
+            found.append(ElementMatrices(flat.cells, flat.share * blocks))
+        return found
+
+    def shared(self, x: Tensor) -> Tensor:
+        """Values of the simplices, (T, …), times the fractions of these that are integrated."""
+        return x if self.shares is None else self.shares.view(-1, *[1] * (x.ndim - 1)) * x
 
     def bilinear(self, forms: Sequence[BilinearForm], medium: Medium) -> Float[Tensor, ""]:
         """Σ of bilinear forms, differentiable in the medium; of "lumped" and "boundary", which depend on none, 0."""
@@ -301,7 +317,7 @@ class Forms:
         if form.along is not None:
             across = [x[(..., *form.along)] for x in medium["projectors"]]
             own = across[0] * own
-        total = [own.sum() if self.shares is None else (self.shares[:, None] * own).sum()]
+        total = [self.shared(own).sum()]
         for number, flat in enumerate(self.flats, 1):
             shape = simplex(self.element.dim, 1)
             metric = spread(flat_metric(flat.lengths), shape)

@@ -8,8 +8,8 @@ from typing import Any, Literal, NamedTuple
 import torch
 from jaxtyping import Float, Shaped
 from torch import Tensor
-from torch.nn.functional import normalize
 
+from torchlb.geometry.vectors import dot
 from torchlb.linalg.once import once_differentiable
 from torchlb.linalg.precision import TINY
 
@@ -96,6 +96,6 @@ def orthonormal(slopes: Float[Tensor, "*batch n d"]) -> Float[Tensor, "*batch n 
     for x in slopes.unbind(-1):
         for _ in range(2):  # the second time takes off what rounding leaves
             for e in unit:
-                x = x - (x * e).sum(-1, keepdim=True) * e
-        unit.append(normalize(x, dim=-1, eps=TINY))
+                x = x - dot(x, e)[..., None] * e
+        unit.append(x / dot(x, x).clamp_min(TINY).sqrt()[..., None])
     return torch.stack(unit, -1)
