@@ -147,13 +147,6 @@ def element_matrices(
     return blocks
 
 
-def assemble_mass(
-    size: Float[Tensor, "T Q"], nodes: Int[Tensor, "T n"], shape: Element, num_nodes: int
-) -> sparse.csr_array:
-    """Mass matrix ∫ φ_i φ_j of elements with volume element `size` at the Gauss points."""
-    return summed((shape.weights * size) @ squares(shape), nodes, num_nodes)
-
-
 def gradient_products(shape: Element) -> Float[Tensor, "Q S n_times_n"]:
     """∂_a φ_i ∂_b φ_j at the Gauss points for a = b, and its sum with a and b exchanged for a < b."""
     products = []

@@ -32,27 +32,18 @@ from torchlb.galerkin.prolongation import prolongation
 from torchlb.geometry.local_fits import FitPlan, LocalFits
 from torchlb.geometry.numbering import Numbering
 from torchlb.geometry.vectors import at
-from torchlb.linalg.once import once_differentiable
+from torchlb.linalg.once import computed_again, once_differentiable
 
 Linear = Callable[[Tensor], Tensor]
+Values = list[Tensor] | None
 FIELDS = {"stiffness": "conductivity", "mass": "density", "potential": "potential"}
 
 
 class FlatCells(NamedTuple):
-    """Flat simplices with P1 elements, in place of curved cells or beside them.
+    """Flat simplices with P1 elements, in place of curved cells or beside them, of which a `share` is integrated.
 
-    Attributes
-    ----------
-    cells
-        (T, d + 1).
-    lengths
-        (T, e), edge lengths, ℓ.
-    share
-        Fraction of each simplex that is integrated.
-    lumped
-        (N,), factors of the mass, which is lumped in equal shares to the corners; None where it is not.
-    mix
-        (T, F), share of each face of the mesh in a cell; None where the cells replace no faces.
+    The mass is lumped in equal shares to the corners, times the factors `lumped`, None where it is not; `mix`, (T, F),
+    has the share of each face of the mesh in a cell, None where the cells replace no faces.
     """
 
     cells: Int[Tensor, "T corners"]
@@ -72,25 +63,16 @@ class Forms:
     Attributes
     ----------
     given
-        (N,), the vertices in an order along the shape, of which the computed triangles of matrices are.
-    points, places
-        (N, n), (NX, n), vertices and nodes, ℓ.
-    cells, lengths
-        (T, d + 1), (T, e), ℓ: simplices, and their edge lengths in the order of `subsets`.
-    faces
-        (T,), face of the mesh for each simplex.
-    num_faces
-        Number F of faces of the mesh.
+        The vertices in an order along the shape, of which the computed triangles of matrices are.
+    places
+        Positions of the nodes, ℓ; the first are the `points`, the vertices.
+    cells, lengths, faces, shares
+        Simplices, their edge lengths in the order of `subsets`, ℓ, the face of the mesh, of `num_faces`, that each is,
+        and the fractions of them that are integrated, None for all.
     prolongation
-        P, (N + X, N), from the vertices to the nodes.
-    nodes
-        (T, n), nodes of each element.
-    metric
-        (T, Q, S), metric at the Gauss points, ℓ².
-    element
-        Shape functions at the Gauss points.
-    shares
-        (T,), fraction of each simplex that is integrated; None for all of it.
+        P, from the vertices to the nodes.
+    nodes, metric, element
+        Nodes of each element, metric, ℓ², and shape functions at the Gauss points.
     flats
         Flat simplices beside these.
     """
@@ -232,24 +214,16 @@ class Forms:
         own = torch.einsum("tnk,qnd->tqkd", places, self.element.gradients)
         return [own, *((x[:, 1:] - x[:, :1]).mT for x in corners)]
 
-    def matrix(
-        self, conductivity: list[Tensor] | None = None, density: list[Tensor] | None = None
-    ) -> sparse.csr_array:
+    def matrix(self, conductivity: Values = None, density: Values = None) -> sparse.csr_array:
         """Upper triangle of K + iM, as `upper` has it, positive semidefinite in every medium; K1 = 0."""
-        lots = [
-            self.curved_elements(conductivity, density),
-            *self.flat_elements(conductivity, density),
-        ]
+        medium = conductivity, density
+        lots = [self.curved_elements(*medium), *self.flat_elements(*medium)]
         return self.upper(self.prolongation, lots)
 
-    def near(
-        self, conductivity: list[Tensor] | None = None, density: list[Tensor] | None = None
-    ) -> sparse.csr_array:
+    def near(self, conductivity: Values = None, density: Values = None) -> sparse.csr_array:
         """Upper triangle of K₁ + iM₁ of P1 elements on flat simplices, with the mean of the medium on each."""
-        lots = [
-            self.linear_elements(conductivity, density),
-            *self.flat_elements(conductivity, density),
-        ]
+        medium = conductivity, density
+        lots = [self.linear_elements(*medium), *self.flat_elements(*medium)]
         return self.upper(sparse.eye_array(len(self.points), format="csr"), lots)
 
     def upper(self, p: Any, lots: Sequence[ElementMatrices]) -> sparse.csr_array:
@@ -257,7 +231,7 @@ class Forms:
         return upper_congruence(_renumbered(p, self.given.argsort(), p.shape[1]), lots)
 
     def curved_elements(
-        self, conductivity: list[Tensor] | None = None, density: list[Tensor] | None = None
+        self, conductivity: Values = None, density: Values = None
     ) -> ElementMatrices:
         """Element matrices of the curved elements."""
         kappa = None if conductivity is None else self.on_curved(conductivity[0])
@@ -266,7 +240,7 @@ class Forms:
         return ElementMatrices(self.nodes, self.shared(blocks))
 
     def linear_elements(
-        self, conductivity: list[Tensor] | None = None, density: list[Tensor] | None = None
+        self, conductivity: Values = None, density: Values = None
     ) -> ElementMatrices:
         """P1 elements in place of the curved ones."""
         kappa, rho = (
@@ -277,7 +251,7 @@ class Forms:
         return ElementMatrices(self.cells, self.shared(blocks))
 
     def flat_elements(
-        self, conductivity: list[Tensor] | None = None, density: list[Tensor] | None = None
+        self, conductivity: Values = None, density: Values = None
     ) -> list[ElementMatrices]:
         """P1 elements on the flat cells beside the curved ones, each lot of them."""
         found = []
@@ -312,7 +286,8 @@ class Forms:
         density = weighted_slopes if stiffness else weighted_products
         coefficient = None if values is None else values[0]
         coefficient = self.on_curved(coefficient) if stiffness else coefficient
-        own = density(self.metric, self.element, outer(self.nodes, nodes, c), coefficient)
+        blocks = outer(self.nodes, nodes, c)
+        own = computed_again(density, self.metric, self.element, blocks, coefficient)
         across = None
         if form.along is not None:
             across = [x[(..., *form.along)] for x in medium["projectors"]]

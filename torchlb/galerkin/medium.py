@@ -18,16 +18,9 @@ Map = Callable[[Tensor], Tensor]
 
 
 class Field(NamedTuple):
-    """A field of a medium at the vertices or on the faces.
+    """A field of a medium at the vertices or on the faces: numbers, or symmetric positive space tensors, (…, n, n).
 
-    Attributes
-    ----------
-    values
-        (N,) or (F,), numbers, or symmetric positive space tensors, (N, n, n) or (F, n, n).
-    on_faces
-        Whether they are on the faces.
-    positive
-        Whether the field is positive, and not merely nowhere negative.
+    It is `positive`, or merely nowhere negative.
     """
 
     values: Shaped[Tensor, "count ..."]

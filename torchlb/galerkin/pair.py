@@ -15,9 +15,10 @@ from torch import Tensor
 
 from torchlb.galerkin.assembly import (
     area_element,
-    assemble_mass,
     assembled,
     metric,
+    squares,
+    summed,
     upper_congruence,
 )
 from torchlb.galerkin.bilinear import BilinearForm, outer, weighted_products
@@ -37,14 +38,9 @@ from torchlb.linalg.sparse import values_on
 
 @dataclass(frozen=True)
 class SparsePair:
-    """Symmetric matrices on one pattern: on a surface stiffness (no unit), mass (ℓ²) and boundary mass (ℓ).
+    """K and M, and B on a shape with a boundary, on one CSR pattern with ascending columns.
 
-    Attributes
-    ----------
-    crow, col
-        (N + 1,), (nnz,), CSR with ascending columns.
-    values
-        (2, nnz), K and M; (3, nnz), also B, on a shape with a boundary.
+    On a surface stiffness has no unit, mass that of ℓ², and boundary mass that of ℓ.
     """
 
     crow: Int[Tensor, " N_plus_1"]
@@ -60,18 +56,9 @@ class SparsePair:
 
 @dataclass(frozen=True)
 class Pattern:
-    """Map from a computed upper triangle to the full symmetric CSR pattern in the user's numbers.
+    """Map from a computed upper triangle, (indptr, indices), to the full CSR pattern in the user's numbers.
 
-    Attributes
-    ----------
-    crow, col
-        As in `SparsePair`.
-    order
-        (nnz,), index of each entry in the upper triangle.
-    diagonal
-        (N,), indices of the diagonal entries.
-    indptr, indices
-        (N + 1,), (upper,), CSR pattern of the upper triangle as computed.
+    `order` has the index of every entry in the triangle, `diagonal` the indices of the diagonal entries.
     """
 
     crow: Int[Tensor, " N_plus_1"]
@@ -114,14 +101,9 @@ class Pattern:
 
 @dataclass(frozen=True)
 class WeakPair:
-    """The pair (K, M), its P1 pair and its lumped mass.
+    """The pair (K, M), that of P1 elements near it, None where both are the same, and the lumped mass.
 
-    Attributes
-    ----------
-    matrices, linear
-        The high-order pair, and that of P1 elements near it; None where both are the same.
-    mass
-        (N,), positive, sums to the area, ℓ^d; None for the mass of the operator's shape.
+    The mass is positive and sums to the area, ℓ^d; None for that of the operator's shape.
     """
 
     matrices: SparsePair
@@ -137,16 +119,8 @@ ELEMENTS = {1: (2, (2,)), 2: (2, (2,)), 3: (2, (3, 2)), 4: (3, (4, 2)), 5: (4, (
 class PairPlan:
     """Plan of the weak pair of a complex of d-simplices.
 
-    Attributes
-    ----------
-    fits, curving
-        Plans of the fits at the vertices, and of the curved cells.
-    stars
-        (S, d + 1), simplices of local stars, each weighted by 1/(d + 1).
-    shares
-        (F,), fraction of each cell that is integrated; None for all of it.
-    lowered
-        (L,), nodes that are not vertices and whose rows of P are linear for the lumped mass.
+    Simplices of local `stars` are weighted by 1/(d + 1); `shares` are the fractions of the cells that are integrated,
+    None for all; rows of P at the nodes `lowered`, which are no vertices, are linear for the lumped mass.
     """
 
     fits: FitPlan
@@ -330,7 +304,8 @@ def boundary_mass(points: Tensor, plan: CurvingPlan, mesh: CurvedMesh, p: Any) -
         return None
     coarse = plan.coarse[cell]
     size = area_element(metric(mesh.places, elements[~coarse], shape))
-    result = p.T @ (assemble_mass(size, elements[~coarse], shape, len(mesh.places)) @ p)
+    blocks = (shape.weights * size) @ squares(shape)
+    result = p.T @ summed(blocks, elements[~coarse], len(mesh.places)) @ p
     result = (result + result.T) / 2
     if mesh.cover is not None:
         shares = boundary_shares(points, elements[coarse, :2], mesh.cover)
