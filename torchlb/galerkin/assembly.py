@@ -220,12 +220,34 @@ def upper_congruence(p: Any, lots: Sequence[ElementMatrices]) -> sparse.csr_arra
 
     nodes, local, size = (np.concatenate(parts) for parts in zip(*map(_rows, lots), strict=True))
     order, start = nodes.argsort(kind="stable"), size.cumsum() - size
-    uses = np.bincount(nodes, minlength=p.shape[0])
-    values = torch.cat([lot.blocks.flatten() for lot in lots]).numpy()
+    ends = np.bincount(nodes, minlength=p.shape[0]).cumsum()
     parts = (np.arange(len(nodes)) - local)[order], start[order], size[order]
-    rows = np.concatenate([[0], uses.cumsum()]), *parts
-    indptr, indices, data = congruence(p, rows, nodes, values)
-    return sparse.csr_array((data, indices, indptr), shape=2 * p.shape[1:])
+    rows = np.concatenate([[0], ends]), *parts
+    elements = nodes, torch.cat([lot.blocks.flatten() for lot in lots]).numpy()
+    left, unsigned, count = p.T.tocsr(), np.uint32, p.shape[1]  # unsigned indices are faster
+    left, right = (
+        (m.indptr.astype(np.int32), m.indices.astype(unsigned), m.data)
+        for m in (left, left.T.tocsr())  # with ascending columns
+    )
+    room = [
+        (np.empty(length, complex), np.empty(length, np.int32), np.empty(length, unsigned))
+        for length in p.shape
+    ]
+    length, done = 64 * count, 0
+    indptr, indices, data = (
+        np.zeros(count + 1, np.int32),
+        *(np.empty(length, t) for t in (unsigned, complex)),
+    )
+    while done < count:
+        for _, seen, _ in room:
+            seen.fill(-1)
+        done = congruence(done, left, right, rows, elements, *room, (indptr, indices, data))
+        length = int(indptr[done])
+        if done < count:
+            length = max(2 * len(indices), int(1.1 * length * count / max(done, 1)))
+        for x in (indices, data):
+            x.resize(length, refcheck=False)
+    return sparse.csr_array((data, indices.view(np.int32), indptr), shape=(count, count))
 
 
 def assembled(lots: Sequence[ElementMatrices], count: int) -> sparse.csr_array:

@@ -332,75 +332,33 @@ def straighten(distance, foot, order, points, first, ends, sides, fell, enough):
                 distance[i], foot[i] = best, source
 
 
-def congruence(p: Any, rows: tuple[np.ndarray, ...], nodes: np.ndarray, values: np.ndarray) -> Any:
-    """Upper triangle of PᵀAP for a symmetric complex A, as (indptr, indices, values), with columns in any order.
-
-    A is the sum of parts of its rows, several to a row. Row a has those from `rows[0][a]` to `rows[0][a + 1]`; part k
-    has `rows[3][k]` entries, in the columns `nodes[rows[1][k] :]`, with the values `values[rows[2][k] :]`.
-    """
-    left, (size, count), room = p.T.tocsr(), p.shape, []
-    p, unsigned = left.T.tocsr(), np.uint32  # with ascending columns; unsigned indices are faster
-    sides = [
-        x
-        for m in (left, p)
-        for x in (m.indptr.astype(np.int32), m.indices.astype(unsigned), m.data)
-    ]
-    for length in (size, count):
-        index = np.full(length, -1, np.int32), np.empty(length, unsigned)
-        room += [np.empty(length, complex), *index]
-    indptr, done = np.zeros(count + 1, np.int32), 0
-    indices, found = np.empty(64 * count, unsigned), np.empty(64 * count, complex)
-    inputs = *sides, *rows, nodes, values, *room, indptr
-    while True:
-        done = _congruence(done, *inputs, indices, found)
-        needed = int(indptr[done])
-        if done < count:
-            needed = max(2 * len(indices), int(1.1 * needed * count / max(done, 1)))
-        for x in (indices, found):
-            x.resize(needed, refcheck=False)
-        if done == count:
-            return indptr, indices.view(np.int32), found
-
-
 @_kept(
-    "int64(int64, int32[::1], uint32[::1], float64[::1], int32[::1], uint32[::1], float64[::1], int64[::1], "
-    "int64[::1], int64[::1], int64[::1], uint32[::1], complex128[::1], complex128[::1], int32[::1], uint32[::1], "
-    "complex128[::1], int32[::1], uint32[::1], int32[::1], uint32[::1], complex128[::1])"
+    "int64(int64, Tuple((int32[::1], uint32[::1], float64[::1])), Tuple((int32[::1], uint32[::1], float64[::1])), "
+    "UniTuple(int64[::1], 4), Tuple((uint32[::1], complex128[::1])), Tuple((complex128[::1], int32[::1], "
+    "uint32[::1])), Tuple((complex128[::1], int32[::1], uint32[::1])), Tuple((int32[::1], uint32[::1], "
+    "complex128[::1])))"
 )
 @no_type_check
-def _congruence(
-    first,
-    left_ptr,
-    left_col,
-    left,
-    right_ptr,
-    right_col,
-    right,
-    part_ptr,
-    part_col,
-    part_value,
-    part_size,
-    nodes,
-    values,
-    middle,
-    met,
-    reached,
-    total,
-    seen,
-    found,
-    indptr,
-    indices,
-    result,
-):
-    """Compute rows of the product from `first` on, until one does not fit, and return its number.
+def congruence(first, left, right, rows, elements, of_nodes, of_columns, result):
+    """Rows of the upper triangle of PᵀAP from `first` on, until one does not fit; return its number.
 
-    A row of PᵀA, `middle`, has entries at the nodes `reached`; one of the product, `total`, at the columns `found`.
+    `left` and `right` are Pᵀ and P, with ascending columns. Row a of A is the sum of the parts from `part_ptr[a]` to
+    `part_ptr[a + 1]`, with `part_size` entries in the columns `nodes[part_col :]`, `values[part_value :]`. A row of
+    PᵀA, `middle`, has entries at the nodes `reached`; one of the product, `total`, at the columns `found`. `met` and
+    `seen` are work space, −1.
     """
+    left_ptr, left_col, left_value = left
+    right_ptr, right_col, right_value = right
+    part_ptr, part_col, part_value, part_size = rows
+    nodes, values = elements
+    middle, met, reached = of_nodes
+    total, seen, found = of_columns
+    indptr, indices, data = result
     count = len(indptr) - 1
     for i in range(first, count):
         many, width = 0, 0
         for k in range(left_ptr[i], left_ptr[i + 1]):
-            a, weight = left_col[k], left[k]
+            a, weight = left_col[k], left_value[k]
             for part in range(part_ptr[a], part_ptr[a + 1]):
                 at, place = part_col[part], part_value[part]
                 for m in range(part_size[part]):
@@ -419,12 +377,11 @@ def _congruence(
                 if seen[j] != i:
                     seen[j], total[j], found[width] = i, 0.0, j
                     width += 1
-                total[j] += right[place] * x
+                total[j] += right_value[place] * x
         start = indptr[i]
         if start + width > len(indices):
-            met[:], seen[:] = -1, -1
             return i
         for k in range(width):
-            indices[start + k], result[start + k] = found[k], total[found[k]]
+            indices[start + k], data[start + k] = found[k], total[found[k]]
         indptr[i + 1] = start + width
     return count
