@@ -10,7 +10,7 @@ from scipy.sparse.linalg import eigsh
 from tolerances import TOLERANCE
 from torchlb import InputError, LaplaceBeltrami
 from torchlb.galerkin import flips
-from torchlb.galerkin.boundary_curves import boundary_curves_plan
+from torchlb.galerkin.boundary import boundary_curves_plan, lagrange
 from torchlb.galerkin.elements import lattice, simplex
 from torchlb.galerkin.flips import flipped
 from torchlb.galerkin.pair import mesh_pair
@@ -262,8 +262,9 @@ def test_curves_of_the_rim_reproduce_polynomials_of_arc_length():
     x = torch.tensor([0.0, 1, 1.5, 2.7, 4, 5.5], dtype=torch.float64)
     points = torch.stack([x, 0 * x, 0 * x], 1)
     rim = torch.stack([torch.arange(5), torch.arange(1, 6)], 1)
-    curves = boundary_curves_plan(points, rim, 4).at(points)
-    weights = curves.weights(torch.full((5, 1), 0.3, dtype=torch.float64))
+    curves = boundary_curves_plan(points, rim, 4)
+    share = torch.full((5, 1), 0.3, dtype=torch.float64)
+    weights = lagrange(curves.arcs(points), curves.valid, share)
     places = (weights * x[curves.index][:, None]).sum(-1)[:, 0]
     torch.testing.assert_close(places, x[:-1] + 0.3 * x.diff(), **TOLERANCE[torch.float64])
     cubic = (weights * (x[curves.index] ** 3)[:, None]).sum(-1)[:, 0]

@@ -65,19 +65,23 @@ def test_left_inverses_are_as_accurate_as_their_condition_allows(degree):
         assert error < torch.finfo(torch.float64).eps * 2 * bound
 
 
-def test_products_some_rows_at_a_time_are_those_of_the_whole(monkeypatch):
-    """PᵀAP, with zeros that cancel and columns that do not ascend."""
+@pytest.mark.parametrize(("count", "density"), [(300, 0.3), (90, 0.05)])
+def test_products_with_element_matrices_are_those_with_the_assembled_ones(count, density):
+    """Upper triangle of PᵀAP for two lots of elements, whose rows are longer than was foreseen, or empty."""
     generator = np.random.default_rng(0)
-    p = sparse.csr_array(sparse.random_array((400, 90), density=0.05, rng=generator))
-    matrix = sparse.random_array((400, 400), density=0.02, rng=generator)
-    matrix = sparse.csr_array(matrix + matrix.T + 1j * sparse.eye_array(400))
-    matrix.data[::5] = 0.0
-    shuffled = p[:, ::-1]
-    shuffled.indices = 89 - shuffled.indices
-    monkeypatch.setattr(assembly, "AT_ONCE", 40)
-    found = assembly.upper_congruence(shuffled.copy(), matrix)
-    expected = sparse.triu(p.T @ matrix @ p)
+    p = sparse.csr_array(sparse.random_array((400, count), density=density, rng=generator))
+    lots, total = [], sparse.csr_array((400, 400), dtype=complex)
+    for elements, size in ((150, 4), (40, 2)):
+        nodes = torch.from_numpy(generator.integers(0, 400, (elements, size)))
+        blocks = torch.randn(elements, size, size, dtype=torch.complex128)
+        blocks = (blocks + blocks.mT).flatten(1)
+        lots.append(assembly.ElementMatrices(nodes, blocks))
+        total = total + assembly.summed(blocks, nodes, 400)
+    found = assembly.upper_congruence(p, lots)
+    expected = sparse.triu(p.T @ total @ p)
     assert abs(found - expected).max() < 1e-14 * abs(expected).max()
+    sums = sum(lot.row_sums(400) for lot in lots)
+    np.testing.assert_allclose(sums, total.imag.sum(axis=1), atol=1e-13)
 
 
 @pytest.mark.parametrize("count", [1, 200])
@@ -89,7 +93,7 @@ def test_stored_matrices_are_symmetric(count):
     matrix = sparse.csr_array(matrix + matrix.T + (1 + 1j) * sparse.eye_array(count))
     matrix.data *= 1 + 1e-15 * generator.standard_normal(len(matrix.data))
     upper = sparse.triu(matrix, format="csr")[:, ::-1][:, ::-1]
-    one = Pattern.of(upper).pair(upper)
+    one = Pattern.of(upper, torch.arange(count)).pair(upper)
     k, m = (sparse.csr_array((v, one.col, one.crow), 2 * (count,)).toarray() for v in one.values)
     assert np.array_equal(k, k.T)
     assert np.array_equal(m, m.T)

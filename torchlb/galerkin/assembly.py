@@ -5,8 +5,9 @@ A symmetric (d, d) matrix is stored as its upper triangle, row by row.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from itertools import combinations_with_replacement
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -146,13 +147,6 @@ def element_matrices(
     return blocks
 
 
-def assemble_mass(
-    size: Float[Tensor, "T Q"], nodes: Int[Tensor, "T n"], shape: Element, num_nodes: int
-) -> sparse.csr_array:
-    """Mass matrix ∫ φ_i φ_j of elements with volume element `size` at the Gauss points."""
-    return summed((shape.weights * size) @ squares(shape), nodes, num_nodes)
-
-
 def gradient_products(shape: Element) -> Float[Tensor, "Q S n_times_n"]:
     """∂_a φ_i ∂_b φ_j at the Gauss points for a = b, and its sum with a and b exchanged for a < b."""
     products = []
@@ -165,21 +159,6 @@ def gradient_products(shape: Element) -> Float[Tensor, "Q S n_times_n"]:
 def squares(shape: Element) -> Float[Tensor, "Q n_times_n"]:
     """φ_i φ_j at the Gauss points."""
     return (shape.values[:, :, None] * shape.values[:, None, :]).flatten(1)
-
-
-def linear_elements(
-    lengths: Float[Tensor, "T e"],
-    cells: Int[Tensor, "T corners"],
-    num_points: int,
-    conductivity: Tensor | None = None,
-    density: Float[Tensor, " T"] | None = None,
-    *,
-    shares: Float[Tensor, " T"] | None = None,
-    lumped: Float[Tensor, " N"] | None = None,
-) -> sparse.csr_array:
-    """K + iM of P1 elements on flat simplices, assembled; arguments as for `linear_blocks`, and weights `shares`."""
-    blocks = linear_blocks(lengths, cells, conductivity, density, lumped)
-    return summed(blocks if shares is None else shares[:, None] * blocks, cells, num_points)
 
 
 def linear_blocks(
@@ -223,18 +202,61 @@ def summed(
     return result
 
 
-def upper_congruence(p: Any, matrix: sparse.csr_array) -> sparse.csr_array:
-    """Upper triangle of the symmetric PᵀAP, computed in blocks of rows."""
-    left, parts, count = sparse.csr_array(p.T), [], p.shape[1]
-    for first in range(0, count, AT_ONCE):
-        part: Any = left[first : first + AT_ONCE] @ matrix @ p
-        row = np.arange(first, first + part.shape[0], dtype=np.int32).repeat(np.diff(part.indptr))
-        upper = np.flatnonzero(part.indices >= row)
-        length = np.bincount(row[upper] - first, minlength=part.shape[0])
-        parts.append((length, part.indices.take(upper), part.data.take(upper)))
-    indptr = np.concatenate([[0], *(length for length, *_ in parts)]).cumsum()
-    indices, data = np.empty(indptr[-1], np.int32), np.empty(indptr[-1], parts[0][2].dtype)
-    for first in range(0, count, AT_ONCE):
-        place = slice(indptr[first], indptr[min(first + AT_ONCE, count)])
-        _, indices[place], data[place] = parts.pop(0)  # which frees it
-    return sparse.csr_array((data, indices, indptr), shape=(count, count))
+class ElementMatrices(NamedTuple):
+    """Nodes of elements, (T, n), and their matrices K + iM, row by row, (T, n²)."""
+
+    nodes: Int[Tensor, "T n"]
+    blocks: Complex[Tensor, "T n_times_n"]
+
+    def row_sums(self, count: int) -> Float[np.ndarray, " count"]:
+        """M1 of the assembled matrix of `count` nodes."""
+        shares = self.blocks.imag.unflatten(1, 2 * self.nodes.shape[1:]).sum(2).flatten()
+        return shares.new_zeros(count).index_add_(0, self.nodes.flatten(), shares).numpy()
+
+
+def upper_congruence(p: Any, lots: Sequence[ElementMatrices]) -> sparse.csr_array:
+    """Upper triangle of PᵀAP, where A is the sum of lots of element matrices; its pattern has no regard to values."""
+    from torchlb.linalg.kernels import congruence
+
+    nodes, local, size = (np.concatenate(parts) for parts in zip(*map(_rows, lots), strict=True))
+    order, start = nodes.argsort(kind="stable"), size.cumsum() - size
+    ends = np.bincount(nodes, minlength=p.shape[0]).cumsum()
+    parts = (np.arange(len(nodes)) - local)[order], start[order], size[order]
+    rows = np.concatenate([[0], ends]), *parts
+    elements = nodes, torch.cat([lot.blocks.flatten() for lot in lots]).numpy()
+    left, unsigned, count = p.T.tocsr(), np.uint32, p.shape[1]  # unsigned indices are faster
+    left, right = (
+        (m.indptr.astype(np.int32), m.indices.astype(unsigned), m.data)
+        for m in (left, left.T.tocsr())  # with ascending columns
+    )
+    room = [
+        (np.empty(length, complex), np.empty(length, np.int32), np.empty(length, unsigned))
+        for length in p.shape
+    ]
+    length, done = 64 * count, 0
+    indptr, indices, data = (
+        np.zeros(count + 1, np.int32),
+        *(np.empty(length, t) for t in (unsigned, complex)),
+    )
+    while done < count:
+        for _, seen, _ in room:
+            seen.fill(-1)
+        done = congruence(done, left, right, rows, elements, *room, (indptr, indices, data))
+        length = int(indptr[done])
+        if done < count:
+            length = max(2 * len(indices), int(1.1 * length * count / max(done, 1)))
+        for x in (indices, data):
+            x.resize(length, refcheck=False)
+    return sparse.csr_array((data, indices.view(np.int32), indptr), shape=(count, count))
+
+
+def assembled(lots: Sequence[ElementMatrices], count: int) -> sparse.csr_array:
+    """Upper triangle of the sum of element matrices whose nodes are the `count` vertices."""
+    return upper_congruence(sparse.eye_array(count, format="csr"), lots)
+
+
+def _rows(lot: ElementMatrices) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Node of every row of the element matrices, its number in the element, and the length of the row."""
+    count, size = lot.nodes.shape
+    nodes = lot.nodes.flatten().numpy().astype(np.uint32)
+    return nodes, np.tile(np.arange(size), count), np.full(count * size, size)

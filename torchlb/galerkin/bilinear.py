@@ -11,6 +11,7 @@ from torch import Tensor
 from torchlb.galerkin.assembly import area_element, conductance, gradient_products, squares
 from torchlb.galerkin.elements import Element
 from torchlb.geometry.vectors import at
+from torchlb.linalg.once import computed_again
 from torchlb.linalg.precision import rows_at_once
 
 
@@ -35,7 +36,11 @@ def outer(
     """Σ_k c_k w_k(i) u_k(j) for all pairs of nodes of each element."""
     one, two = values[0] * c, values[1]
     parts = nodes.split(rows_at_once(nodes.shape[1] * len(c)))
-    return torch.cat([(at(one, part) @ at(two, part).mT).flatten(1) for part in parts])
+    return torch.cat([computed_again(_outer, one, two, part) for part in parts])
+
+
+def _outer(one: Tensor, two: Tensor, nodes: Tensor) -> Tensor:
+    return (at(one, nodes) @ at(two, nodes).mT).flatten(1)
 
 
 def weighted_slopes(

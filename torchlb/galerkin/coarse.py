@@ -86,14 +86,15 @@ def _without_inside(points: Tensor, nodes: Nodes, fits: FitPlan) -> Bool[Tensor,
 
 
 def _cosines(points: Float[Tensor, "N 3"], nodes: Nodes) -> Float[Tensor, " E"]:
-    """Cosine of the angle between the two triangle normals at each edge; 1 where there are not two triangles."""
+    """Cosine of the angle between the two triangle normals at each edge; 1 where not two triangles have an area."""
     corners = at(points, nodes.faces)
     normal = torch.linalg.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     normal = torch.nn.functional.normalize(normal, eps=torch.finfo(normal.dtype).tiny)
-    total = points.new_zeros(len(nodes.edges), 3)
+    normal = torch.cat([normal, normal.square().sum(1, keepdim=True).round()], 1)
+    total = points.new_zeros(len(nodes.edges), 4)
     total.index_add_(0, nodes.edge.flatten(), normal.repeat_interleave(3, 0))
     # |m + n|² = 2 + 2 m·n of two units
-    return torch.where(nodes.sides[2].uses == 2, total.square().sum(1) / 2 - 1, 1.0)
+    return torch.where(total[:, 3] == 2, total[:, :3].square().sum(1) / 2 - 1, 1.0)
 
 
 def _around(nodes: Nodes, values: Shaped[Tensor, " N"]) -> Shaped[Tensor, " N"]:

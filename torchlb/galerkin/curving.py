@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Protocol, runtime_checkable
+from typing import NamedTuple
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -51,18 +51,11 @@ class Ends:
             yield part, own.clamp_max(len(self.node) - 1), slot < uses[part, None]
 
 
-@dataclass(frozen=True)
-class BoundaryNodes:
+class BoundaryNodes(NamedTuple):
     """Nodes whose position and value depend on boundary vertices alone: zero at these is zero on the whole boundary.
 
-    Attributes
-    ----------
-    displacement
-        (X, n), displacement of every node from its flat position by the boundary, ℓ.
-    nodes
-        (A,), nodes along the boundary.
-    entries
-        (node, vertex, weight), which interpolate values at these nodes from boundary vertices.
+    They are displaced from the flat cells by (X, n), ℓ, as all nodes near them are, and take their values from boundary
+    vertices, by `entries` (node, vertex, weight).
     """
 
     displacement: Float[Tensor, "X n"]
@@ -70,33 +63,26 @@ class BoundaryNodes:
     entries: tuple[Int[Tensor, " E"], Int[Tensor, " E"], Float[Tensor, " E"]]
 
 
-@runtime_checkable
-class BoundaryNodesPlan(Protocol):
-    """Plan of the nodes along the boundary."""
+@dataclass(frozen=True)
+class BoundaryNodesPlan:
+    """Plan of the nodes along the boundary; this one of a shape without any."""
+
+    nodes: Nodes
 
     def at(self, points: Float[Tensor, "N n"]) -> BoundaryNodes:
         """Evaluate the plan at these points."""
-        ...
+        none = torch.zeros(0, dtype=torch.int64)
+        still = points.new_zeros(len(self.nodes.shares), points.shape[1])
+        return BoundaryNodes(still, none, (none, none, points.new_zeros(0)))
 
 
 @dataclass(frozen=True)
 class CurvingPlan:
     """Plan of the curved cells.
 
-    Attributes
-    ----------
-    nodes
-        Lagrange nodes.
-    boundary
-        Plan of the nodes along the boundary.
-    curved
-        (E,), which edges are curved.
-    bent
-        (X,), which nodes lie on the surface instead of on a flat cell.
-    coarse, fixed
-        (F,), triangles that `coarse_triangles` finds; (E,), edges along which the sheets of their cover are not glued.
-    flips
-        Edge flips that make that cover Delaunay.
+    It says which edges are `curved`, which nodes are `bent`, on the surface instead of on a flat cell, and which
+    triangles are `coarse`; the sheets of the cover of these are not glued along `fixed` edges, and `flips` make it
+    Delaunay.
     """
 
     nodes: Nodes
@@ -111,7 +97,9 @@ class CurvingPlan:
         """Evaluate the curved cells at these points."""
         nodes, boundary = self.nodes, self.boundary.at(points)
         ends, flat = node_ends(nodes, len(points)), flat_places(points, nodes)
-        standing, _ = _moved(points, plan, fits, nodes, ends, _start(flat, boundary), boundary)
+        standing, _ = _moved(
+            points, plan, fits, nodes, ends, flat + boundary.displacement, boundary
+        )
         places = torch.cat([points, torch.where(self.bent[:, None], standing, flat)])
         lengths, some = (
             sound_lengths(nodes.lengths(points), nodes.cells),
@@ -135,22 +123,10 @@ class CurvingPlan:
 
 @dataclass(frozen=True)
 class CurvedMesh:
-    """Curved cells at given points.
+    """Curved cells at given points: positions of the nodes, ℓ, metric at the Gauss points, ℓ², and edge lengths, ℓ.
 
-    Attributes
-    ----------
-    places
-        (N + X, n), positions of the nodes, ℓ.
-    metric
-        (F, Q, S), metric at the Gauss points of each cell, ℓ²; that of flat triangles is of mollified lengths.
-    lengths
-        (F, e), mollified edge lengths, ℓ.
-    cover
-        Cover that replaces the coarse triangles; None if there are none.
-    boundary
-        Nodes along the boundary.
-    ends
-        Vertices whose fits the nodes use.
+    Lengths are mollified, and so are metrics of flat triangles. `cover` replaces coarse triangles, None without any;
+    `ends` are the vertices whose fits the nodes use.
     """
 
     places: Float[Tensor, "NX n"]
@@ -176,7 +152,7 @@ def curve(
     """
     boundary, flat = edge_nodes.at(points), flat_places(points, nodes)
     ends = node_ends(nodes, len(points))
-    start = _start(flat, boundary)
+    start = flat + boundary.displacement
     standing, sound = _moved(points, plan, fits, nodes, ends, start, boundary)
     ratio = (start - flat).norm(dim=1) / _sizes(points, nodes)
     curved, *whole = nodes.by_side(sound & (ratio <= ROUGH))
@@ -202,10 +178,6 @@ def curve(
 def flat_places(points: Float[Tensor, "N n"], nodes: Nodes) -> Float[Tensor, "X n"]:
     """Positions of the nodes on flat cells."""
     return torch.einsum("xv,xvn->xn", nodes.shares, at(points, nodes.corners))
-
-
-def _start(flat: Float[Tensor, "X n"], boundary: BoundaryNodes) -> Float[Tensor, "X n"]:
-    return flat + boundary.displacement
 
 
 def _opposed(points: Tensor, nodes: Nodes) -> Bool[Tensor, " E"]:

@@ -23,18 +23,11 @@ EDGES = tuple((i, (i + 1) % 3) for i in range(3))
 
 
 class Cover(NamedTuple):
-    """Tufted cover of a set of triangles.
+    """Tufted cover of a set of triangles, with edge lengths in the order of `EDGES`, ℓ.
 
-    Attributes
-    ----------
-    faces
-        (2F, 3); both copies of a vertex have one number, and an edge may join a vertex to itself.
-    lengths
-        (2F, 3), edge lengths in the order of `EDGES`, ℓ.
-    flips
-        Batches of simultaneous edge flips, in order; half-edge s of face f has number 3f + s.
-    shares
-        For each batch, the pairs of triangles, and the first one's share of their joint area before the flip.
+    Both copies of a vertex have one number, and an edge may join a vertex to itself. `flips` are batches of
+    simultaneous edge flips; half-edge s of face f has number 3f + s. Each has `shares`: the pairs of triangles, and the
+    first one's share of their joint area before the flip.
     """
 
     faces: Int[Tensor, "two_F 3"]

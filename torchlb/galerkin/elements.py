@@ -20,14 +20,8 @@ from torchlb.fits.polynomials import monomial_derivatives, monomials
 class Element(NamedTuple):
     """Shape functions φ_i at the points of a Gauss rule that is exact up to degree 2r + 1.
 
-    Attributes
-    ----------
-    weights
-        (Q,), quadrature weights; they sum to the volume of the reference simplex, 1/d!.
-    values
-        (Q, n), φ_i.
-    gradients
-        (Q, n, d), ∇φ_i in reference coordinates, the barycentric ones of all corners but the first.
+    Its weights sum to the volume of the reference simplex, 1/d!. `values` are φ_i, `gradients` ∇φ_i in reference
+    coordinates, the barycentric ones of all corners but the first.
     """
 
     weights: Float[Tensor, " Q"]

@@ -116,11 +116,7 @@ def _flips(
 
 
 def _independent(
-    gain: Tensor,
-    left: Tensor,
-    right: Tensor,
-    after: Tensor,
-    num_faces: int,
+    gain: Tensor, left: Tensor, right: Tensor, after: Tensor, num_faces: int
 ) -> Tensor:
     """Improving flips, best first, that share neither a face nor the new edge with a better one."""
     order = gain.argsort(descending=True, stable=True)

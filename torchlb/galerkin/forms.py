@@ -14,13 +14,13 @@ from scipy import sparse
 from torch import Tensor
 
 from torchlb.galerkin.assembly import (
+    ElementMatrices,
     area_element,
     element_matrices,
     flat_metric,
     in_cells,
-    linear_elements,
+    linear_blocks,
     spread,
-    summed,
     upper_congruence,
 )
 from torchlb.galerkin.bilinear import BilinearForm, outer, weighted_products, weighted_slopes
@@ -32,27 +32,18 @@ from torchlb.galerkin.prolongation import prolongation
 from torchlb.geometry.local_fits import FitPlan, LocalFits
 from torchlb.geometry.numbering import Numbering
 from torchlb.geometry.vectors import at
-from torchlb.linalg.once import once_differentiable
+from torchlb.linalg.once import computed_again, once_differentiable
 
 Linear = Callable[[Tensor], Tensor]
+Values = list[Tensor] | None
 FIELDS = {"stiffness": "conductivity", "mass": "density", "potential": "potential"}
 
 
 class FlatCells(NamedTuple):
-    """Flat simplices with P1 elements, in place of curved cells or beside them.
+    """Flat simplices with P1 elements, in place of curved cells or beside them, of which a `share` is integrated.
 
-    Attributes
-    ----------
-    cells
-        (T, d + 1).
-    lengths
-        (T, e), edge lengths, ℓ.
-    share
-        Fraction of each simplex that is integrated.
-    lumped
-        (N,), factors of the mass, which is lumped in equal shares to the corners; None where it is not.
-    mix
-        (T, F), share of each face of the mesh in a cell; None where the cells replace no faces.
+    The mass is lumped in equal shares to the corners, times the factors `lumped`, None where it is not; `mix`, (T, F),
+    has the share of each face of the mesh in a cell, None where the cells replace no faces.
     """
 
     cells: Int[Tensor, "T corners"]
@@ -71,28 +62,22 @@ class Forms:
 
     Attributes
     ----------
-    points, places
-        (N, n), (NX, n), vertices and nodes, ℓ.
-    cells, lengths
-        (T, d + 1), (T, e), ℓ: simplices, and their edge lengths in the order of `subsets`.
-    faces
-        (T,), face of the mesh for each simplex.
-    num_faces
-        Number F of faces of the mesh.
+    given
+        The vertices in an order along the shape, of which the computed triangles of matrices are.
+    places
+        Positions of the nodes, ℓ; the first are the `points`, the vertices.
+    cells, lengths, faces, shares
+        Simplices, their edge lengths in the order of `subsets`, ℓ, the face of the mesh, of `num_faces`, that each is,
+        and the fractions of them that are integrated, None for all.
     prolongation
-        P, (N + X, N), from the vertices to the nodes.
-    nodes
-        (T, n), nodes of each element.
-    metric
-        (T, Q, S), metric at the Gauss points, ℓ².
-    element
-        Shape functions at the Gauss points.
-    shares
-        (T,), fraction of each simplex that is integrated; None for all of it.
+        P, from the vertices to the nodes.
+    nodes, metric, element
+        Nodes of each element, metric, ℓ², and shape functions at the Gauss points.
     flats
         Flat simplices beside these.
     """
 
+    given: Int[Tensor, " N"]
     points: Float[Tensor, "N n"]
     places: Float[Tensor, "NX n"]
     cells: Int[Tensor, "T corners"]
@@ -138,7 +123,8 @@ class Forms:
             parts, shares = [x[own] for x in parts], None if shares is None else shares[own]
         cells, lengths, faces, elements, metric = parts
         curved = p, elements, metric, simplex(nodes.dim, nodes.degree)
-        flat = fits.points, mesh.places, cells, lengths, faces, len(own)
+        every = torch.arange(len(fits.points))
+        flat = every, fits.points, mesh.places, cells, lengths, faces, len(own)
         return cls(*flat, *curved, shares, flats)
 
     @classmethod
@@ -160,11 +146,13 @@ class Forms:
         flats = [FlatCells(faces, lengths, 1.0, mass / shares, whole)]
         metric = spread(g[:0], element)
         curved = faces[:0], lengths[:0], faces[:0, 0], len(faces), same, faces[:0], metric, element
-        return cls(points, points, *curved, None, flats)
+        return cls(torch.arange(len(points)), points, points, *curved, None, flats)
 
     def restored(self, numbering: Numbering, order: Int[Tensor, " G"], num_faces: int) -> Forms:
         """Renumber to the user's points and `num_faces` faces; `order` has the user's numbers of the faces here."""
         given = numbering.given
+        beyond = torch.arange(len(given), len(self.places))  # nodes that are no vertices
+        rows = torch.cat([numbering.here, beyond])
         flats = [
             flat._replace(
                 cells=given[flat.cells],
@@ -175,11 +163,14 @@ class Forms:
         ]
         return replace(
             self,
+            given=given,
             points=numbering.restored(self.points),
+            places=self.places[rows],
+            nodes=torch.cat([given, beyond])[self.nodes],
             cells=given[self.cells],
             faces=order[self.faces],
             num_faces=num_faces,
-            prolongation=_renumbered(self.prolongation, given, len(given)),
+            prolongation=_renumbered(self.prolongation[rows.numpy()], given, len(given)),
             flats=flats,
         )
 
@@ -223,58 +214,57 @@ class Forms:
         own = torch.einsum("tnk,qnd->tqkd", places, self.element.gradients)
         return [own, *((x[:, 1:] - x[:, :1]).mT for x in corners)]
 
-    def matrix(
-        self, conductivity: list[Tensor] | None = None, density: list[Tensor] | None = None
-    ) -> sparse.csr_array:
-        """Upper triangle of K + iM, (N, N), positive semidefinite in every medium; the rows of K sum to zero."""
-        elements = summed(
-            self.blocks(conductivity, density), self.nodes, self.prolongation.shape[0]
-        )
-        return upper_congruence(self.prolongation, elements) + self.flat(conductivity, density)
+    def matrix(self, conductivity: Values = None, density: Values = None) -> sparse.csr_array:
+        """Upper triangle of K + iM, as `upper` has it, positive semidefinite in every medium; K1 = 0."""
+        medium = conductivity, density
+        lots = [self.curved_elements(*medium), *self.flat_elements(*medium)]
+        return self.upper(self.prolongation, lots)
 
-    def blocks(
-        self, conductivity: list[Tensor] | None = None, density: list[Tensor] | None = None
-    ) -> Tensor:
-        """Element matrices K_FE + iM_FE of the curved elements, (T, n²)."""
+    def near(self, conductivity: Values = None, density: Values = None) -> sparse.csr_array:
+        """Upper triangle of K₁ + iM₁ of P1 elements on flat simplices, with the mean of the medium on each."""
+        medium = conductivity, density
+        lots = [self.linear_elements(*medium), *self.flat_elements(*medium)]
+        return self.upper(sparse.eye_array(len(self.points), format="csr"), lots)
+
+    def upper(self, p: Any, lots: Sequence[ElementMatrices]) -> sparse.csr_array:
+        """Upper triangle of PᵀAP in the order of `given`; A is made of element matrices."""
+        return upper_congruence(_renumbered(p, self.given.argsort(), p.shape[1]), lots)
+
+    def curved_elements(
+        self, conductivity: Values = None, density: Values = None
+    ) -> ElementMatrices:
+        """Element matrices of the curved elements."""
         kappa = None if conductivity is None else self.on_curved(conductivity[0])
         rho = None if density is None else density[0]
         blocks = element_matrices(self.metric, self.element, kappa, rho)
-        return blocks if self.shares is None else self.shares[:, None] * blocks
+        return ElementMatrices(self.nodes, self.shared(blocks))
 
-    def near(
-        self,
-        conductivity: list[Tensor] | None = None,
-        density: list[Tensor] | None = None,
-        flat: Any = None,
-    ) -> sparse.csr_array:
-        """Upper triangle of K₁ + iM₁ of P1 elements on flat simplices, with the mean of the medium on each.
-
-        `flat` has the part of the flat cells, if it is known.
-        """
+    def linear_elements(
+        self, conductivity: Values = None, density: Values = None
+    ) -> ElementMatrices:
+        """P1 elements in place of the curved ones."""
         kappa, rho = (
             None if x is None else cell_mean(x[0], self.element) for x in (conductivity, density)
         )
         kappa = self.on_flat(kappa, self.cells, self.lengths)
-        own = linear_elements(
-            self.lengths, self.cells, len(self.points), kappa, rho, shares=self.shares
-        )
-        triangle: Any = sparse.triu(own, format="csr")
-        if not self.flats:
-            return triangle
-        return triangle + (self.flat(conductivity, density) if flat is None else flat)
+        blocks = linear_blocks(self.lengths, self.cells, kappa, rho)
+        return ElementMatrices(self.cells, self.shared(blocks))
 
-    def flat(
-        self, conductivity: list[Tensor] | None = None, density: list[Tensor] | None = None
-    ) -> sparse.csr_array:
-        """Upper triangle of K + iM of the flat cells."""
-        count = len(self.points)
-        total: Any = sparse.csr_array((count, count), dtype=complex)
+    def flat_elements(
+        self, conductivity: Values = None, density: Values = None
+    ) -> list[ElementMatrices]:
+        """P1 elements on the flat cells beside the curved ones, each lot of them."""
+        found = []
         for number, flat in enumerate(self.flats, 1):
             kappa, rho = (None if x is None else x[number] for x in (conductivity, density))
             kappa = self.on_flat(kappa, flat.cells, flat.lengths)
-            part = linear_elements(flat.lengths, flat.cells, count, kappa, rho, lumped=flat.lumped)
-            total = total + flat.share * sparse.triu(part, format="csr")
-        return total
+            blocks = linear_blocks(flat.lengths, flat.cells, kappa, rho, flat.lumped)
+            found.append(ElementMatrices(flat.cells, flat.share * blocks))
+        return found
+
+    def shared(self, x: Tensor) -> Tensor:
+        """Values of the simplices, (T, …), times the fractions of these that are integrated."""
+        return x if self.shares is None else self.shares.view(-1, *[1] * (x.ndim - 1)) * x
 
     def bilinear(self, forms: Sequence[BilinearForm], medium: Medium) -> Float[Tensor, ""]:
         """Σ of bilinear forms, differentiable in the medium; of "lumped" and "boundary", which depend on none, 0."""
@@ -296,12 +286,13 @@ class Forms:
         density = weighted_slopes if stiffness else weighted_products
         coefficient = None if values is None else values[0]
         coefficient = self.on_curved(coefficient) if stiffness else coefficient
-        own = density(self.metric, self.element, outer(self.nodes, nodes, c), coefficient)
+        blocks = outer(self.nodes, nodes, c)
+        own = computed_again(density, self.metric, self.element, blocks, coefficient)
         across = None
         if form.along is not None:
             across = [x[(..., *form.along)] for x in medium["projectors"]]
             own = across[0] * own
-        total = [own.sum() if self.shares is None else (self.shares[:, None] * own).sum()]
+        total = [self.shared(own).sum()]
         for number, flat in enumerate(self.flats, 1):
             shape = simplex(self.element.dim, 1)
             metric = spread(flat_metric(flat.lengths), shape)

@@ -8,8 +8,8 @@ from typing import Any, Literal, NamedTuple
 import torch
 from jaxtyping import Float, Shaped
 from torch import Tensor
-from torch.nn.functional import normalize
 
+from torchlb.geometry.vectors import dot
 from torchlb.linalg.once import once_differentiable
 from torchlb.linalg.precision import TINY
 
@@ -18,16 +18,9 @@ Map = Callable[[Tensor], Tensor]
 
 
 class Field(NamedTuple):
-    """A field of a medium at the vertices or on the faces.
+    """A field of a medium at the vertices or on the faces: numbers, or symmetric positive space tensors, (…, n, n).
 
-    Attributes
-    ----------
-    values
-        (N,) or (F,), numbers, or symmetric positive space tensors, (N, n, n) or (F, n, n).
-    on_faces
-        Whether they are on the faces.
-    positive
-        Whether the field is positive, and not merely nowhere negative.
+    It is `positive`, or merely nowhere negative.
     """
 
     values: Shaped[Tensor, "count ..."]
@@ -96,6 +89,6 @@ def orthonormal(slopes: Float[Tensor, "*batch n d"]) -> Float[Tensor, "*batch n 
     for x in slopes.unbind(-1):
         for _ in range(2):  # the second time takes off what rounding leaves
             for e in unit:
-                x = x - (x * e).sum(-1, keepdim=True) * e
-        unit.append(normalize(x, dim=-1, eps=TINY))
+                x = x - dot(x, e)[..., None] * e
+        unit.append(x / dot(x, x).clamp_min(TINY).sqrt()[..., None])
     return torch.stack(unit, -1)

@@ -15,20 +15,10 @@ from torchlb.geometry.vectors import at
 
 @dataclass(frozen=True)
 class Sides:
-    """Sub-simplices of one dimension of a complex, each listed once.
+    """Sub-simplices of one dimension of a complex, each listed once, with ascending corners.
 
-    Attributes
-    ----------
-    corners
-        (S, s), ascending.
-    of
-        (F, c), sub-simplices of each cell, in the order of `subsets`.
-    edges
-        (S, e), edges of each.
-    uses
-        (S,), number of cells that each belongs to.
-    nodes
-        Number of nodes inside each.
+    `of` has those of each cell in the order of `subsets`, `edges` their edges, `uses` the number of cells that each
+    belongs to, `nodes` the number of nodes inside each.
     """
 
     corners: Int[Tensor, "S s"]
@@ -42,20 +32,9 @@ class Sides:
 class Nodes:
     """Nodes of degree r: the vertices, then those inside each edge, inside each triangle, and so on.
 
-    Attributes
-    ----------
-    degree
-        r.
-    faces
-        (F, d + 1), cells with their orientation.
-    cells
-        (F, d + 1), cells with their corners ascending.
-    sides
-        Sub-simplices by number of corners: edges, triangles, …, and the facets.
-    corners, shares
-        (X, d + 1), vertices and barycentric coordinates of each node that is not a vertex.
-    elements
-        (F, n), nodes of each cell in the order of `lattice`.
+    `faces` are the cells with their orientation, `cells` those with ascending corners; `sides` has their sub-simplices
+    by number of corners: edges, triangles, …, and facets. Nodes that are no vertices have barycentric coordinates
+    `shares` with respect to `corners`; `elements` has the nodes of each cell in the order of `lattice`.
     """
 
     degree: int

@@ -15,8 +15,9 @@ from torch import Tensor
 
 from torchlb.galerkin.assembly import (
     area_element,
-    assemble_mass,
+    assembled,
     metric,
+    squares,
     summed,
     upper_congruence,
 )
@@ -37,37 +38,27 @@ from torchlb.linalg.sparse import values_on
 
 @dataclass(frozen=True)
 class SparsePair:
-    """Symmetric matrices on one pattern: on a surface stiffness (no unit), mass (ℓ²) and boundary mass (ℓ).
+    """K and M, and B on a shape with a boundary, on one CSR pattern with ascending columns.
 
-    Attributes
-    ----------
-    crow, col
-        (N + 1,), (nnz,), CSR with ascending columns.
-    values
-        (2, nnz), K and M; (3, nnz), also B, on a shape with a boundary.
+    On a surface stiffness has no unit, mass that of ℓ², and boundary mass that of ℓ.
     """
 
     crow: Int[Tensor, " N_plus_1"]
     col: Int[Tensor, " nnz"]
     values: Float[Tensor, "terms nnz"]
 
+    def beside(self, others: Sequence[Any], number: np.ndarray | None = None) -> SparsePair:
+        """The pair with other matrices on its pattern, whose rows have these numbers here."""
+        place = self.crow.numpy(), self.col.numpy()
+        extra = [torch.from_numpy(values_on(*place, other, number))[None] for other in others]
+        return replace(self, values=torch.cat([self.values, *extra]))
+
 
 @dataclass(frozen=True)
 class Pattern:
-    """Map from a computed upper triangle to the full symmetric CSR pattern in the user's numbers.
+    """Map from a computed upper triangle, (indptr, indices), to the full CSR pattern in the user's numbers.
 
-    Attributes
-    ----------
-    crow, col
-        As in `SparsePair`.
-    order
-        (nnz,), index of each entry in the upper triangle.
-    diagonal
-        (N,), indices of the diagonal entries.
-    indptr, indices
-        (N + 1,), (upper,), CSR pattern of the upper triangle as computed.
-    given
-        (N,), user's numbers of its rows.
+    `order` has the index of every entry in the triangle, `diagonal` the indices of the diagonal entries.
     """
 
     crow: Int[Tensor, " N_plus_1"]
@@ -76,15 +67,12 @@ class Pattern:
     diagonal: Int[np.ndarray, " N"]
     indptr: Int[np.ndarray, " N_plus_1"]
     indices: Int[np.ndarray, " upper"]
-    given: Int[np.ndarray, " N"]
 
     @classmethod
-    def of(cls, upper: Any, numbering: Numbering | None = None) -> Pattern:
-        """Full pattern of an upper triangle, which without a numbering is in the user's numbers already."""
-        count = upper.shape[0]
-        given = np.arange(count) if numbering is None else numbering.given.numpy()
-        given = given.astype(np.int32)
-        row, col = given.repeat(np.diff(upper.indptr)), given[upper.indices]
+    def of(cls, upper: Any, given: Int[Tensor, " N"]) -> Pattern:
+        """Full pattern of an upper triangle, whose rows have the user's numbers `given`."""
+        count, number = upper.shape[0], given.numpy().astype(np.int32)
+        row, col = number.repeat(np.diff(upper.indptr)), number[upper.indices]
         beyond = np.flatnonzero(row != col).astype(np.int32)
         places = np.concatenate([np.arange(upper.nnz, dtype=np.int32), beyond])
         where = np.concatenate([row, col[beyond]]), np.concatenate([col, row[beyond]])
@@ -93,37 +81,29 @@ class Pattern:
         row = np.arange(count, dtype=np.int32).repeat(np.diff(whole.indptr))
         diagonal = np.flatnonzero(row == whole.indices)
         crow, col = (torch.from_numpy(part).long() for part in (whole.indptr, whole.indices))
-        return cls(crow, col, whole.data, diagonal, upper.indptr, upper.indices, given)
+        return cls(crow, col, whole.data, diagonal, upper.indptr, upper.indices)
 
     def is_of(self, upper: Any) -> bool:
         """Whether this is the pattern of `upper`: products drop entries that are zero at some points only."""
         ours, theirs = (self.indptr, self.indices), (upper.indptr, upper.indices)
         return all(np.array_equal(x, y) for x, y in zip(ours, theirs, strict=True))
 
-    def pair(self, upper: Any, *others: Any) -> SparsePair:
-        """Unpack K + iM into real matrices, rows of K summing to zero, followed by others such as the boundary mass."""
-        values = np.empty((2, len(self.order)))
-        for value, part in zip(values, (upper.data.real, upper.data.imag), strict=True):
-            np.take(part.copy(), self.order, out=value, mode="clip")  # this mode is not buffered
+    def whole(self, upper: Float[np.ndarray, " upper"]) -> Float[np.ndarray, " nnz"]:
+        """The values of the full matrix from those of the upper triangle."""
+        return upper.copy().take(self.order, mode="clip")  # this mode is not buffered
+
+    def pair(self, upper: Any) -> SparsePair:
+        """Unpack K + iM into real matrices, rows of K summing to zero."""
+        values = np.stack([self.whole(upper.data.real), self.whole(upper.data.imag)])
         values[0, self.diagonal] -= np.add.reduceat(values[0], self.crow.numpy()[:-1])
-        if others:
-            place = self.crow.numpy(), self.col.numpy()
-            number = self.given.astype(np.int64)
-            extra = [values_on(*place, (other + other.T) / 2, number) for other in others]
-            values = np.concatenate([values, np.stack(extra)])
         return SparsePair(self.crow, self.col, torch.from_numpy(values))
 
 
 @dataclass(frozen=True)
 class WeakPair:
-    """The pair (K, M), its P1 pair and its lumped mass.
+    """The pair (K, M), that of P1 elements near it, None where both are the same, and the lumped mass.
 
-    Attributes
-    ----------
-    matrices, linear
-        The high-order pair, and that of P1 elements near it; None where both are the same.
-    mass
-        (N,), positive, sums to the area, ℓ^d; None for the mass of the operator's shape.
+    The mass is positive and sums to the area, ℓ^d; None for that of the operator's shape.
     """
 
     matrices: SparsePair
@@ -139,16 +119,8 @@ ELEMENTS = {1: (2, (2,)), 2: (2, (2,)), 3: (2, (3, 2)), 4: (3, (4, 2)), 5: (4, (
 class PairPlan:
     """Plan of the weak pair of a complex of d-simplices.
 
-    Attributes
-    ----------
-    fits, curving
-        Plans of the fits at the vertices, and of the curved cells.
-    stars
-        (S, d + 1), simplices of local stars, each weighted by 1/(d + 1).
-    shares
-        (F,), fraction of each cell that is integrated; None for all of it.
-    lowered
-        (L,), nodes that are not vertices and whose rows of P are linear for the lumped mass.
+    Simplices of local `stars` are weighted by 1/(d + 1); `shares` are the fractions of the cells that are integrated,
+    None for all; rows of P at the nodes `lowered`, which are no vertices, are linear for the lumped mass.
     """
 
     fits: FitPlan
@@ -272,25 +244,25 @@ def assembled_pair(
     Missing `patterns` are computed and added.
     """
     forms = plan.forms(fits, mesh)
-    flat, p = forms.flat(), forms.prolongation
-    near = forms.near(flat=flat)
+    p, count = forms.prolongation, len(fits.points)
+    given = torch.arange(count) if numbering is None else numbering.given
     boundary = boundary_mass(fits.points, plan.curving, mesh, p)
-    blocks, nodes = [forms.blocks()], forms.nodes
+    own, linear, *flats = forms.curved_elements(), forms.linear_elements(), *forms.flat_elements()
     del forms, mesh  # some of these are as large as the pair
     fits.let_go()
-    elements = summed(blocks.pop(), nodes, p.shape[0])
-    weights, beside = elements.imag.sum(axis=1), _row_sums(flat)
-    mass, lowered = positive_mass(p, weights, plan, _row_sums(near) - beside)
-    upper = upper_congruence(p, elements)
-    upper = upper + flat if flat.nnz else upper  # without a copy
-    del p, elements
+    weights = own.row_sums(p.shape[0])
+    mass, lowered = positive_mass(p, weights, plan, linear.row_sums(count))
+    mass += sum(lot.row_sums(count) for lot in flats)
+    near, upper = assembled([linear, *flats], count), upper_congruence(p, [own, *flats])
+    del p, own, linear, flats
     found = {}
     for name, matrix in {"linear": near, "matrices": upper}.items():
         if name not in patterns or not patterns[name].is_of(matrix):
-            patterns[name] = Pattern.of(matrix, numbering)
-        more = () if boundary is None or matrix is near else (boundary,)
-        found[name] = patterns[name].pair(matrix, *more)
-    return WeakPair(**found, mass=torch.from_numpy(mass + beside)), lowered
+            patterns[name] = Pattern.of(matrix, given)
+        found[name] = patterns[name].pair(matrix)
+    if boundary is not None:
+        found["matrices"] = found["matrices"].beside([boundary], given.numpy())
+    return WeakPair(**found, mass=torch.from_numpy(mass)), lowered
 
 
 def positive_mass(
@@ -324,12 +296,6 @@ def positive_mass(
     return mass, torch.from_numpy(np.flatnonzero(lowered) - count)
 
 
-def _row_sums(upper: Any) -> Float[np.ndarray, " N"]:
-    """Row sums M1 from the upper triangle of K + iM."""
-    mass = upper.imag
-    return mass.sum(axis=1) + mass.sum(axis=0) - mass.diagonal()
-
-
 def boundary_mass(points: Tensor, plan: CurvingPlan, mesh: CurvedMesh, p: Any) -> Any:
     """Boundary mass ∫ φ_i φ_j, 1 at the end of a curve, lumped at coarse triangles; None for a closed shape."""
     nodes, shape = plan.nodes, simplex(plan.nodes.dim - 1, plan.nodes.degree)
@@ -338,7 +304,9 @@ def boundary_mass(points: Tensor, plan: CurvingPlan, mesh: CurvedMesh, p: Any) -
         return None
     coarse = plan.coarse[cell]
     size = area_element(metric(mesh.places, elements[~coarse], shape))
-    result = p.T @ (assemble_mass(size, elements[~coarse], shape, len(mesh.places)) @ p)
+    blocks = (shape.weights * size) @ squares(shape)
+    result = p.T @ summed(blocks, elements[~coarse], len(mesh.places)) @ p
+    result = (result + result.T) / 2
     if mesh.cover is not None:
         shares = boundary_shares(points, elements[coarse, :2], mesh.cover)
         result = result + sparse.diags_array(shares.numpy(), format="csr")

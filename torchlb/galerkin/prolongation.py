@@ -14,6 +14,7 @@ from torchlb.fits.weights import cardinal
 from torchlb.galerkin.curving import CurvedMesh, CurvingPlan
 from torchlb.geometry.local_fits import FitPlan, LocalFits
 from torchlb.geometry.vectors import at
+from torchlb.linalg.once import computed_again
 
 
 def prolongation(
@@ -53,9 +54,13 @@ def prolonged(
     found = values.new_zeros(len(mesh.places), values.shape[1])
     found = found.index_add(0, row, weight[:, None] * values[col])
     for asked, used, points, weights in _by_fits(plan, fits, mesh, by_fit):
-        said = weights @ at(values, points)  # (c, e, C)
-        found = found.index_add(0, count + asked[used], said[used])
+        said = computed_again(_said, weights, values, points, used)
+        found = found.index_add(0, count + asked[used], said)
     return found
+
+
+def _said(weights: Tensor, values: Tensor, points: Tensor, used: Tensor) -> Tensor:
+    return (weights @ at(values, points))[used]
 
 
 def _by_fits(

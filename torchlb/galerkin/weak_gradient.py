@@ -17,12 +17,7 @@ from torchlb.geometry.vectors import at
 class WeakGradient(NamedTuple):
     """The bilinear form ∫v·∇u of functions u and fields v on a surface, or ∫v·(ν × ∇u), for prolonged u and v.
 
-    Attributes
-    ----------
-    prolongation
-        P, from the vertices to the nodes.
-    curved, flat
-        Matrices ∫φ_j (∇φ_i)_k, (NX, NX) on curved elements and (N, N) on flat cells, for each component k in space.
+    Its matrices are ∫φ_j (∇φ_i)_k for each component k in space, (NX, NX) on curved elements and (N, N) on flat cells.
     """
 
     prolongation: Any

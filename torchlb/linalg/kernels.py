@@ -1,4 +1,4 @@
-"""Three loops without a fast form in NumPy, SciPy or torch, compiled by numba.
+"""Four loops without a fast form in NumPy, SciPy or torch, compiled by numba.
 
 Callers import them where they call them, so that importing the package does not load numba. Each is compiled for one
 signature only, and cached beside this file, or in the user's cache.
@@ -330,3 +330,58 @@ def straighten(distance, foot, order, points, first, ends, sides, fell, enough):
             if best < distance[i]:
                 most, fell[i] = max(most, distance[i] - best), clock
                 distance[i], foot[i] = best, source
+
+
+@_kept(
+    "int64(int64, Tuple((int32[::1], uint32[::1], float64[::1])), Tuple((int32[::1], uint32[::1], float64[::1])), "
+    "UniTuple(int64[::1], 4), Tuple((uint32[::1], complex128[::1])), Tuple((complex128[::1], int32[::1], "
+    "uint32[::1])), Tuple((complex128[::1], int32[::1], uint32[::1])), Tuple((int32[::1], uint32[::1], "
+    "complex128[::1])))"
+)
+@no_type_check
+def congruence(first, left, right, rows, elements, of_nodes, of_columns, result):
+    """Rows of the upper triangle of PᵀAP from `first` on, until one does not fit; return its number.
+
+    `left` and `right` are Pᵀ and P, with ascending columns. Row a of A is the sum of the parts from `part_ptr[a]` to
+    `part_ptr[a + 1]`, with `part_size` entries in the columns `nodes[part_col :]`, `values[part_value :]`. A row of
+    PᵀA, `middle`, has entries at the nodes `reached`; one of the product, `total`, at the columns `found`. `met` and
+    `seen` are work space, −1.
+    """
+    left_ptr, left_col, left_value = left
+    right_ptr, right_col, right_value = right
+    part_ptr, part_col, part_value, part_size = rows
+    nodes, values = elements
+    middle, met, reached = of_nodes
+    total, seen, found = of_columns
+    indptr, indices, data = result
+    count = len(indptr) - 1
+    for i in range(first, count):
+        many, width = 0, 0
+        for k in range(left_ptr[i], left_ptr[i + 1]):
+            a, weight = left_col[k], left_value[k]
+            for part in range(part_ptr[a], part_ptr[a + 1]):
+                at, place = part_col[part], part_value[part]
+                for m in range(part_size[part]):
+                    b = nodes[at + m]
+                    if met[b] != i:
+                        met[b], middle[b], reached[many] = i, 0.0, b
+                        many += 1
+                    middle[b] += weight * values[place + m]
+        for k in range(many):
+            b = reached[k]
+            x = middle[b]
+            for place in range(right_ptr[b + 1] - 1, right_ptr[b] - 1, -1):
+                j = right_col[place]
+                if j < i:
+                    break
+                if seen[j] != i:
+                    seen[j], total[j], found[width] = i, 0.0, j
+                    width += 1
+                total[j] += right_value[place] * x
+        start = indptr[i]
+        if start + width > len(indices):
+            return i
+        for k in range(width):
+            indices[start + k], data[start + k] = found[k], total[found[k]]
+        indptr[i + 1] = start + width
+    return count

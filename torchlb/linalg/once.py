@@ -1,4 +1,4 @@
-"""Operations that are differentiable once."""
+"""Operations that are differentiable once, or computed twice."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ from typing import Any
 
 import torch
 from torch import Tensor
+from torch.utils.checkpoint import checkpoint
 
 from torchlb.errors import DerivativeError
 
@@ -48,3 +49,8 @@ class _Last(torch.autograd.Function):
 
 
 _last: Any = _Last.apply
+
+
+def computed_again(function: Callable[..., Tensor], *inputs: Any) -> Tensor:
+    """What a function gives, which is computed again for its derivative instead of keeping what is between."""
+    return checkpoint(function, *inputs, use_reentrant=False, preserve_rng_state=False)  # pyright: ignore[reportReturnType]

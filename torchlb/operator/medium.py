@@ -7,8 +7,8 @@ from typing import Any
 
 import numpy as np
 import torch
-from scipy import sparse
 from torch import Tensor
+from torch.nn.functional import pad
 
 from torchlb.errors import InputError, first_few
 from torchlb.galerkin.forms import Forms
@@ -139,16 +139,20 @@ def pair_in(lb: OperatorStorage, medium: Medium) -> PairMatrices:
         linear = None
         if lb.weak.linear.num_rows:
             near = None if c is None else elements.near(None, c).imag
-            linear = _stored(lb.weak.linear, elements.near(kappa, rho), near)
-    whole = _stored(lb.weak, whole, potential)
+            linear = _stored(elements, lb.weak.linear, elements.near(kappa, rho), near)
+    whole = _stored(elements, lb.weak, whole, potential)
     return PairMatrices(whole.crow, whole.col, whole.values, linear)
 
 
-def _stored(pair: Csr, upper: Any, potential: Any) -> Csr:
+def _stored(elements: Forms, pair: Csr, upper: Any, potential: Any) -> Csr:
     """K and M in a medium from the upper triangle, with B and what a condition and the potential add to K."""
+    pattern = Pattern.of(upper, elements.given)
     shape = pair.num_rows, pair.num_rows
     rest = [to_scipy(pair.crow, pair.col, v.double(), shape) for v in pair.values[2:4]]
+    found = pattern.pair(upper).beside(rest)
+    values = found.values
     if potential is not None:
-        none: Any = sparse.csr_array(shape)
-        rest = [*[*rest, none, none][:2], potential + sparse.triu(potential, 1).T]
-    return Csr(**vars(Pattern.of(upper).pair(upper, *rest))).to(pair.values)
+        values = pad(values, (0, 0, 0, 4 - len(values)))
+        whole = torch.from_numpy(pattern.whole(potential.data))
+        values = torch.cat([values, whole[None]])
+    return Csr(found.crow, found.col, values).to(pair.values)
