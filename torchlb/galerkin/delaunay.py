@@ -113,7 +113,8 @@ def _lacking(sheets: Tensor, sides: Tensor, twin: Tensor) -> Iterator[Int[Tensor
         active = active[(twin[active] > active) & (active // 3 != twin[active] // 3)]
         weight = _cotangents(sides, active) + _cotangents(sides, twin[active])
         lacking = weight < -NEGLIGIBLE
-        chosen = _apart(active[lacking], twin[active[lacking]], weight[lacking], len(sheets))
+        poor = active[lacking]
+        chosen = poor[apart(poor // 3, twin[poor] // 3, weight[lacking], len(sheets))]
         if len(chosen) == 0:
             return
         faces = torch.cat([chosen, twin[chosen]]) // 3
@@ -162,15 +163,15 @@ def _cotangents(sides: Tensor, slot: Tensor) -> Float[Tensor, " H"]:
     return (after.square() + before.square() - own.square()) / (2 * own * height).clamp_min(tiny)
 
 
-def _apart(one: Tensor, other: Tensor, weight: Tensor, num_faces: int) -> Int[Tensor, " C"]:
-    """Independent edges: those of least weight among all that share a face with them."""
+def apart(one: Tensor, other: Tensor, weight: Tensor, num_faces: int) -> Int[Tensor, " C"]:
+    """Independent edges, the lightest first: those of least weight among all that share a face with them."""
     order = weight.argsort(stable=True)
     rank = torch.arange(len(order))
     first = torch.full((num_faces,), len(order))
-    pair = one[order] // 3, other[order] // 3
+    pair = one[order], other[order]
     for face in pair:
         first.scatter_reduce_(0, face, rank, "amin")
-    return one[order[(first[pair[0]] == rank) & (first[pair[1]] == rank)]]
+    return order[(first[pair[0]] == rank) & (first[pair[1]] == rank)]
 
 
 def _flip(

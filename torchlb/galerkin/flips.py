@@ -9,6 +9,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from torchlb.galerkin.delaunay import apart
 from torchlb.geometry.frames import vertex_normals
 from torchlb.geometry.thresholds import CREASE
 from torchlb.geometry.vectors import dot
@@ -119,14 +120,8 @@ def _independent(
     gain: Tensor, left: Tensor, right: Tensor, after: Tensor, num_faces: int
 ) -> Tensor:
     """Improving flips, best first, that share neither a face nor the new edge with a better one."""
-    order = gain.argsort(descending=True, stable=True)
-    order = order[gain[order] > 1e-9]
-    rank = torch.arange(len(order))
-    far = torch.full((num_faces,), len(order))
-    for face in (left[order], right[order]):
-        far.scatter_reduce_(0, face, rank, "amin")
-    free = (far[left[order]] == rank) & (far[right[order]] == rank)
-    order = order[free]
+    order = (gain > 1e-9).nonzero()[:, 0]
+    order = order[apart(left[order], right[order], -gain[order], num_faces)]
     made = _keys(after[order, 0, 0], after[order, 0, 1], int(after.max()) + 1)
     _, place = torch.unique(made, return_inverse=True)
     best = torch.full((int(place.max()) + 1 if len(place) else 0,), len(order))

@@ -67,8 +67,8 @@ class Forms:
     places
         Positions of the nodes, ℓ; the first are the `points`, the vertices.
     cells, lengths, faces, shares
-        Simplices, their edge lengths in the order of `subsets`, ℓ, the face of the mesh, of `num_faces`, that each is,
-        and the fractions of them that are integrated, None for all.
+        Simplices, their edge lengths in the order of `subsets`, ℓ, the face of the mesh that each is, and the
+        fractions of them that are integrated, None for all.
     prolongation
         P, from the vertices to the nodes.
     nodes, metric, element
@@ -83,7 +83,6 @@ class Forms:
     cells: Int[Tensor, "T corners"]
     lengths: Float[Tensor, "T e"]
     faces: Int[Tensor, " T"]
-    num_faces: int
     prolongation: Any
     nodes: Int[Tensor, "T lattice"]
     metric: Float[Tensor, "T Q S"]
@@ -124,7 +123,7 @@ class Forms:
         cells, lengths, faces, elements, metric = parts
         curved = p, elements, metric, simplex(nodes.dim, nodes.degree)
         every = torch.arange(len(fits.points))
-        flat = every, fits.points, mesh.places, cells, lengths, faces, len(own)
+        flat = every, fits.points, mesh.places, cells, lengths, faces
         return cls(*flat, *curved, shares, flats)
 
     @classmethod
@@ -145,7 +144,7 @@ class Forms:
         whole: Any = sparse.eye_array(len(faces), format="csr")
         flats = [FlatCells(faces, lengths, 1.0, mass / shares, whole)]
         metric = spread(g[:0], element)
-        curved = faces[:0], lengths[:0], faces[:0, 0], len(faces), same, faces[:0], metric, element
+        curved = faces[:0], lengths[:0], faces[:0, 0], same, faces[:0], metric, element
         return cls(torch.arange(len(points)), points, points, *curved, None, flats)
 
     def restored(self, numbering: Numbering, order: Int[Tensor, " G"], num_faces: int) -> Forms:
@@ -169,7 +168,6 @@ class Forms:
             nodes=torch.cat([given, beyond])[self.nodes],
             cells=given[self.cells],
             faces=order[self.faces],
-            num_faces=num_faces,
             prolongation=_renumbered(self.prolongation[rows.numpy()], given, len(given)),
             flats=flats,
         )
