@@ -66,9 +66,19 @@ class _Maps(NamedTuple):
         def shifted(p: Tensor, shifts: Tensor) -> Tensor:
             return single[0](p).sub_(single[2](p).mul_(shifts))
 
-        return cls(
-            (partial(multiply, *k), partial(multiply, *m)), (single[0], single[1]), shifted, cycle
+        whole = (
+            partial(_in_chunks, partial(multiply, *k)),
+            partial(_in_chunks, partial(multiply, *m)),
         )
+        return cls(whole, (single[0], single[1]), shifted, cycle)
+
+
+def _in_chunks(product: Linear, x: Tensor) -> Tensor:
+    """A product by some columns at once, for which the library takes several times their memory."""
+    result = torch.empty_like(x)
+    for here, part in zip(result.split(CHUNK, 1), x.split(CHUNK, 1), strict=True):
+        here.copy_(product(part))
+    return result
 
 
 def swept(
