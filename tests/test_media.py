@@ -408,11 +408,13 @@ def test_what_cannot_be_a_medium_is_refused():
     lb, one = build("mesh"), torch.ones(80, dtype=torch.float64)
     tensor = torch.eye(3, dtype=torch.float64).repeat(80, 1, 1)
     skew = tensor + torch.tensor([[0, 0.1, 0], [0, 0, 0], [0, 0, 0]])
+    tangential = lb.frames @ lb.frames.mT
     for given, message in (
         ({"conductivity": one[1:]}, "one of each vertex"),
         ({"conductivity": 0 * one}, "finite, positive"),
         ({"conductivity": skew}, "symmetric, positive"),
         ({"conductivity": -tensor}, "symmetric, positive"),
+        ({"conductivity": tangential}, "at 80 of 80 .* of tangent directions alone need"),
         ({"conductivity": tensor[:, :2, :2]}, "symmetric space tensors"),
         ({"density": tensor}, "one of each vertex"),
         ({"density": torch.nan * one}, "finite, positive"),

@@ -16,7 +16,7 @@ from torchlb.galerkin.medium import Field, Medium
 from torchlb.galerkin.pair import Pattern
 from torchlb.linalg.checks import check_tensor
 from torchlb.linalg.csr import Csr
-from torchlb.linalg.precision import ROOT_EPS
+from torchlb.linalg.precision import ROOT_EPS, ROUNDING
 from torchlb.linalg.sparse import to_scipy
 from torchlb.operator.inputs import ArrayLike
 from torchlb.operator.parts import MediumFields, PairMatrices
@@ -100,7 +100,10 @@ def _check_values(name: str, x: Tensor) -> None:
         skew = (x - x.mT).abs().amax((1, 2)) > ROOT_EPS * size
         safe = torch.where((x.isfinite().all(2).all(1) & ~skew)[:, None, None], x, 0.0)
         least, what = torch.linalg.eigvalsh(safe)[:, 0], "symmetric, positive"
-        bad = least <= 0
+        bad, remedy = (
+            least <= ROUNDING * size,
+            "; tensors of tangent directions alone need nnᵀ, too, n the normal",
+        )
     elif name == "potential":
         what, bad = "nonnegative", ~(x >= 0)
         remedy = "; with c + μρ in place of c the eigenvalues are λ + μ"
