@@ -317,9 +317,7 @@ def from_scipy(matrix: Any) -> tuple[Tensor, Tensor, Tensor]:
     return crow, col, torch.from_numpy(matrix.data)
 
 
-def on_device(
-    matrix: sparse.csr_array, device: torch.device | str = "cpu"
-) -> tuple[Tensor, Tensor, Tensor]:
+def on_device(matrix: sparse.csr_array, device: torch.device) -> tuple[Tensor, Tensor, Tensor]:
     """(crow, col, values) of a scipy CSR matrix on a device; on the CPU in the same memory."""
     crow, col, values = (
         torch.from_numpy(part).to(device) for part in (matrix.indptr, matrix.indices, matrix.data)

@@ -6,7 +6,6 @@ Jacobi–Davidson sweeps (`sweeps`). All run on the device of the operator; smal
 
 from __future__ import annotations
 
-from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -177,12 +176,12 @@ def _pairs(part: _Part, k: int, tolerance: float, device: torch.device) -> tuple
     """Eigenvalues of a component without 0, relative errors, U and MU: the k smallest, with groups whole, or all."""
     size, zero = len(part.points), int(part.conserving)
     count = min(k + BLOCK, size)
-    mass = partial(multiply, *on_device(part.mass_matrix, device))
+    mass_matrix = on_device(part.mass_matrix, device)
     if size <= max(DENSE, SHARE * count):
         dense = (part.stiffness.toarray(), part.mass_matrix.toarray())
         found = linalg.eigh(*dense, subset_by_index=(0, count - 1))
         values, u = (torch.from_numpy(x).to(device) for x in found)
-        errors, mu = torch.zeros_like(values), mass(u)
+        errors, mu = torch.zeros_like(values), multiply(*mass_matrix, u)
     else:
         k1, m1 = part.linear or (part.stiffness, part.mass_matrix)
         null = None
@@ -196,9 +195,9 @@ def _pairs(part: _Part, k: int, tolerance: float, device: torch.device) -> tuple
         if null is not None:
             values, u = pad(values, (1, 0)), torch.cat([null.to(u)[:, None], u], dim=1)
         if part.linear is None:
-            errors, mu = torch.full_like(values, tolerance), mass(u)
+            errors, mu = torch.full_like(values, tolerance), multiply(*mass_matrix, u)
         else:
-            matrices = [on_device(m, device) for m in (part.stiffness, part.mass_matrix, m1)]
+            matrices = [on_device(part.stiffness, device), mass_matrix, on_device(m1, device)]
             found = swept(matrices, u, k, solve, tolerance, zero)
             if found is None:
                 warn(
