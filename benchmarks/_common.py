@@ -53,14 +53,14 @@ def peak() -> float:
     )
 
 
-def alone(script: str, arguments: Sequence[str]) -> Any:
-    """What a script prints last, as JSON, from a process of its own with one thread."""
-    threads = {f"{library}_NUM_THREADS": "1" for library in ("OMP", "MKL", "OPENBLAS")}
+def alone(script: str, arguments: Sequence[str], threads: int = 1) -> Any:
+    """What a script prints last, as JSON, from a process of its own with so many threads."""
+    numbers = {f"{library}_NUM_THREADS": str(threads) for library in ("OMP", "MKL", "OPENBLAS")}
     done = subprocess.run(
         [sys.executable, script, *arguments],
         stdout=subprocess.PIPE,
         text=True,
         check=True,
-        env=os.environ | threads,
+        env=os.environ | numbers,
     )
     return json.loads(done.stdout.splitlines()[-1])

@@ -1,11 +1,12 @@
-"""Seconds and memory of operators beside their peers, one thread: python benchmarks/speed.py [MESH ...] [--sizes N ...]
+"""Seconds and memory of operators beside their peers: python benchmarks/speed.py [MESH ...] [--sizes N ...]
 
 Meshes of a star-shaped surface, evenly spread, and those named (.npz with `vertices` and `faces`, or what trimesh
 reads), and clouds of their vertices. Every figure is of a process of its own that has run the same on 500 points:
-medians of the seconds to build and of the seconds until 128 eigenpairs are there too, the latter over those of
-DiffusionNet's `get_operators` in brackets, and by how much the resident memory grew at most. What does not give
+medians of the seconds to build and of the seconds until 128 eigenpairs (--pairs) are there too, the latter over those
+of DiffusionNet's `get_operators` in brackets, and by how much the resident memory grew at most. What does not give
 eigenpairs has a dash, and is compared by its build. A method that would take longer than --limit at the next size,
-were it to grow linearly, is left out there. Growth is the exponent between the last two sizes.
+were it to grow linearly, is left out there. Growth is the exponent between the last two sizes. Seconds are those of
+the processor by one thread, or with --threads those that pass.
 
 `get_operators` is DiffusionNet's own where the environment variable DIFFUSION_NET names the folder `src` of a checkout,
 else its steps as they are restated here: cotangents or robust_laplacian, eigsh, and point by point the least-squares
@@ -33,27 +34,45 @@ import torch
 import trimesh
 from _common import alone, peak, versions
 from scipy import sparse
-from scipy.sparse.linalg import eigsh
+from scipy.sparse.linalg import LinearOperator, eigsh
 from scipy.spatial import KDTree
 from tqdm import tqdm
 
 from torchlb import LaplaceBeltrami
 from torchlb.surfaces import StarShaped
 
-PAIRS, NEIGHBORS = 128, 30
+NEIGHBORS = 30
 CHECKOUT = os.environ.get("DIFFUSION_NET")
-Method = tuple[Callable[..., Any], Callable[[Any], Any] | None]
-"""From points (and faces) to what is built, and from that to eigenpairs."""
+Method = tuple[Callable[..., Any], Callable[[Any, int], Any] | None]
+"""From points (and faces) to what is built, and from that to so many eigenpairs."""
 
 
 def ours(build: Callable[..., LaplaceBeltrami], **options: Any) -> Method:
-    return lambda *shape: build(*shape, **options), lambda lb: lb.eigenbasis(PAIRS)
+    return lambda *shape: build(*shape, **options), lambda lb, k: lb.eigenbasis(k)
 
 
-def pairs(matrices: tuple[Any, Any, Any]) -> Any:
+def pairs(matrices: tuple[Any, Any, Any], k: int) -> Any:
     """Smallest eigenpairs as DiffusionNet finds them, of (stiffness, mass, gradients)."""
     shifted = sparse.csc_matrix(matrices[0] + 1e-8 * sparse.identity(matrices[0].shape[0]))
-    return eigsh(shifted, PAIRS, matrices[1], sigma=1e-8)
+    return eigsh(shifted, k, matrices[1], sigma=1e-8)
+
+
+def pairs_by_cholesky(matrices: tuple[Any, Any, Any], k: int) -> Any:
+    """The same by ARPACK with a Cholesky factor, CHOLMOD's, instead of SuperLU's."""
+    from cholespy import CholeskySolverD, MatrixType
+
+    stiffness, mass, _ = matrices
+    count, sigma = len(mass.diagonal()), -1e-2
+    shifted = sparse.coo_matrix(stiffness - sigma * mass)
+    solver = CholeskySolverD(count, shifted.row, shifted.col, shifted.data, MatrixType.COO)
+
+    def solve(b: np.ndarray) -> np.ndarray:
+        x = np.empty_like(b, dtype=float)
+        solver.solve(np.ascontiguousarray(b), x)
+        return x
+
+    inverse = LinearOperator((count, count), matvec=solve, dtype=float)
+    return eigsh(sparse.csc_matrix(stiffness), k, mass, sigma=sigma, OPinv=inverse)
 
 
 def libigl(points: np.ndarray, faces: np.ndarray) -> Any:
@@ -129,9 +148,7 @@ def from_checkout(points: np.ndarray, faces: np.ndarray | None = None) -> Any:
 
 REFERENCE = "get_operators" if CHECKOUT else "get_operators, restated"
 ORIGINAL: Method = (
-    (from_checkout, lambda built: built[1](*built[0], PAIRS))
-    if CHECKOUT
-    else (get_operators, pairs)
+    (from_checkout, lambda built, k: built[1](*built[0], k)) if CHECKOUT else (get_operators, pairs)
 )
 MESH: dict[str, Method] = {
     REFERENCE: ORIGINAL,
@@ -142,6 +159,7 @@ MESH: dict[str, Method] = {
     },
     "robust_laplacian": (robust, pairs),
     "libigl": (libigl, pairs),
+    "libigl, ARPACK with CHOLMOD": (libigl, pairs_by_cholesky),
     "LaPy": (lapy, pairs),
 }
 CLOUD: dict[str, Method] = {
@@ -159,39 +177,42 @@ CLOUD: dict[str, Method] = {
 }
 
 
-def measure(methods: dict[str, Method], name: str, shape: list[np.ndarray], repeats: int) -> None:
-    """In a process of its own: prints seconds to build, seconds with pairs and MiB, as JSON."""
-    build, solve = methods[name]
-    torch.set_num_threads(1)
+def measure(method: Method, shape: list[np.ndarray], k: int, repeats: int, twice: bool) -> None:
+    """In a process of its own: prints seconds to build, seconds with k pairs and MiB, as JSON.
+
+    `twice` says that the pairs are found by another build.
+    """
+    build, solve = method
     warnings.simplefilter("ignore")
     small = StarShaped().points(500)
     first = small.numpy(), StarShaped().triangulate(small).numpy()
     warm = build(*first[: len(shape)])
     if solve:
-        solve(warm)
+        solve(warm, min(k, 128))
     before = peak()
+    clock = time.process_time if torch.get_num_threads() == 1 else time.perf_counter
     builds, totals = [], []
     for _ in range(repeats):
-        start = time.perf_counter()
+        start = clock()
         built = build(*shape)
-        builds.append(time.perf_counter() - start)
-        start = time.perf_counter()
+        builds.append(clock() - start)
+        start = clock()
         if solve:
-            solve(built)
-        whole = CHECKOUT and name == REFERENCE  # builds once more
-        totals.append(time.perf_counter() - start + (0 if whole else builds[-1]))
+            solve(built, k)
+        totals.append(clock() - start + (0 if twice else builds[-1]))
     grown = peak() - before
     total = statistics.median(totals) if solve else None
     print(json.dumps([statistics.median(builds), total, grown]))
 
 
 def measured(
-    kind: str, name: str, path: Path, repeats: int
+    kind: str, name: str, path: Path, asked: argparse.Namespace, repeats: int
 ) -> tuple[float, float | None, float] | None:
     """What `measure` prints, from a process of its own; None if it failed."""
     arguments = [str(path), "--one", kind, name, "--repeats", str(repeats)]
+    arguments += ["--pairs", str(asked.pairs), "--threads", str(asked.threads)]
     try:
-        build, total, grown = alone(__file__, arguments)
+        build, total, grown = alone(__file__, arguments, asked.threads)
     except subprocess.CalledProcessError:
         return None  # it has said why
     return build, total, grown
@@ -205,9 +226,10 @@ def read(path: Path) -> tuple[np.ndarray, np.ndarray]:
     return np.array(mesh.vertices, dtype=float), np.array(mesh.faces, dtype=np.int64)
 
 
-def show(kind: str, paths: dict[str, Path], limit: float, series: bool, without: list[str]) -> None:
+def show(kind: str, paths: dict[str, Path], asked: argparse.Namespace) -> None:
     methods = MESH if kind == "mesh" else CLOUD
-    methods = {name: method for name, method in methods.items() if name not in without}
+    series = not asked.meshes
+    methods = {name: methods[name] for name in asked.rows or methods if name in methods}
     print(f"\n#### {kind}\n\n| | {' | '.join(paths)} |{' growth |' if series else ''}")
     print("|:--|" + "--:|" * (len(paths) + series), flush=True)
     reference: dict[str, float] = {}
@@ -215,8 +237,8 @@ def show(kind: str, paths: dict[str, Path], limit: float, series: bool, without:
         cells, past = [], []
         for label, path in tqdm(paths.items(), name, leave=False):
             count = len(read(path)[0])
-            slow = series and past and past[-1][1] * count / past[-1][0] > limit
-            found = None if slow else measured(kind, name, path, 3 if count < 3e4 else 1)
+            slow = series and past and past[-1][1] * count / past[-1][0] > asked.limit
+            found = None if slow else measured(kind, name, path, asked, 3 if count < 3e4 else 1)
             if found is None:
                 cells.append("—")
                 continue
@@ -241,7 +263,9 @@ def main() -> None:
         "--sizes", nargs="+", type=int, default=[2000, 10_000, 50_000, 200_000, 1_000_000]
     )
     parser.add_argument("--limit", type=float, default=900.0, help="s")
-    parser.add_argument("--without", nargs="+", default=[], help="rows to leave out")
+    parser.add_argument("--rows", nargs="+", help="of the tables; all by default")
+    parser.add_argument("--pairs", type=int, default=128)
+    parser.add_argument("--threads", type=int, default=1)
     parser.add_argument("--kinds", nargs="+", default=["mesh", "cloud"])
     parser.add_argument("--one", nargs=2, help=argparse.SUPPRESS)
     parser.add_argument("--repeats", type=int, default=1, help=argparse.SUPPRESS)
@@ -251,12 +275,15 @@ def main() -> None:
         shape = list(read(asked.meshes[0]))
         if kind == "cloud":
             shape = [np.unique(shape[0], axis=0)]
-        measure(MESH if kind == "mesh" else CLOUD, name, shape, asked.repeats)
+        method = (MESH if kind == "mesh" else CLOUD)[name]
+        twice = bool(CHECKOUT) and name == REFERENCE
+        torch.set_num_threads(asked.threads)
+        measure(method, shape, asked.pairs, asked.repeats, twice)
         return
     print("\n".join(versions()))
     print(
-        "\ns to build, s with 128 eigenpairs too (over get_operators'), MiB; DiffusionNet "
-        + ("from a checkout." if CHECKOUT else "restated.")
+        f"\n{asked.threads} thread(s): s to build, s with {asked.pairs} eigenpairs too (over get_operators'), MiB; "
+        "DiffusionNet " + ("from a checkout." if CHECKOUT else "restated.")
     )
     with tempfile.TemporaryDirectory() as folder:
         paths = {path.stem: path for path in asked.meshes}
@@ -266,7 +293,7 @@ def main() -> None:
             faces = StarShaped().triangulate(points)
             np.savez(paths[f"N = {n:,}"], vertices=points.numpy(), faces=faces.numpy())
         for kind in asked.kinds:
-            show(kind, paths, asked.limit, not asked.meshes, asked.without)
+            show(kind, paths, asked)
 
 
 if __name__ == "__main__":

@@ -13,7 +13,7 @@ from torchlb.cloud.cocone import best_manifold, conormals
 from torchlb.fits.weights import left_inverse, scaled_system
 from torchlb.galerkin import assembly
 from torchlb.galerkin.pair import Pattern
-from torchlb.geometry.compatibility import compatible, normal_frames
+from torchlb.geometry.compatibility import compatible, plucker_coordinates
 from torchlb.geometry.complex import components, edges_of, spanning_pairs, tree_sides
 from torchlb.geometry.thresholds import CREASE, HALF_CREASE
 from torchlb.linalg import kernels
@@ -204,7 +204,8 @@ def test_graph_balls_are_what_walks_reach(n, dim):
     graph.setdiag(0)
     graph.eliminate_zeros()
     sides = sides + 2 * torch.eye(n, dtype=torch.float64)[0]
-    shape = (x.contiguous().numpy() for x in (points, normal_frames(frames), sides))
+    planes = plucker_coordinates(frames)
+    shape = (x.contiguous().numpy() for x in (points, frames, planes, sides))
     rows = graph.indptr.astype(np.int32), graph.indices.astype(np.int32)
     bounds = 12, 18.0, 4, HALF_CREASE, CREASE
     index, count = kernels.k_hop_neighborhoods(*shape, *rows, np.arange(120), *bounds)

@@ -16,12 +16,12 @@ def planes_of(frames: Frames) -> Frames | Points:
     return torch.linalg.cross(*frames.unbind(-1)) if frames.shape[1:] == (3, 2) else frames
 
 
-def normal_frames(frames: Frames) -> Float[Tensor, "N n m"]:
-    """Orthonormal frames of the normal spaces, m = n − d."""
-    n, dim = frames.shape[1:]
-    if (n, dim) == (3, 2):
-        return planes_of(frames)[..., None]
-    return torch.linalg.qr(frames, mode="complete")[0][..., dim:]
+def plucker_coordinates(frames: Frames) -> Float[Tensor, "N minors"]:
+    """Minors of the frames, whose inner products are det(E_kᵀE_i); for a surface in R³ its normals."""
+    planes, (n, dim) = planes_of(frames), frames.shape[1:]
+    if planes.ndim == 2:
+        return planes
+    return torch.linalg.det(frames[:, torch.combinations(torch.arange(n), dim)])
 
 
 def compatible(
@@ -29,9 +29,10 @@ def compatible(
 ) -> Bool[Tensor, " P"]:
     """Whether `others[j]` may enter the stencil of `centers[j]`.
 
-    Tangent planes of compatible points are less than 60° apart (σ_min(E_kᵀE_i) ≥ 0.5), and the height of the neighbour
-    over the centre's plane is at most 0.5 of its distance. `planes` are frames E, or the unit normals of a
-    hypersurface, for which σ_min(E_kᵀE_i) = |n_k·n_i| takes less time. Orientation is irrelevant.
+    Tangent planes of compatible points are less than 60° apart (|det(E_kᵀE_i)| ≥ 0.5, the product of the cosines of
+    the principal angles), and the height of the neighbour over the centre's plane is at most 0.5 of its distance.
+    `planes` are frames E, or the unit normals of a surface in R³, for which det(E_kᵀE_i) = n_k·n_i takes less time.
+    Orientation is irrelevant.
     """
     found = []
     for one, other in zip(centers.split(AT_ONCE), others.split(AT_ONCE), strict=True):
@@ -41,7 +42,7 @@ def compatible(
         if planes.ndim == 3:
             flat = torch.einsum("pn,pnd->pd", offset, mine)
             height = total - dot(flat, flat)
-            cosine = torch.linalg.svdvals(theirs.mT @ mine)[:, -1]
+            cosine = torch.linalg.det(theirs.mT @ mine).abs()
         else:
             height = dot(offset, mine).square()
             cosine = dot(theirs, mine).abs()

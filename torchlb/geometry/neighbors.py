@@ -20,7 +20,7 @@ from scipy import sparse
 from scipy.spatial import KDTree
 from torch import Tensor
 
-from torchlb.geometry.compatibility import normal_frames
+from torchlb.geometry.compatibility import plucker_coordinates
 from torchlb.geometry.thresholds import AROUND, CREASE, HALF_CREASE, WIDER
 from torchlb.geometry.vectors import Frames, Near, Points, at
 
@@ -77,7 +77,8 @@ class GraphNeighborhoods:
     def _arrays(self) -> dict[str, np.ndarray]:
         """Arguments of the compiled walk."""
         sides = torch.zeros_like(self.points) if self.sides is None else self.sides
-        shape = {"points": self.points, "normals": normal_frames(self.frames), "sides": sides}
+        planes = plucker_coordinates(self.frames)
+        shape = {"points": self.points, "frames": self.frames, "planes": planes, "sides": sides}
         rows = {"indptr": self.graph.indptr, "indices": self.graph.indices}
         arrays = {name: x.contiguous().numpy() for name, x in shape.items()}
         return arrays | {name: x.astype(np.int32) for name, x in rows.items()}

@@ -1,12 +1,13 @@
 """Four loops without a fast form in NumPy, SciPy or torch, compiled by numba.
 
 Callers import them where they call them, so that importing the package does not load numba. Each is compiled for one
-signature only, and cached beside this file, or in the user's cache.
+signature only at its first call, and cached beside this file, or in the user's cache.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import cache
 from typing import Any, no_type_check
 
 import numpy as np
@@ -17,16 +18,20 @@ LANES = 64
 
 
 def _kept(signature: str) -> Callable[[Any], Any]:
-    """Compile for one signature, cached on disk for later processes if there is a place to write to."""
+    """Compile for one signature at the first call, cached on disk for later processes if there is a place to write."""
 
-    def compiled(function: Any) -> Any:
-        options = {"error_model": "numpy", "nogil": True}
-        try:
-            return njit(signature, cache=True, **options)(function)
-        except RuntimeError:  # numba finds no place to write to
-            return njit(signature, **options)(function)
+    def deferred(function: Any) -> Any:
+        @cache
+        def compiled() -> Any:
+            options = {"error_model": "numpy", "nogil": True}
+            try:
+                return njit(signature, cache=True, **options)(function)
+            except RuntimeError:  # numba finds no place to write to
+                return njit(signature, **options)(function)
 
-    return compiled
+        return lambda *arguments: compiled()(*arguments)
+
+    return deferred
 
 
 @njit(error_model="numpy")
@@ -129,52 +134,25 @@ def _left_inverse(
 @no_type_check
 def _distance(
     points: np.ndarray,
-    normals: np.ndarray,
+    frames: np.ndarray,
+    planes: np.ndarray,
     center: int,
     other: int,
     slope: float,
     alignment: float,
-    room: np.ndarray,
 ) -> float:
-    """Squared distance, ℓ², or −1 where `geometry.compatibility.compatible` rejects the other point.
-
-    With frames A, B of the normal spaces, the singular values of C = AᵀB are the cosines of the principal angles, which
-    are those of the tangent spaces; σ_min(C) exceeds the alignment a if CᵀC − a²I = LDLᵀ with D > 0. `room` is work
-    space for C and CᵀC.
-    """
-    dim, codimension = normals.shape[1:]
-    square, height, cosine = 0.0, 0.0, 0.0
-    for x in range(dim):
+    """Squared distance, ℓ², or −1 where `geometry.compatibility.compatible` rejects the other point."""
+    square, flat, cosine = 0.0, 0.0, 0.0
+    for x in range(points.shape[1]):
         square += (points[other, x] - points[center, x]) ** 2
-    for a in range(codimension):
+    for a in range(frames.shape[2]):
         along = 0.0
-        for x in range(dim):
-            along += (points[other, x] - points[center, x]) * normals[center, x, a]
-        height += along * along
-    if height > slope**2 * square:
-        return -1.0
-    if codimension == 1:
-        for x in range(dim):
-            cosine += normals[other, x, 0] * normals[center, x, 0]
-        return square if abs(cosine) >= alignment else -1.0
-    c, g = room[0], room[1]
-    for a in range(codimension):
-        for b in range(codimension):
-            c[a, b] = 0.0
-            for x in range(dim):
-                c[a, b] += normals[other, x, a] * normals[center, x, b]
-    for a in range(codimension):
-        for b in range(a, codimension):
-            g[a, b] = -(alignment**2) if a == b else 0.0
-            for k in range(codimension):
-                g[a, b] += c[k, a] * c[k, b]
-    for a in range(codimension):
-        if g[a, a] <= 0:
-            return -1.0
-        for b in range(a + 1, codimension):
-            for k in range(b, codimension):
-                g[b, k] -= g[a, b] * g[a, k] / g[a, a]
-    return square
+        for x in range(points.shape[1]):
+            along += (points[other, x] - points[center, x]) * frames[center, x, a]
+        flat += along * along
+    for x in range(planes.shape[1]):
+        cosine += planes[other, x] * planes[center, x]
+    return square if square - flat <= slope**2 * square and abs(cosine) >= alignment else -1.0
 
 
 @njit
@@ -198,7 +176,8 @@ def _nearest_first(square: np.ndarray, ball: np.ndarray, total: int, size: int) 
 
 def k_hop_neighborhoods(
     points: np.ndarray,
-    normals: np.ndarray,
+    frames: np.ndarray,
+    planes: np.ndarray,
     sides: np.ndarray,
     indptr: np.ndarray,
     indices: np.ndarray,
@@ -211,28 +190,28 @@ def k_hop_neighborhoods(
 ) -> tuple[np.ndarray, np.ndarray]:
     """The `size` nearest points of each k-hop neighbourhood, padded by the centre, and how many are real.
 
-    Points are (N, n), `normals` orthonormal frames of their normal spaces, (N, n, n − d), `sides` vectors (N, n): a
-    point opposed to the centre's is rejected; they are zero where no sides are known. `indptr` and `indices` are the
-    CSR pattern of the graph, without loops. A neighbourhood stops growing at `wanted` points, or after so many rings;
-    `slope` and `alignment` are the bounds of `compatible`.
+    Points are (N, n), `frames` those of their tangent planes, (N, n, d), `planes` the Plücker coordinates of these.
+    `sides` are vectors (N, n): a point opposed to the centre's is rejected; they are zero where no sides are known.
+    `indptr` and `indices` are the CSR pattern of the graph, without loops. A neighbourhood stops growing at `wanted`
+    points, or after so many rings; `slope` and `alignment` are the bounds of `compatible`.
     """
-    num_points, _, m = normals.shape
     index, count = np.empty((len(centers), size), np.int32), np.empty(len(centers), np.int32)
-    seen, ball = np.zeros((2, num_points), np.int32)
-    room = seen, ball, np.empty(num_points), np.empty((2, m, m))
-    inputs = points, normals, sides, indptr, indices, centers
+    seen, ball = np.zeros((2, len(points)), np.int32)
+    room = seen, ball, np.empty(len(points))
+    inputs = points, frames, planes, sides, indptr, indices, centers
     _k_hop_neighborhoods(*inputs, wanted, rings, slope, alignment, *room, index, count)
     return index, count
 
 
 @_kept(
-    "void(float64[:, ::1], float64[:, :, ::1], float64[:, ::1], int32[::1], int32[::1], int64[::1], float64, int64, "
-    "float64, float64, int32[::1], int32[::1], float64[::1], float64[:, :, ::1], int32[:, ::1], int32[::1])"
+    "void(float64[:, ::1], float64[:, :, ::1], float64[:, ::1], float64[:, ::1], int32[::1], int32[::1], int64[::1], "
+    "float64, int64, float64, float64, int32[::1], int32[::1], float64[::1], int32[:, ::1], int32[::1])"
 )
 @no_type_check
 def _k_hop_neighborhoods(
     points: np.ndarray,
-    normals: np.ndarray,
+    frames: np.ndarray,
+    planes: np.ndarray,
     sides: np.ndarray,
     indptr: np.ndarray,
     indices: np.ndarray,
@@ -244,7 +223,6 @@ def _k_hop_neighborhoods(
     seen: np.ndarray,
     ball: np.ndarray,
     square: np.ndarray,
-    room: np.ndarray,
     index: np.ndarray,
     count: np.ndarray,
 ) -> None:
@@ -268,7 +246,9 @@ def _k_hop_neighborhoods(
                         side += sides[other, x] * sides[center, x]
                     distance = -1.0
                     if side >= 0:
-                        distance = _distance(points, normals, center, other, slope, alignment, room)
+                        distance = _distance(
+                            points, frames, planes, center, other, slope, alignment
+                        )
                     if distance >= 0:
                         ball[total], square[total] = other, distance
                         total += 1

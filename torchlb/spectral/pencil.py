@@ -28,7 +28,7 @@ from torchlb.linalg.precision import (
 from torchlb.linalg.sparse import multiply, on_device, on_one_pattern
 from torchlb.spectral.components import constants
 from torchlb.spectral.eigenbasis import Eigenbasis
-from torchlb.spectral.sweeps import closed, swept
+from torchlb.spectral.sweeps import CHUNK, closed, swept
 
 SHARE = 9
 """If more than a ninth of the spectrum is wanted, a dense solve is as fast."""
@@ -240,8 +240,9 @@ def _merged(
     for part, (own, _, *vectors) in zip(parts, found, strict=True):
         points = torch.from_numpy(part.points).to(mass.device)
         here = ((order >= at) & (order < at + len(own))).nonzero()[:, 0]
-        for whole, columns in zip((phi, left), vectors, strict=True):
-            whole[points[:, None], here] = columns[:, order[here] - at].to(whole)
+        for some in here.split(CHUNK):
+            for whole, columns in zip((phi, left), vectors, strict=True):
+                whole[points[:, None], some] = columns[:, order[some] - at].to(whole)
         at += len(own)
     square, unit = units  # of 1/λ, and of M
     signs = 1 - 2 * (-phi.amin(0) > phi.amax(0)).to(phi)  # the largest entry is positive

@@ -23,7 +23,15 @@ from torchlb.errors import EigenbasisError
 from torchlb.geometry.thresholds import FACTOR
 from torchlb.linalg.conjugate_gradients import Linear
 from torchlb.linalg.lanczos import BLOCK
-from torchlb.linalg.precision import LARGEST_FACTORED, ROOT_EPS, ROUNDING, ROUNDS, SMALL, TINY
+from torchlb.linalg.precision import (
+    AT_ONCE,
+    LARGEST_FACTORED,
+    ROOT_EPS,
+    ROUNDING,
+    ROUNDS,
+    SMALL,
+    TINY,
+)
 from torchlb.linalg.sparse import multiply
 from torchlb.linalg.two_grid import Matrix, absolute_row_sums, two_grid, without_small_entries
 
@@ -111,15 +119,14 @@ def swept(
         w = _corrections(maps, small, right, 1 if coarse else LONGEST).double()
         del right, small
         if sweep:
-            w -= known[0] @ (known[2].T @ w)
-        elif coarse:
-            w = torch.cat([known[0], w], dim=1)
+            new = [w.addmm_(known[0], known[2].T @ w, alpha=-1)]
         else:
-            w = known[0] - w * size
-        space = [[w], *([on(w)] for on in maps.whole)]
+            new, known = [known[0].double(), w] if coarse else [known[0] - w * size], ()
+        space = [new, *([on(x) for x in new] for on in maps.whole)]
         if sweep:
-            space = [[old, *new] for old, new in zip(known, space, strict=True)]
-        w, known = None, ()
+            space = [[old, *parts] for old, parts in zip(known, space, strict=True)]
+        w = new = None
+        known = ()
         values, known = _ritz(space, count)
     if len(u) > LARGEST_FACTORED:
         raise EigenbasisError(
@@ -131,15 +138,16 @@ def swept(
 
 def _residuals(maps: _Maps, known: Blocks, values: Tensor) -> tuple[Tensor, ...]:
     """The norms of Ku − λMu, their energies in units of these, the residuals of norm one, and the cycle of these."""
-    found = []
-    for columns in torch.arange(len(values), device=values.device).split(CHUNK):
-        ku, mu = (x.index_select(1, columns) for x in known[1:])
-        residual = torch.addcmul(ku, mu, values[columns].to(ku), value=-1)
-        size = residual.norm(dim=0).clamp_min(TINY)
-        r = (residual / size).float()
-        z = maps.cycle(r)
-        found.append((size, _dots(r, z), r, z))
-    return tuple(torch.cat(parts, -1) for parts in zip(*found, strict=True))
+    r, z = torch.empty(2, len(known[0]), len(values), device=values.device)
+    size, energy = torch.empty_like(values), torch.empty(len(values), device=values.device)
+    for some in torch.arange(len(values), device=values.device).split(CHUNK):
+        ku, mu = (x.index_select(1, some) for x in known[1:])
+        residual = torch.addcmul(ku, mu, values[some].to(ku), value=-1)
+        size[some] = residual.norm(dim=0).clamp_min(TINY).to(size)
+        r[:, some] = (residual / size[some]).float()
+        z[:, some] = maps.cycle(r[:, some])
+        energy[some] = _dots(r[:, some], z[:, some])
+    return size, energy, r, z
 
 
 def _corrections(
@@ -191,7 +199,7 @@ def _dots(x: Tensor, y: Tensor) -> Tensor:
 def _ritz(space: list[list[Tensor]], count: int) -> tuple[Tensor, Blocks]:
     """Rayleigh–Ritz on the span of U, from the columns of (U, KU, MU): the smallest values and their (U, KU, MU).
 
-    Each is given as a list of blocks of columns, which are let go one by one.
+    Each is given as a list of blocks of columns. The first one is overwritten by the result, and the others let go.
     """
     a, b = (
         torch.cat([torch.cat([(u.T @ x).double() for x in product], 1) for u in space[0]])
@@ -205,9 +213,9 @@ def _ritz(space: list[list[Tensor]], count: int) -> tuple[Tensor, Blocks]:
     found = []
     while space:
         blocks = space.pop(0)
-        first, *rest = y.split([x.shape[1] for x in blocks])
-        result = blocks.pop(0) @ first
-        for part in rest:
-            result.addmm_(blocks.pop(0), part)
+        fits = blocks[0].shape[1] == y.shape[1]
+        result = blocks[0] if fits else blocks[0].new_empty(len(blocks[0]), y.shape[1])
+        for rows in zip(result.split(AT_ONCE), *(x.split(AT_ONCE) for x in blocks), strict=True):
+            torch.mm(torch.cat(rows[1:], 1), y, out=rows[0])
         found.append(result)
     return values[:count], tuple(found)
