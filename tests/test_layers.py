@@ -41,8 +41,8 @@ needs_cuda = pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA d
 CHANNELS, K = 4, 24
 SMALL = {"width": 8, "num_blocks": 2, "k": K}
 LAYERS = {
-    "deflated": lambda: Diffusion(CHANNELS, k=K),
-    "spectral": lambda: Diffusion(CHANNELS, method="spectral", k=K),
+    "deflated": lambda: Diffusion(CHANNELS, method="deflated", k=K),
+    "spectral": lambda: Diffusion(CHANNELS, k=K),
     "rational": lambda: Diffusion(CHANNELS, method="rational"),
     "convolution": lambda: SpectralConv(CHANNELS, 3, k=K),
     "implicit": lambda: ImplicitDiffusion(CHANNELS, tolerance=1e-8),

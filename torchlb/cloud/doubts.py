@@ -138,11 +138,11 @@ def warn_of_layers(points: Float[Tensor, "N 3"]) -> None:
 
 
 def in_two_layers(points: Vectors) -> tuple[Int[np.ndarray, " M"], int]:
-    """(sampled points around which points lie in two layers, a spacing apart or closer; size of the sample).
+    """Return those of a sample of points around which the cloud has two layers, and the size of the sample.
 
-    Noise makes heights over the surface unimodal, most frequent in the middle; of two layers the middle is the rarest,
-    which shows in the kurtosis of the residuals of local quadratics. Clouds of fewer than 2 `PATCH` points are not
-    tested.
+    The layers are a spacing apart or closer. A local quadratic is fitted around each point of the sample. Residuals of
+    one noisy layer have one peak, those of two layers have two with few points between, which their kurtosis tells.
+    Clouds of fewer than 2 `PATCH` points are not tested.
     """
     some = np.arange(0, len(points), -(-len(points) // SAMPLE))
     if len(points) < 2 * PATCH:

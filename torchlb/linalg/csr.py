@@ -44,7 +44,7 @@ def side_by_side(f: Tensor) -> Tensor:
 
 
 def shaped_like(columns: Tensor, f: Tensor) -> Tensor:
-    """Columns in the layout of f: the inverse of `side_by_side`."""
+    """Columns as functions of the shape of f, (N,), (N, C) or (B, N, C): the inverse of `side_by_side`."""
     if f.ndim == 1:
         return columns[:, 0]
     return columns if f.ndim == 2 else columns.unflatten(1, f.shape[::2]).transpose(0, 1)

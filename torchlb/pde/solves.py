@@ -18,7 +18,7 @@ from torchlb.linalg.sparse import compute_dtype, symmetric_product
 from torchlb.operator.checks import check_tolerance
 from torchlb.operator.laplace_beltrami import LaplaceBeltrami
 from torchlb.operator.pair_methods import PairMethods, check_pair
-from torchlb.operator.systems import means, solve_columns
+from torchlb.operator.systems import Tolerance, means, solve_columns
 from torchlb.operator.through import Origins, origins, without
 from torchlb.pde.checks import as_columns, as_times, uncompiled
 
@@ -133,7 +133,7 @@ def potential(
     field: Float[Tensor, "*B N d C"] | None,
     source: Float[Tensor, "*B N C"] | None = None,
     *,
-    tolerance: float | None = None,
+    tolerance: Tolerance = "P1",
 ) -> Float[Tensor, "*B N C"]:
     """u with −Δu = s − ∇·v for a tangent field v, given in the frames, and a source s; differentiable.
 
@@ -147,9 +147,10 @@ def potential(
     source
         (N, C) or (B, N, C), units of u by 1/ℓ²; its mean is subtracted.
     tolerance
-        Relative tolerance of the solve with the weak pair; None for the solution by P1 elements, of second order.
+        Relative tolerance of the solve with the weak pair; "P1" for the solution by P1 elements, of second order.
     """
-    check_tolerance(tolerance)
+    if tolerance != "P1":
+        check_tolerance(tolerance)
     products = []
     if source is not None:
         products.append(lb.mass.to(source.dtype)[:, None] * source)
@@ -163,7 +164,7 @@ def potential(
     if source is None and field is not None:
         source = field[..., 0, :]
     assert source is not None, "neither field nor source"
-    if tolerance is None:
+    if tolerance == "P1":
         columns = without(lb, columns, "solutions by P1 elements")
         u = _solve(columns, None, None, None, lb, None, tolerance)
     else:

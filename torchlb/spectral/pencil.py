@@ -164,7 +164,7 @@ def _narrow(matrix: Sparse, unit: float) -> Sparse:
 
 
 def _joined(one: Sparse, other: Sparse) -> Sparse:
-    """|A| + |B|, without zeros; in a tenth of the time for a common pattern."""
+    """|A| + |B| of two sparse matrices, without stored zeros; on a common pattern in a tenth of the time."""
     if on_one_pattern(one, other):
         data = abs(one.data) + abs(other.data)
         if data.all():
