@@ -77,7 +77,7 @@ def implicit_step(
     x = as_columns(f, lb)
     dtype = torch.float64 if tolerance < SINGLE else compute_dtype(x, lb.mass)
     columns, time = _columns(x, as_times(t, x, torch.float64), dtype)
-    lb = _conducting(lb, conductivity)
+    lb = _with_conductivity(lb, conductivity)
     given, fluxes = (_data(lb, d, n, f) for d, n in ((boundary_values, 0), (flux, 1)))
     right = _product(lb, 1, columns)
     if fluxes is not None:
@@ -116,7 +116,7 @@ def poisson_solve(
     check_tolerance(tolerance)
     x = as_columns(f, lb)
     columns, _ = _columns(x, None)
-    lb = _conducting(lb, conductivity)
+    lb = _with_conductivity(lb, conductivity)
     given, fluxes = (_data(lb, d, n, f) for d, n in ((boundary_values, 0), (flux, 1)))
     right = _product(lb, 1, columns)
     if fluxes is not None:
@@ -180,7 +180,7 @@ def _columns(
     return side_by_side(x.to(dtype)), time if x.ndim == 2 else time.repeat(len(x))
 
 
-def _conducting(lb: PairMethods, conductivity: Tensor | None) -> PairMethods:
+def _with_conductivity(lb: PairMethods, conductivity: Tensor | None) -> PairMethods:
     """The operator with this conductivity, if any."""
     if conductivity is None:
         return lb
