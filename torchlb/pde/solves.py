@@ -140,14 +140,8 @@ def potential(
     Ku = Σ_c G_cᵀ(π v_c) + π s, where G are the rows of the gradient and π is the mass. u has mean zero where no
     condition holds it. For a field alone, ∇u is closest to it; for v = ∇f, u is f less its mean, up to the order.
 
-    Parameters
-    ----------
-    field
-        (N, d, C) or (B, N, d, C), as `lb.local_gradient` gives it, units of u by 1/ℓ; None for no field.
-    source
-        (N, C) or (B, N, C), units of u by 1/ℓ²; its mean is subtracted.
-    tolerance
-        Relative tolerance of the solve with the weak pair; "P1" for the solution by P1 elements, of second order.
+    Fields are (N, d, C) or (B, N, d, C), as `lb.local_gradient` gives them, sources (N, C) or (B, N, C), less their
+    means; without a field it is None. The tolerance is that of the weak pair's solve, or "P1".
     """
     if tolerance != "P1":
         check_tolerance(tolerance)
