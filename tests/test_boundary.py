@@ -7,6 +7,7 @@ from functools import cache, partial
 import numpy as np
 import pytest
 import torch
+from scipy.sparse.linalg import eigs
 
 from torchlb import LaplaceBeltrami
 from torchlb.cloud import reconstruct
@@ -23,6 +24,12 @@ def spectrum(lb, count):
     """The smallest eigenvalues of −Δ and the spectral abscissa of Δ, densely."""
     values = torch.linalg.eigvals(lb.matrix.to_dense())
     return (-values.real).sort().values[:count], float(values.real.max())
+
+
+def smallest(lb, count):
+    """The smallest eigenvalues of −Δ, by shift and invert from the right of the spectrum."""
+    found = eigs(lb.to_scipy().tocsc(), count, sigma=0.5, return_eigenvectors=False)
+    return torch.from_numpy(np.sort(-found.real))
 
 
 def operators(surface, n, order):
@@ -55,7 +62,7 @@ def test_spectrum_converges_at_the_order(surface, condition, order):
     for n in sizes:
         lb = certified_mesh(*surface.mesh(n), order=order, condition=condition)
         exact = surface.eigenvalues(10, condition=condition)
-        values, _ = spectrum(lb, 10)
+        values = smallest(lb, 10)
         errors.append(float(((values - exact).abs()[1:] / exact[1:]).max()))
     slope = -2 * np.polyfit(np.log(sizes), np.log(errors), 1)[0]
     assert slope >= order - 0.5
@@ -173,7 +180,7 @@ def cut_torus(n):
 @cache
 def first_eigenvalue(shape, condition):
     lb = certified_mesh(*shape(2000)[:2], order=3, condition=condition)
-    return spectrum(lb, 2)[0][int(condition == "neumann")]
+    return smallest(lb, 2)[int(condition == "neumann")]
 
 
 @pytest.mark.parametrize("shape", [wavy_disk, cut_torus])

@@ -243,7 +243,7 @@ def test_learned_times_stay_positive_and_are_learned():
     lb = KINDS["points"]()
     f = rough(300, 2)
     target = heat_flow(lb, f, torch.tensor([0.2, 0.05]), method="deflated", k=40)
-    layer = Diffusion(2, k=40).double()
+    layer = Diffusion(2, method="deflated", k=40).double()
     optimizer = torch.optim.LBFGS(layer.parameters(), max_iter=60, line_search_fn="strong_wolfe")
 
     def loss():
@@ -262,7 +262,7 @@ def test_learned_times_stay_positive_and_are_learned():
 def test_what_cannot_work_is_said(unchecked):
     lb = KINDS["points"]()
     f = rough(300)
-    with pytest.raises(InputError, match=r"expected one of \('deflated'.*got 'implicit'"):
+    with pytest.raises(InputError, match=r"expected one of \['rational'.*got 'implicit'"):
         heat_flow(lb, f, 0.1, method="implicit")
     for time in (-1.0, math.inf, math.nan):
         with pytest.raises(InputError, match="finite times of at least 0"):

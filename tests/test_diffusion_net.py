@@ -13,9 +13,9 @@ from torchlb import (
     LaplaceBeltrami,
     heat_flow,
 )
+from torchlb.linalg.checks import check_choice
 from torchlb.nn.diffusion_net import Block, Place
 from torchlb.nn.pointwise import Dropout
-from torchlb.pde.checks import check_choice
 from torchlb.surfaces import Circle, Sphere, Torus
 
 WIDTH, HIDDEN, BLOCKS = 8, [12, 10], 2

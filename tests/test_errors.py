@@ -420,6 +420,61 @@ def test_features_in_the_place_of_operators_are_named(unchecked):
             LaplaceBeltrami.batch(shapes)
 
 
+SWAPPED = {
+    "heat_flow": lambda lb, v, path: torchlb.heat_flow(v, lb, 0.1),
+    "heat_flow, time": lambda lb, v, path: torchlb.heat_flow(lb, 0.1, v),
+    "smooth": lambda lb, v, path: torchlb.smooth(lb, 0.1, v),
+    "implicit_step": lambda lb, v, path: torchlb.implicit_step(v, lb, 0.1),
+    "poisson_solve": lambda lb, v, path: torchlb.poisson_solve(v, lb),
+    "geodesic_distance": lambda lb, v, path: torchlb.geodesic_distance(0, lb),
+    "vector_heat_flow": lambda lb, v, path: torchlb.vector_heat_flow(v, lb, 0.1),
+    "parallel_transport": lambda lb, v, path: torchlb.parallel_transport(0, lb, v[0]),
+    "parallel_transport, sources": lambda lb, v, path: torchlb.parallel_transport(lb, v[0], 0),
+    "parallel_transport, list": lambda lb, v, path: torchlb.parallel_transport(lb, 0, [1.0, 0, 0]),
+    "logarithmic_map": lambda lb, v, path: torchlb.logarithmic_map(0, lb),
+    "hodge_decomposition": lambda lb, v, path: torchlb.hodge_decomposition(v, lb),
+    "hodge_decomposition, list": lambda lb, v, path: torchlb.hodge_decomposition(lb, [1.0]),
+    "components": lambda lb, v, path: lb.connection.components(lb),
+    "vectors": lambda lb, v, path: lb.connection.vectors(v),
+    "signature": lambda lb, v, path: torchlb.heat_kernel_signature(v, lb),
+    "diffusion_distance": lambda lb, v, path: torchlb.diffusion_distance(0, lb, 0.1),
+    "product": lambda lb, v, path: lb.product(v, "mass"),
+    "to_scipy": lambda lb, v, path: lb.to_scipy(v),
+    "eigenbasis": lambda lb, v, path: lb.eigenbasis(v),
+    "weak_matrices": lambda lb, v, path: torchlb.interop.conventions.weak_matrices("igl", lb),
+    "from_mesh": lambda lb, v, path: LaplaceBeltrami.from_mesh(FACES, VERTICES),
+    "clean_mesh": lambda lb, v, path: torchlb.clean_mesh(FACES, VERTICES),
+    "submesh": lambda lb, v, path: torchlb.submesh(FACES, VERTICES, VERTICES[:, 0] > 0),
+    "submesh, mask": lambda lb, v, path: torchlb.submesh(VERTICES, VERTICES[:, 0] > 0, FACES),
+    "submesh, operator": lambda lb, v, path: torchlb.submesh(lb, FACES, VERTICES[:, 0] > 0),
+    "collate": lambda lb, v, path: torchlb.collate(lb),
+    "write_shape": lambda lb, v, path: torchlb.write_shape(VERTICES, path, FACES),
+    "write_shape, faces": lambda lb, v, path: torchlb.write_shape(path, FACES, VERTICES),
+    "read_shape": lambda lb, v, path: torchlb.read_shape(VERTICES),
+    "save_operator": lambda lb, v, path: torchlb.save_operator(path, lb),
+    "load_operator": lambda lb, v, path: torchlb.load_operator(lb),
+    "precompute_operators": lambda lb, v, path: torchlb.precompute_operators(path, [VERTICES]),
+    "tangent layer": lambda lb, v, path: torchlb.TangentDiffusion(3)(lb, v),
+}
+
+
+@pytest.mark.parametrize("name", SWAPPED)
+def test_a_wrong_order_of_arguments_is_an_error_of_input(unchecked, tmp_path, name):
+    """It says in some lines what was expected, and prints no tensors."""
+    lb = LaplaceBeltrami.from_mesh(VERTICES, FACES, order=1)
+    with pytest.raises(torchlb.InputError, match="expected") as told:
+        SWAPPED[name](lb, VERTICES, tmp_path / "a.npz")
+    assert len(str(told.value)) < 400
+
+
+def test_errors_and_warnings_have_one_base_each():
+    names = [getattr(torchlb, name) for name in torchlb.__all__]
+    kinds = [kind for kind in names if isinstance(kind, type) and issubclass(kind, Exception)]
+    for kind in kinds:
+        base = torchlb.TorchlbWarning if issubclass(kind, Warning) else torchlb.TorchlbError
+        assert issubclass(kind, base)
+
+
 def test_arrays_are_welcome_as_times_and_scales(unchecked):
     lb, values = LaplaceBeltrami.from_cotangent(VERTICES, FACES), np.array([0.1, 0.2])
     for signature in (torchlb.heat_kernel_signature, torchlb.wave_kernel_signature):

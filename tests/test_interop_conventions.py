@@ -106,7 +106,7 @@ def test_edge_weights_are_pygs():
     torch.testing.assert_close(strong, STENCIL.matrix.to_dense())
 
 
-def test_errors():
+def test_errors(unchecked):
     with pytest.raises(ValueError, match=r"convention: expected one of.*geomstats"):
         weak_matrices(COTANGENT, "geomstats")
     with pytest.raises(ValueError, match="normalization: expected None or 'rw', got 'sym'"):

@@ -283,7 +283,7 @@ def test_a_batch_searches_nothing(monkeypatch):
     monkeypatch.setattr("torchlb.operator.parts.spectral_radius", None)
     lb = to_operator(batch)
     assert lb.weak.radius == expected
-    Diffusion(2, k=4)(torch.randn(batch.num_nodes, 2), lb.float())
+    Diffusion(2, method="deflated", k=4)(torch.randn(batch.num_nodes, 2), lb.float())
 
 
 def test_errors():

@@ -20,17 +20,15 @@ ROOT = Path(__file__).parents[1]
 VERTICES, FACES = Ellipsoid().mesh(150)
 
 
-def run(*arguments, cwd):
-    environment = {**os.environ, "PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1"}
-    done = subprocess.run(
-        [sys.executable, "-m", "torchlb", *map(str, arguments)],
-        cwd=cwd,
-        env=environment,
-        capture_output=True,
-        text=True,
-        timeout=120,
-    )
-    assert "Traceback" not in done.stderr
+@pytest.fixture(autouse=True)
+def folder(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+
+
+def run(*arguments):
+    """A call in this process, which is quicker; it ends by an exit code, not by an exception."""
+    done = CliRunner().invoke(main, list(map(str, arguments)))
+    assert done.exception is None or type(done.exception) is SystemExit
     return done
 
 
@@ -41,8 +39,8 @@ def mesh(tmp_path):
 
 
 def test_compare_prints_report_certificate_and_spectra_and_draws(mesh, tmp_path):
-    done = run("compare", mesh, "-k", 6, "--order", 2, cwd=tmp_path)
-    assert done.returncode == 0, done.stderr
+    done = run("compare", mesh, "-k", 6, "--order", 2)
+    assert done.exit_code == 0, done.stderr
     for part in (
         "shape.ply: 150 points in R^3, 296 faces",
         "150 points, order 2 requested",
@@ -61,51 +59,66 @@ def test_compare_prints_report_certificate_and_spectra_and_draws(mesh, tmp_path)
 
 def test_compare_of_a_cloud_has_no_cotangent(tmp_path):
     np.save(tmp_path / "cloud.npy", VERTICES.numpy())
-    done = run("compare", "cloud.npy", "--out", "a.png", "-k", 3, cwd=tmp_path)
-    assert done.returncode == 0, done.stderr
+    done = run("compare", "cloud.npy", "--out", "a.png", "-k", 3)
+    assert done.exit_code == 0, done.stderr
     assert "150 points in R^3, a cloud" in done.stdout
     assert "cotangent" not in done.stdout
     assert (tmp_path / "a.png").exists()
 
 
 def test_precompute_then_again_then_info(mesh, tmp_path):
-    arguments = ("precompute", ".", "--out", "cache", "--order", 1, "-k", 4, "--certify")
-    first = run(*arguments, cwd=tmp_path)
-    assert (first.returncode, first.stdout) == (0, "1 shapes, 1 built, 0 cached, 0 failed\n")
-    again = run(*arguments, cwd=tmp_path)
-    assert (again.returncode, again.stdout) == (0, "1 shapes, 0 built, 1 cached, 0 failed\n")
+    arguments = (
+        "precompute",
+        ".",
+        "--out",
+        "cache",
+        "--order",
+        1,
+        "-k",
+        4,
+        "--certify",
+        "--workers",
+        1,
+    )
+    first = run(*arguments)
+    assert (first.exit_code, first.stdout) == (0, "1 shapes, 1 built, 0 cached, 0 failed\n")
+    again = run(*arguments)
+    assert (again.exit_code, again.stdout) == (0, "1 shapes, 0 built, 1 cached, 0 failed\n")
     [file] = (tmp_path / "cache").glob("*.npz")
-    done = run("info", file, cwd=tmp_path)
-    assert done.returncode == 0, done.stderr
+    done = run("info", file)
+    assert done.exit_code == 0, done.stderr
     for part in ("order=1", "certificate holds", "eigenpairs stored", f"torchlb {__version__}"):
         assert part in done.stdout, part
 
 
 def test_an_error_is_one_message_on_stderr(tmp_path):
-    done = run("compare", "missing.ply", cwd=tmp_path)
-    assert (done.returncode, done.stdout) == (2, "")
-    assert "does not exist" in done.stderr
+    """In a process of its own, as from a shell."""
+    np.savetxt("few.xyz", np.eye(3))
+    environment = {**os.environ, "PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1"}
+    call = [sys.executable, "-m", "torchlb", "compare", "few.xyz"]
+    done = subprocess.run(call, env=environment, capture_output=True, text=True, timeout=120)
+    assert (done.returncode, done.stdout) == (1, "")
+    assert "3 points are fewer than the 4" in done.stderr
+    assert "Traceback" not in done.stderr
 
 
 def test_precompute_names_what_failed_and_ends_with_1(mesh, tmp_path):
     (tmp_path / "broken.obj").write_text("nothing")
-    done = run(
-        "precompute", ".", "--out", "cache", "--order", 1, "--workers", 1, "--quiet", cwd=tmp_path
-    )
-    assert done.returncode == 1
+    done = run("precompute", ".", "--out", "cache", "--order", 1, "--workers", 1, "--quiet")
+    assert done.exit_code == 1
     assert "2 shapes, 1 built, 0 cached, 1 failed\nfailed\n  broken.obj" in done.stdout
     assert done.stderr == ""
 
 
 def test_info_of_a_shape_and_of_a_damaged_operator(mesh, tmp_path):
-    done = run("info", mesh, cwd=tmp_path)
-    assert done.returncode == 0
+    done = run("info", mesh)
+    assert done.exit_code == 0
     assert "150 points in R^3, 296 faces, box" in done.stdout
     save_operator(LaplaceBeltrami.from_cotangent(VERTICES, FACES), tmp_path / "lb.npz")
     content = (tmp_path / "lb.npz").read_bytes()
     (tmp_path / "lb.npz").write_bytes(content[: len(content) // 2])
-    done = run("info", "lb.npz", cwd=tmp_path)
-    assert done.returncode == 1
+    done = run("info", "lb.npz")
+    assert done.exit_code == 1
     assert done.stderr.startswith("Error: ")
     assert "lb.npz" in done.stderr
 
@@ -130,19 +143,17 @@ def test_info_of_a_shape_and_of_a_damaged_operator(mesh, tmp_path):
         (["conquer"], 2, "No such command 'conquer'"),
     ],
 )
-def test_a_wrong_call_ends_with_a_message(arguments, code, message, tmp_path, monkeypatch):
+def test_a_wrong_call_ends_with_a_message(arguments, code, message, tmp_path):
     (tmp_path / "prose.obj").write_text("no mesh")
     (tmp_path / "few.xyz").write_text("0 0 0\n1 0 0\n0 1 0\n")
     (tmp_path / "empty").mkdir()
-    monkeypatch.chdir(tmp_path)
-    done = CliRunner().invoke(main, arguments)  # in this process, which is quicker
-    assert (done.exit_code, type(done.exception)) == (code, SystemExit)
+    done = run(*arguments)
+    assert done.exit_code == code
     assert message in done.output
     assert not list(tmp_path.glob("*.png"))
 
 
-def test_commands_write_what_they_compute(mesh, tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
+def test_commands_write_what_they_compute(mesh):
     vertices, faces = read_shape(mesh)
     lb = LaplaceBeltrami.from_mesh(vertices, faces, order=2)
     gaps = torch.where(vertices[:, 2] > 0, vertices[:, 0], torch.nan)
@@ -168,7 +179,7 @@ def test_commands_write_what_they_compute(mesh, tmp_path, monkeypatch):
     }.items():
         command, *options = arguments
         call = [command, str(mesh), "--order", "2", *options, "--out", "out.npz"]
-        done = CliRunner().invoke(main, call)
+        done = run(*call)
         assert done.exit_code == 0, done.output
         assert "out.npz: 150 points in R^3, 296 faces" in done.output
         found = torchlb.read_point_data("out.npz")
@@ -180,10 +191,10 @@ def test_commands_write_what_they_compute(mesh, tmp_path, monkeypatch):
 
 @pytest.mark.parametrize("command", [[], ["compare"], ["precompute"], ["info"]])
 def test_help_has_examples(command):
-    done = CliRunner().invoke(main, [*command, "--help"])
+    done = run(*command, "--help")
     assert done.exit_code == 0
     assert f"  python -m torchlb {command[0] if command else 'compare'} " in done.output
 
 
-def test_version(tmp_path):
-    assert run("--version", cwd=tmp_path).stdout == f"torchlb, version {__version__}\n"
+def test_version():
+    assert run("--version").stdout == f"torchlb, version {__version__}\n"

@@ -176,7 +176,7 @@ def test_a_point_comes_before_those_that_coincide_with_it():
     assert all(len(set(row)) == 4 for row in crowd.tolist())
 
 
-def test_everything_in_a_ball_is_admissible():
+def test_everything_in_a_ball_is_compatible():
     points = Ellipsoid((1.0, 1.0, 0.1)).points(800)
     neighborhoods = cloud_balls(points)
     index, count = neighborhoods(torch.arange(800), 30)

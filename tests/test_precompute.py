@@ -235,7 +235,7 @@ def test_the_same_call_runs_on_a_dask_cluster(tmp_path, monkeypatch):
 
 def test_a_warning_of_a_shape_is_in_the_report(tmp_path, monkeypatch):
     def warned(*arguments, **options):
-        warnings.warn("few points", UserWarning, stacklevel=1)
+        warnings.warn("few points", torchlb.TorchlbWarning, stacklevel=1)
         warnings.warn("Sparse CSR tensor support is in beta", UserWarning, stacklevel=1)
         return load_or_build(*arguments, **options)
 

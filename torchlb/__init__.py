@@ -24,6 +24,7 @@ from torchlb.errors import (
     StabilityWarning,
     StencilError,
     TorchlbError,
+    TorchlbWarning,
 )
 from torchlb.io.cache import load_operator, load_or_build, operator_key, save_operator
 from torchlb.io.files import read_point_data, read_shape, write_shape
@@ -88,6 +89,7 @@ __all__ = [
     "TangentBlock",
     "TangentDiffusion",
     "TorchlbError",
+    "TorchlbWarning",
     "__version__",
     "clean_mesh",
     "clean_points",

@@ -18,12 +18,12 @@ from typing import Any, get_args
 import click
 from click.core import ParameterSource
 
-from torchlb.errors import OperatorFileError
+from torchlb.errors import OperatorFileError, TorchlbWarning
 from torchlb.fits.rules import WeightsName
 from torchlb.geometry.frames import Projection
 from torchlb.io.cache import load_with_header
 from torchlb.io.files import read_point_data, read_shape, write_shape
-from torchlb.io.precompute import concerns_the_shape, precompute_operators
+from torchlb.io.precompute import precompute_operators
 from torchlb.operator.cleaning import clean_mesh, cleaned
 from torchlb.operator.dispatch import Operator, build_operator
 from torchlb.operator.laplace_beltrami import LaplaceBeltrami
@@ -61,7 +61,7 @@ class _Commands(click.Group):
 
 
 def _show(message: Warning | str, category: type[Warning], *_: Any) -> None:
-    if concerns_the_shape(message):
+    if issubclass(category, TorchlbWarning):
         click.echo(f"Warning: {message}", err=True)
 
 
@@ -76,7 +76,7 @@ def _stencil_options(command: Callable[..., Any]) -> Callable[..., Any]:
 
 
 def _built(shape: Path, settings: dict[str, Any]) -> tuple[LaplaceBeltrami, Any]:
-    """The operator of the shape in a file, and its faces; its options are taken out of the settings."""
+    """Build the operator of the shape in a file and return it with its faces; its options leave the settings."""
     vertices, faces = read_shape(shape)
     options = {name: settings.pop(name) for name in OF_THE_OPERATOR}
     if options.pop("clean"):

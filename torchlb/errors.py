@@ -22,9 +22,11 @@ __all__ = [
     "StabilityWarning",
     "StencilError",
     "TorchlbError",
+    "TorchlbWarning",
     "as_given",
     "first_few",
     "renumbered",
+    "shown",
     "warn",
 ]
 HERE = str(Path(__file__).parent)
@@ -66,11 +68,15 @@ class OperatorFileError(TorchlbError):
     """A damaged file, or one that is no operator; the message names it and says what to do."""
 
 
-class StabilityWarning(UserWarning):
+class TorchlbWarning(UserWarning):
+    """Base of all warnings of torchlb: ``warnings.simplefilter("error", torchlb.TorchlbWarning)`` raises them."""
+
+
+class StabilityWarning(TorchlbWarning):
     """The certificate does not hold; the message names what remains."""
 
 
-class CacheWarning(UserWarning):
+class CacheWarning(TorchlbWarning):
     """A cache file was damaged, outdated, or could not be written; the message names it."""
 
 
@@ -99,7 +105,13 @@ def first_few(index: Any, limit: int = 8) -> str:
     return ", ".join(map(str, names)) + (", …" if len(index) > limit else "")
 
 
-def warn(message: str, category: type[Warning] = UserWarning) -> None:
+def shown(value: object, longest: int = 80) -> str:
+    """A value for a message; its type where it has too many letters, as a tensor in the place of a number."""
+    text = repr(value)
+    return text if len(text) <= longest else f"a {type(value).__name__}"
+
+
+def warn(message: str, category: type[Warning] = TorchlbWarning) -> None:
     """Issue a warning at the line outside torchlb from which the call came."""
     frame, level = sys._getframe(), 1
     while frame.f_back is not None and frame.f_code.co_filename.startswith(HERE):

@@ -31,9 +31,10 @@ one layer of triangles, not several that mix."""
 
 @dataclass(frozen=True)
 class Cloud:
-    """Points with unit normals and nearest points, themselves first, from which triangles are made.
+    """Points from which triangles are made, with their unit normals and nearest points, each point itself first.
 
-    `reach` bounds the circumradius of triangles at each point, ℓ; half of it does if all corners are on the boundary.
+    `reach` is the largest circumradius, ℓ, that a triangle at each point may have, twice that of one whose corners are
+    all on the boundary.
     """
 
     points: Vectors

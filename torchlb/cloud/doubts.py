@@ -26,7 +26,7 @@ from torchlb.cloud.noise import SAMPLE, spacing_at
 from torchlb.cloud.surface import CloudSurface
 from torchlb.errors import first_few, warn
 from torchlb.geometry.boundary import boundary_faces
-from torchlb.geometry.compatibility import admissible_neighbors
+from torchlb.geometry.compatibility import compatible_neighbors
 from torchlb.geometry.complex import Faces, edges_of
 from torchlb.geometry.fit_search import REASONS
 from torchlb.geometry.frames import complete_frames
@@ -138,11 +138,11 @@ def warn_of_layers(points: Float[Tensor, "N 3"]) -> None:
 
 
 def in_two_layers(points: Vectors) -> tuple[Int[np.ndarray, " M"], int]:
-    """(sampled points around which points lie in two layers, a spacing apart or closer; size of the sample).
+    """Return those of a sample of points around which the cloud has two layers, and the size of the sample.
 
-    Noise makes heights over the surface unimodal, most frequent in the middle; of two layers the middle is the rarest,
-    which shows in the kurtosis of the residuals of local quadratics. Clouds of fewer than 2 `PATCH` points are not
-    tested.
+    The layers are a spacing apart or closer. A local quadratic is fitted around each point of the sample. Residuals of
+    one noisy layer have one peak, those of two layers have two with few points between, which their kurtosis tells.
+    Clouds of fewer than 2 `PATCH` points are not tested.
     """
     some = np.arange(0, len(points), -(-len(points) // SAMPLE))
     if len(points) < 2 * PATCH:
@@ -162,7 +162,7 @@ def _surrounded(
     points: Float[Tensor, "N 3"], normals: Float[Tensor, "N 3"], near: Int[Tensor, "B K"]
 ) -> Bool[np.ndarray, " B"]:
     """Whether the first point of each row is surrounded by its own sheet: no gap of 120° in the tangent plane."""
-    good = admissible_neighbors(points, normals, near)[:, 1:]
+    good = compatible_neighbors(points, normals, near)[:, 1:]
     good &= good.cumsum(1) <= NEAREST
     flat = (points[near[:, 1:]] - points[near[:, :1]]) @ complete_frames(normals[near[:, 0]])
     angle = torch.atan2(*flat.unbind(-1)).masked_fill(~good, torch.inf).sort(1).values

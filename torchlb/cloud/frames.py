@@ -16,7 +16,7 @@ from torch.nn.functional import normalize
 from torchlb.errors import first_few, warn
 from torchlb.fits.polynomials import monomials
 from torchlb.fits.weights import window
-from torchlb.geometry.compatibility import admissible_neighbors, planes_of
+from torchlb.geometry.compatibility import compatible_neighbors, planes_of
 from torchlb.geometry.complex import components, tree_sides
 from torchlb.geometry.frames import complete_frames
 from torchlb.geometry.thresholds import CREASE, KINK, RING
@@ -53,7 +53,7 @@ def _principal_directions(
     distance = offset.norm(dim=-1)
     good = torch.ones_like(index, dtype=torch.bool)
     if planes is not None:
-        good = admissible_neighbors(points, planes, index)
+        good = compatible_neighbors(points, planes, index)
         good |= good.sum(1, keepdim=True) <= dim
     near = good & (good.cumsum(1) <= (index.shape[1] + 1) // 2)
     reach = (distance * near).amax(1, keepdim=True).clamp_min(torch.finfo(distance.dtype).tiny)
@@ -102,7 +102,7 @@ def local_polynomials(
     """
     offset, own = points[index] - points[index[:, :1]], planes[index[:, 0]]
     frames = complete_frames(own) if planes.ndim == 2 else own
-    good = admissible_neighbors(points, planes, index)
+    good = compatible_neighbors(points, planes, index)
     good[:, 0] = True
     distance = offset.norm(dim=-1)
     radius = (distance * good).amax(1).clamp_min(TINY)

@@ -101,7 +101,10 @@ class Poles:
         return side if around >= 0 else -side, two_sided
 
     def _touching(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Pairs of spheres that share a triangle, or an edge of the hull, and the cosine between their radii there."""
+        """Pairs of circumscribed spheres that meet, and the cosine of the angle between their radii there.
+
+        Spheres of two tetrahedra meet at a common triangle, those of the convex hull's triangles at a common edge.
+        """
         every = self.tetrahedra
         apex, hull = every.points[every.triangles[:, 0]], every.hull
         radii = [torch.from_numpy(end - apex) for end in every.ends()]

@@ -20,7 +20,7 @@ from torchlb.cloud.manifold import boundary_loops, facing_out, with_single_fans,
 from torchlb.cloud.noise import denoised, lone_points, put_beside
 from torchlb.cloud.poles import Poles, corrected_normals
 from torchlb.errors import InputError
-from torchlb.geometry.compatibility import mutually_admissible
+from torchlb.geometry.compatibility import mutually_compatible
 from torchlb.geometry.complex import Faces, components, delaunay, pieces_of
 from torchlb.geometry.frames import vertex_normals
 from torchlb.geometry.neighbors import mesh_graph, nearest_neighbors
@@ -126,7 +126,7 @@ def cloud_surface(
         normals, oriented = settled_normals(points, normals, candidates)
     start = _start(points, candidates, normals, boundary)
     cloud, found, given, count = start.cloud, start.found, normals, len(points)
-    places, pairs = cloud.points, _kin(cloud)
+    places, pairs = cloud.points, _neighbor_graph(cloud)
     outward = given.numpy() if given is not None and oriented else found.outward
     every, seam = wound_alike(places, _chosen(cloud, found, start.two_sided, pairs))
     faces = with_single_fans(every[~seam], count) if seam.any() else every
@@ -136,7 +136,7 @@ def cloud_surface(
     # not by the faces, which may lead into a mouth from outside
     cloud = _along(_along(cloud, _of_faces(cloud, faces)), outward)
     if given is None:
-        cloud = _righted(cloud, faces)
+        cloud = _realigned(cloud, faces)
     stars = stars_in_gaps(cloud, faces, pairs)
     loops = boundary_loops(faces, count)
     pieces = pieces_of(np.concatenate([faces, stars]), count)
@@ -147,7 +147,7 @@ def cloud_surface(
     parts = {"points": places, "cells": faces, "stars": stars, "normals": cloud.normals}
     parts |= {"neighbors": cloud.neighbors, "lone": start.lone}
     tensors: Any = {name: torch.from_numpy(part) for name, part in parts.items()}
-    frames = _upright(start.frames, tensors["normals"])
+    frames = _orthogonal_to(start.frames, tensors["normals"])
     return CloudSurface(**tensors, frames=frames, summary=summary)
 
 
@@ -219,7 +219,7 @@ def _reaches(points: Vectors, near: Int[np.ndarray, "N K"]) -> Float[np.ndarray,
     return REACH * np.linalg.norm(points[far] - points, axis=1)
 
 
-def _upright(
+def _orthogonal_to(
     frames: Float[Tensor, "N 3 2"], normals: Float[Tensor, "N 3"]
 ) -> Float[Tensor, "N 3 2"]:
     """Frames orthogonal to the normals, from the first given direction that is not along the normal."""
@@ -300,7 +300,7 @@ def _along(cloud: Cloud, vectors: Vectors) -> Cloud:
     return replace(cloud, normals=np.where(away[:, None], -cloud.normals, cloud.normals))
 
 
-def _righted(cloud: Cloud, faces: Faces) -> Cloud:
+def _realigned(cloud: Cloud, faces: Faces) -> Cloud:
     """Cloud with normals realigned to those of its faces where they are misaligned, on their previous side."""
     of_faces = _of_faces(cloud, faces)
     cosine = (cloud.normals * of_faces).sum(1)
@@ -332,10 +332,10 @@ def _contacts(cloud: Cloud, faces: Faces) -> Mask:
     return touched
 
 
-def _kin(cloud: Cloud) -> Pairs:
+def _neighbor_graph(cloud: Cloud) -> Pairs:
     """Edges of the graph of the `RING` nearest compatible neighbours, or of all nearest ones in small components."""
     points, normals = torch.from_numpy(cloud.points), torch.from_numpy(cloud.normals)
-    i, j, good = mutually_admissible(points, normals, torch.from_numpy(cloud.neighbors))
+    i, j, good = mutually_compatible(points, normals, torch.from_numpy(cloud.neighbors))
     near = (good & (good.cumsum(1) <= RING)).view(-1).numpy()
     i, j = i.numpy(), j.numpy()
     piece = components(i[near], j[near], len(points))

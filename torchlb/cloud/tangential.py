@@ -22,7 +22,7 @@ from torchlb.cloud.complexes import Complex
 from torchlb.cloud.frames import cloud_frames
 from torchlb.cloud.manifold import boundary_loops, ears_of
 from torchlb.errors import InputError, first_few
-from torchlb.geometry.compatibility import mutually_admissible, planes_of
+from torchlb.geometry.compatibility import mutually_compatible, planes_of
 from torchlb.geometry.complex import Faces, delaunay, edges_of
 from torchlb.geometry.neighbors import nearest_neighbors
 from torchlb.geometry.thresholds import AROUND, FACTOR, SLIGHT
@@ -60,7 +60,7 @@ def delaunay_stars(
 ) -> Int[np.ndarray, "S corners"]:
     """Simplices of the star of every point, the point first."""
     dim, found = frames.shape[2], []
-    _, _, good = mutually_admissible(points, planes_of(frames), candidates)
+    _, _, good = mutually_compatible(points, planes_of(frames), candidates)
     offset = points[candidates[:, 1:]] - points[:, None]
     coords, near = (offset @ frames).numpy(), candidates.numpy()
     reach = FACTOR * offset.norm(dim=2)[:, min(AROUND, offset.shape[1]) - 1].numpy()

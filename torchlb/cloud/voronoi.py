@@ -20,7 +20,7 @@ from torch import Tensor
 
 from torchlb.cloud.frames import cloud_frames
 from torchlb.geometry.boundary import BoundaryPlan
-from torchlb.geometry.compatibility import mutually_admissible, planes_of
+from torchlb.geometry.compatibility import mutually_compatible, planes_of
 from torchlb.geometry.neighbors import adjacency, nearest_neighbors
 from torchlb.geometry.thresholds import CREASE, RING, WIDER
 from torchlb.geometry.vectors import Frames, Near, Points
@@ -114,7 +114,7 @@ def nearest_graph(points: Points, frames: Frames, candidates: Near) -> sparse.cs
     num_rows, size = others.shape
     if size == 0:  # a single point
         return sparse.csr_array((num_rows, num_rows), dtype=np.float32)
-    centers, flat, good = mutually_admissible(points, planes_of(frames), candidates)
+    centers, flat, good = mutually_compatible(points, planes_of(frames), candidates)
     chosen = good & (good.cumsum(1) <= wanted)
     for rows in torch.arange(num_rows).split(rows_at_once(size * len(unit_directions(dim)))):
         offset = points[others[rows]] - points[rows, None]

@@ -203,7 +203,7 @@ def summed(
 
 
 class ElementMatrices(NamedTuple):
-    """Nodes of elements, (T, n), and their matrices K + iM, row by row, (T, n²)."""
+    """Nodes of elements, (T, n), and their stiffness and mass as complex matrices K + iM, row by row, (T, n²)."""
 
     nodes: Int[Tensor, "T n"]
     blocks: Complex[Tensor, "T n_times_n"]

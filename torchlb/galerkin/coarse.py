@@ -53,7 +53,8 @@ def lying_triangles(
 ) -> Bool[Tensor, " F"]:
     """Triangles with an obtuse angle opposite a free boundary edge, or opposite an edge of another such triangle.
 
-    At an edge without length every angle counts as obtuse, so that triangles without area hand on what they meet.
+    The angle opposite an edge without length counts as obtuse, so that a chain of such triangles may lead through
+    triangles without area.
     """
     corners = at(points, nodes.cells)
     apex = corners.roll(-2, 1)  # across from the sides of `EDGES`

@@ -125,7 +125,10 @@ def _lacking(sheets: Tensor, sides: Tensor, twin: Tensor) -> Iterator[Int[Tensor
 
 
 def _glued(faces: Tensor, edge: Tensor, fixed: Tensor) -> Int[Tensor, " six_F"]:
-    """Twin of half-edge s of face f of the cover, number 3f + s; −1 where it is fixed."""
+    """Opposite half-edge of every half-edge of the orientation double cover, −1 where the edge is fixed.
+
+    Half-edge s of face f has the number 3f + s. Where several faces share an edge, each is glued to the next one.
+    """
     count = len(faces)
     front = torch.arange(3 * count)
     back = 3 * (count + front // 3) + torch.tensor([1, 0, 2])[front % 3]

@@ -346,7 +346,7 @@ def _along(linear: Linear, x: Tensor) -> Tensor:
 
 
 class _Times(torch.autograd.Function):
-    """A sparse matrix times functions (N, C)."""
+    """Product of a scipy matrix, a constant, with functions (N, C), differentiable once in these."""
 
     @staticmethod
     def forward(ctx: Any, matrix: Any, x: Tensor) -> Tensor:  # pyright: ignore[reportIncompatibleMethodOverride]

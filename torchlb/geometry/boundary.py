@@ -88,7 +88,7 @@ class BoundaryPlan:
         return outward, size / factorial(self.sides.shape[1]), folds
 
     def with_fits(self, points: Points, graph: sparse.csr_array, degree: int) -> BoundaryPlan:
-        """Plan with fits of the boundary's tangents, of this degree or lower ones."""
+        """Return the plan with fits of the boundary's tangents, of this degree or, at few points, lower."""
         own = GraphNeighborhoods(points[self.members], graph, self.initial(points))
         search = FitSearch(own, degree)
         search.refine(torch.arange(len(self.members)))

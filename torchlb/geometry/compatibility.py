@@ -50,7 +50,7 @@ def compatible(
     return torch.cat(found)
 
 
-def admissible_neighbors(
+def compatible_neighbors(
     points: Points, planes: Frames | Points, index: Int[Tensor, "B K"]
 ) -> Bool[Tensor, "B K"]:
     """Which points of each row are compatible with its first, see `compatible`."""
@@ -58,7 +58,7 @@ def admissible_neighbors(
     return compatible(points, planes, centers, index.flatten()).view(index.shape)
 
 
-def mutually_admissible(
+def mutually_compatible(
     points: Points, planes: Frames | Points, candidates: Near
 ) -> tuple[Int[Tensor, " P"], Int[Tensor, " P"], Bool[Tensor, "N others"]]:
     """Pairs (i, j) of each point with its candidates, row by row, and which of them are compatible both ways."""
@@ -74,7 +74,7 @@ def thin_sides(points: Points, oriented: Points, candidates: Near) -> Points:
     Points are on different sides if their normals have a negative product. A place is thin where a near point stands
     above or below the tangent plane and yet has nearly the same one. Elsewhere a shape may be one-sided.
     """
-    i, j, good = mutually_admissible(points, oriented, candidates)
+    i, j, good = mutually_compatible(points, oriented, candidates)
     refused = ~good.view(-1)
     both = torch.stack([i[refused], j[refused]])
     alike = dot(at(oriented, both[0]), at(oriented, both[1])).abs() >= CREASE

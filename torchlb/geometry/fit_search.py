@@ -175,8 +175,8 @@ class FitSearch:
             self.owner[vertices[new]] = self._takings
             columns = (vertices, block.points.int(), block.keep, frame, new)
             owner = torch.full((len(rows),), self._takings)
-            pile = self._surface.setdefault((block.degree, block.points.shape[1]), [])
-            pile.append((*(at(column, rows) for column in columns), owner))
+            kept = self._surface.setdefault((block.degree, block.points.shape[1]), [])
+            kept.append((*(at(column, rows) for column in columns), owner))
         return good
 
 
@@ -193,12 +193,12 @@ def _block(
 
 
 def _joined(
-    piles: dict[tuple[int, int], list[tuple[Tensor, ...]]],
+    blocks: dict[tuple[int, int], list[tuple[Tensor, ...]]],
 ) -> Iterator[tuple[int, list[Tensor]]]:
-    """Yield the degree of every pile and its columns joined; the piles are emptied."""
-    while piles:
-        degree, _ = key = next(iter(piles))
-        yield degree, [torch.cat(column) for column in zip(*piles.pop(key), strict=True)]
+    """Yield the joined columns of the blocks of one degree and size, with the degree, and let go of these blocks."""
+    while blocks:
+        degree, _ = key = next(iter(blocks))
+        yield degree, [torch.cat(column) for column in zip(*blocks.pop(key), strict=True)]
 
 
 def is_regular(fit: CenteredFit, middles: Tensor, degree: int) -> Bool[Tensor, " B"]:

@@ -112,7 +112,11 @@ class LocalFits:
         self.heights, self.coefficients = self.heights[:0].clone(), []
 
     def fit(self, block: Neighborhoods) -> tuple[CenteredFit, Tensor, Tensor]:
-        """(fits; offsets of the neighbours, (b, K − 1, n); their coordinates in the initial planes)."""
+        """Fit polynomials around some vertices; return the fits, and offsets and coordinates of the neighbours.
+
+        Offsets, (b, K − 1, n), are from the vertex, coordinates, (b, K − 1, d), those of the offsets in the initial
+        tangent planes.
+        """
         frame, places = at(self.initial, block.vertices), at(self.points, block.points)
         offset = places[:, 1:] - places[:, :1]
         coords, keep = offset @ frame, None if block.keep.all() else block.keep

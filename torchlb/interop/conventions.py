@@ -6,22 +6,26 @@ strong: Δ = M⁻¹C, M the diagonal of `lb.mass`.
 
 from __future__ import annotations
 
+from typing import Literal
+
 import torch
 from jaxtyping import Float, Int
 from scipy import sparse
 from torch import Tensor
 
 from torchlb.errors import InputError
+from torchlb.linalg.checks import check_choice, check_operator
 from torchlb.operator.laplace_beltrami import LaplaceBeltrami
 
 __all__ = ["SIGNS", "edge_weights", "weak_matrices"]
 
+Convention = Literal["igl", "potpourri3d", "robust_laplacian", "lapy", "diffusion_net"]
 SIGNS = {"igl": 1, "potpourri3d": -1, "robust_laplacian": -1, "lapy": -1, "diffusion_net": -1}
 """Sign of the weak matrix: +1 if it is negative semidefinite like Δ, −1 if positive."""
 
 
 def weak_matrices(
-    lb: LaplaceBeltrami, convention: str
+    lb: LaplaceBeltrami, convention: Convention
 ) -> tuple[sparse.csr_array, sparse.csr_array]:
     """Weak matrix C and diagonal mass M, both (N, N), with the sign of a library: M⁻¹C = ±Δ.
 
@@ -51,14 +55,14 @@ def weak_matrices(
     >>> bool(abs(C - igl.cotmatrix(vertices.numpy(), faces.numpy())).max() < 1e-12)
     True
     """
-    if convention not in SIGNS:
-        raise InputError(f"convention: expected one of {list(SIGNS)}, got {convention!r}")
+    check_operator(lb)
+    check_choice("convention", convention, Convention)
     mass = sparse.csr_array(sparse.diags_array(lb.mass.detach().cpu().numpy()))
     return SIGNS[convention] * sparse.csr_array(mass @ lb.to_scipy()), mass
 
 
 def edge_weights(
-    lb: LaplaceBeltrami, normalization: str | None = None
+    lb: LaplaceBeltrami, normalization: Literal["rw"] | None = None
 ) -> tuple[Int[Tensor, "2 nnz"], Float[Tensor, " nnz"]]:
     """`edge_index, edge_weight` as PyG's `get_mesh_laplacian(pos, face, normalization)` gives them, diagonal included.
 
@@ -77,6 +81,7 @@ def edge_weights(
     ValueError
         For another normalization.
     """
+    check_operator(lb)
     if normalization not in (None, "rw"):
         raise InputError(f"normalization: expected None or 'rw', got {normalization!r}")
     row, values = lb.stencil.row, lb.stencil.values[0]

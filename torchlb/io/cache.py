@@ -24,7 +24,7 @@ from torch import Tensor
 from torchlb.errors import CacheWarning, InputError, OperatorFileError, warn
 from torchlb.linalg.checks import check_operator
 from torchlb.operator.dispatch import Operator, build_operator, builder_of, complete_options
-from torchlb.operator.inputs import ArrayLike, as_tensor, float_type, warn_of_gradients
+from torchlb.operator.inputs import ArrayLike, as_tensor, check_path, float_type, warn_of_gradients
 from torchlb.operator.laplace_beltrami import LaplaceBeltrami
 from torchlb.stencils.conditions import Condition
 from torchlb.version import __version__
@@ -79,7 +79,7 @@ def load_or_build(
     warn_of_gradients(vertices, "vertices")
     _, points, corners = builder_of(vertices, faces, operator)
     key = operator_key(points, corners, operator=operator, **options)
-    path = Path(cache).expanduser() / f"{key}.npz"
+    path = check_path(cache, "cache") / f"{key}.npz"
     if path.parent.exists() and not path.parent.is_dir():
         raise InputError(f"cache: expected a folder, {path.parent} is a file")
     lb = None if overwrite else _cached(path, key)
@@ -161,7 +161,7 @@ def save_operator(lb: LaplaceBeltrami, path: str | Path, *, key: str = "") -> No
         Where the file cannot be written; no part of it remains.
     """
     check_operator(lb)
-    path = Path(path).expanduser()
+    path = check_path(path)
     state = lb.state_dict()
     header = {"format": FORMAT, "version": __version__, "key": key}
     header |= {"state": state.pop("_extra_state")}
@@ -210,7 +210,7 @@ def load_operator(path: str | Path) -> LaplaceBeltrami:
 
 def load_with_header(path: str | Path) -> tuple[LaplaceBeltrami, dict[str, Any]]:
     """As `load_operator`, with the header: version, key, …; read in full, so that every checksum is verified."""
-    path = Path(path).expanduser()
+    path = check_path(path)
     try:
         with np.load(path, allow_pickle=False) as archive:
             header = json.loads(str(archive["header"]))

@@ -14,7 +14,7 @@ from torch import Tensor
 from torchlb.errors import InputError
 from torchlb.io.formats import READERS, numbers_of
 from torchlb.operator.cleaning import merged, triangles_of
-from torchlb.operator.inputs import ArrayLike, as_tensor, check_corners, check_points
+from torchlb.operator.inputs import ArrayLike, as_tensor, check_corners, check_path, check_points
 
 VTK, CELLS = (".vtk", ".vtp", ".vtu"), ("VERTEX", "LINE", "TRIANGLE", "TETRA")
 OTHERS = (".gii", ".glb", ".gltf", ".npy", ".npz", ".stl")
@@ -89,7 +89,7 @@ def read_point_data(path: str | Path) -> dict[str, Tensor]:
 
 def _read(path: str | Path) -> Contents:
     """The vertices, cells and data in a file, if any."""
-    path = Path(path).expanduser()
+    path = check_path(path)
     suffix = path.suffix.lower()
     if not path.is_file():
         raise FileNotFoundError(f"{path}: no such file")
@@ -198,7 +198,7 @@ def write_shape(
 
     Raises ValueError for data of another length, a format that does not hold them, and where its library is missing.
     """
-    path, places = Path(path).expanduser(), check_points(points).numpy()
+    path, places = check_path(path), check_points(points).numpy()
     suffix, corners = path.suffix.lower(), np.zeros((0, 3), dtype=np.int64)
     if cells is not None and len(cells):
         corners = check_corners(cells, len(places)).numpy()

@@ -20,12 +20,13 @@ from typing import Any
 
 from tqdm import tqdm
 
-from torchlb.errors import InputError
+from torchlb.errors import InputError, TorchlbWarning
 from torchlb.io.cache import load_or_build, operator_key, written_whole
 from torchlb.io.files import SUFFIXES, may_be_shape, read_shape
 from torchlb.linalg.threads import threads_for
 from torchlb.operator.cleaning import cleaned
 from torchlb.operator.dispatch import Operator, check_options_of
+from torchlb.operator.inputs import check_path
 
 TABLE = "precompute.csv"
 """File in the cache that lists the result of every shape in the last run."""
@@ -133,7 +134,7 @@ def precompute_operators(
     or TypeError for unknown options, a folder that is missing or has no shapes, before any work.
     """
     check_options_of(operator, options)
-    cache = Path(out).expanduser()
+    cache = check_path(out, "out")
     sources, skipped = _sources(shapes, cache)
     settings: dict[str, Any] = {"operator": operator, "k": k, **options}
     work = partial(_solve, clean=clean, cache=str(cache.resolve()), settings=settings)
@@ -233,7 +234,7 @@ def _solve(
     start = time.perf_counter()
     try:
         with threads_for(0), warnings.catch_warnings(record=True) as caught:
-            warnings.simplefilter("always", UserWarning)
+            warnings.simplefilter("always", TorchlbWarning)
             vertices, faces = read_shape(source) if isinstance(source, Path) else source
             if clean:
                 vertices, faces = cleaned(vertices, faces)
@@ -244,14 +245,9 @@ def _solve(
             if not path.exists():
                 raise OSError("its operator was built and could not be written")
         status = "cached" if path.stat().st_mtime_ns == before else "built"
-        notes = {str(w.message) for w in caught if concerns_the_shape(w.message)}
+        notes = {str(w.message) for w in caught if issubclass(w.category, TorchlbWarning)}
         points, file, message = lb.num_points, str(path), "; ".join(sorted(notes))
     except Exception as error:
         status, points, file, message = "failed", 0, "", f"{type(error).__name__}: {error}"
     seconds = time.perf_counter() - start
     return index, ShapeResult(name, status, points, seconds, file, message)
-
-
-def concerns_the_shape(warning: Warning | str) -> bool:
-    """Whether a warning concerns the shape; torch's about its own sparse tensors does not."""
-    return isinstance(warning, UserWarning) and not str(warning).startswith("Sparse ")

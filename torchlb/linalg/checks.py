@@ -5,13 +5,14 @@ from __future__ import annotations
 import inspect
 from collections.abc import Callable
 from functools import wraps
-from typing import Any, ParamSpec, TypeVar
+from typing import Any, ParamSpec, TypeVar, get_args
 
 import numpy as np
 import torch
+from jaxtyping import Int
 from torch import Tensor
 
-from torchlb.errors import InputError, InputTypeError, first_few
+from torchlb.errors import InputError, InputTypeError, first_few, shown
 
 P = ParamSpec("P")
 T = TypeVar("T")
@@ -83,6 +84,30 @@ def check_operator(lb: object) -> None:
             f"expected an operator, got a {type(lb).__name__} in its place: functions take (lb, f), layers (x, lb); "
             "several shapes are one operator, LaplaceBeltrami.batch(…), with features below each other, torch.cat(…)"
         )
+
+
+def check_choice(name: str, value: object, choices: Any) -> None:
+    """Raise InputError unless the value is one of a Literal."""
+    if not isinstance(value, str) or value not in get_args(choices):
+        raise InputError(f"{name}: expected one of {list(get_args(choices))}, got {shown(value)}")
+
+
+def check_sources(sources: Any, count: int) -> Int[Tensor, " S"]:
+    """Indices of points, from an index, several, or a mask; InputError for none, and for any out of range."""
+    try:
+        index = torch.as_tensor(sources)
+    except (TypeError, ValueError, RuntimeError):
+        index = torch.zeros(0)
+    if index.dtype == torch.bool and index.shape == (count,):
+        index = index.nonzero()
+    index = index.reshape(-1)
+    whole = index.dtype in (torch.uint8, torch.int8, torch.int16, torch.int32, torch.int64)
+    if len(index) == 0 or not whole or bool(((index < 0) | (index >= count)).any()):
+        raise InputError(
+            f"sources: expected numbers of points from 0 to {count - 1}, or a mask of them with at least one, got "
+            f"{shown(sources)}"
+        )
+    return index.cpu().long()
 
 
 def check_finite(f: Tensor, what: str = "f") -> None:

@@ -44,7 +44,7 @@ def side_by_side(f: Tensor) -> Tensor:
 
 
 def shaped_like(columns: Tensor, f: Tensor) -> Tensor:
-    """Columns in the layout of f: the inverse of `side_by_side`."""
+    """Columns as functions of the shape of f, (N,), (N, C) or (B, N, C): the inverse of `side_by_side`."""
     if f.ndim == 1:
         return columns[:, 0]
     return columns if f.ndim == 2 else columns.unflatten(1, f.shape[::2]).transpose(0, 1)
@@ -113,16 +113,9 @@ class Record(Tensors):
 
 
 class Csr(Tensors):
-    """Sparse matrices (N, N) on one pattern, a channel of values each; block-diagonal for a batch.
+    """Sparse matrices (N, N) on one CSR pattern with ascending columns, a channel of values, (c, nnz), for each.
 
-    Parameters
-    ----------
-    crow, col
-        (N + 1,), (nnz,), CSR with ascending columns; no rows by default.
-    values
-        (c, nnz).
-    order_t
-        (nnz,), the entries sorted by columns; None for symmetric matrices.
+    Those of a batch are block-diagonal. `order_t` sorts the entries by columns, and is None for symmetric matrices.
 
     >>> one = Csr(torch.tensor([0, 1]), torch.tensor([0]), torch.tensor([[2.0]]))
     >>> Csr.join([one, one]).col.tolist()
@@ -199,18 +192,7 @@ class Csr(Tensors):
     ) -> Tensor:
         """Product of a matrix, or its transpose, with f: (N,), (N, C) or (B, N, C); types as in `csr_product`.
 
-        Parameters
-        ----------
-        channel
-            Number of the matrix.
-        f
-            Dense, of any floating type.
-        transposed
-            Whether to multiply by the transpose.
-        dtype
-            Type that the values are cast to first; None for their own.
-
-        Raises InputError for another shape.
+        The values are cast to `dtype` first, if it is given. Raises InputError for another shape.
         """
         check_rows(f, self.num_rows)
         values = self.values[channel] if dtype is None else self.values[channel].to(dtype)

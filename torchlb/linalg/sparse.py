@@ -50,15 +50,9 @@ def csr_product(
 ) -> Float[Tensor, "K C"]:
     """Product A x of a CSR matrix, or Aᵀ x, differentiable any number of times in `values` and in `x`.
 
-    Parameters
-    ----------
-    pattern
-        [crow, col, crow_t, col_t, order_t] of A and, from `transpose_pattern`, of its transpose; int32 or int64.
-    values
-        Values of A.
-    x
-        Dense. The product is computed in the wider of the types of `values` and `x`, and at least in float32, also
-        under autocast; the result has that type, or that of a half-precision x.
+    The pattern is [crow, col, crow_t, col_t, order_t] of A and, from `transpose_pattern`, of its transpose, int32 or
+    int64. The product is computed in the wider of the types of `values` and `x`, and at least in float32, also under
+    autocast; the result has that type, or that of a half-precision x.
 
     >>> crow, col, values = torch.tensor([0, 2, 3]), torch.tensor([0, 1, 1]), torch.tensor([1.0, 2.0, 3.0])
     >>> pattern = [crow, col, *transpose_pattern(crow, col, 2)]
@@ -116,11 +110,6 @@ def multiply(
         return csr_tensor(crow, col, values, len(x)) @ x
 
 
-def on_one_pattern(one: sparse.csr_array, other: sparse.csr_array) -> bool:
-    """Whether two CSR matrices have the same pattern, in the same order."""
-    return np.array_equal(one.indptr, other.indptr) and np.array_equal(one.indices, other.indices)
-
-
 def values_on(
     crow: np.ndarray, col: np.ndarray, matrix: Any, number: np.ndarray | None = None
 ) -> np.ndarray:
@@ -151,9 +140,8 @@ def symmetric_product(
     >>> torch.autograd.grad(y.sum(), x)[0].T
     tensor([[2., 4.]])
     """
-    order = torch.arange(
-        len(col), device=col.device
-    )  # as if A were its own transpose, entry by entry
+    # as if A were its own transpose, entry by entry
+    order = torch.arange(len(col), device=col.device)
     return csr_product([crow, col, crow, col, order], values, x)
 
 

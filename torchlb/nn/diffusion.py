@@ -11,10 +11,10 @@ from torch import Tensor, nn
 from torch.nn.functional import softplus
 
 from torchlb.errors import InputError
+from torchlb.linalg.checks import check_choice
 from torchlb.linalg.precision import SINGLE
 from torchlb.nn.pointwise import check_features
 from torchlb.operator.pair_methods import PairMethods
-from torchlb.pde.checks import check_choice
 from torchlb.pde.heat import Method, flow
 from torchlb.pde.solves import TOLERANCE, implicit_step
 
@@ -57,14 +57,14 @@ class Diffusion(LearnedTimes):
     channels
         C.
     method
-        "deflated" (exact at every scale), "spectral" (as in the original DiffusionNet: Φe^{−λt}Φᵀπ, which drops
-        everything beyond the basis), "rational" (no basis, but solves).
+        "spectral" (as in the original DiffusionNet: Φe^{−λt}ΦᵀM, which drops everything beyond the basis), "deflated"
+        (exact at every scale), "rational" (no basis, but solves). See `docs/conventions.md`.
     k
         Number of eigenpairs for the first two.
     init_time
         Initial time, ℓ². Shapes of radius about one are expected.
     tolerance
-        Tolerance of the methods other than "spectral", see `heat_flow`; that of single precision by default.
+        Tolerance of the methods other than "spectral", see `heat_flow`; None for 1e-5 in float32, 1e-10 in float64.
 
     Attributes
     ----------
@@ -85,10 +85,10 @@ class Diffusion(LearnedTimes):
         self,
         channels: int,
         *,
-        method: Method = "deflated",
+        method: Method = "spectral",
         k: int = 128,
         init_time: float = 0.01,
-        tolerance: float = SINGLE,
+        tolerance: float | None = None,
     ) -> None:
         super().__init__(channels, init_time)
         check_choice("method", method, Method)
@@ -96,7 +96,7 @@ class Diffusion(LearnedTimes):
         self.used_k = k if method in ("deflated", "spectral") else 0
 
     def _diffused(self, x: Tensor, lb: PairMethods, time: Tensor) -> Tensor:
-        return flow(lb, x, time, self.method, self.k, self.tolerance)
+        return flow(lb, x, time, self.method, self.k, tolerance_for(x, self.tolerance))
 
     def extra_repr(self) -> str:
         """Channels, method, k."""
@@ -142,14 +142,18 @@ class ImplicitDiffusion(LearnedTimes):
         self.tolerance = tolerance
 
     def _diffused(self, x: Tensor, lb: PairMethods, time: Tensor) -> Tensor:
-        tolerance = self.tolerance
-        if tolerance is None:
-            tolerance = TOLERANCE if x.dtype == torch.float64 else SINGLE
-        return implicit_step(lb, x, time, tolerance=tolerance)
+        return implicit_step(lb, x, time, tolerance=tolerance_for(x, self.tolerance))
 
     def extra_repr(self) -> str:
         """Channels, tolerance."""
         return f"{self.channels}, tolerance={self.tolerance}"
+
+
+def tolerance_for(x: Tensor, tolerance: float | None) -> float:
+    """Tolerance of a layer for features x; None for the accuracy of their type, 1e-5 in float32, 1e-10 in float64."""
+    if tolerance is None:
+        return TOLERANCE if x.dtype == torch.float64 else SINGLE
+    return tolerance
 
 
 def diffusion_by(

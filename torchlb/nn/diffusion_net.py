@@ -16,13 +16,13 @@ from torch import Tensor, nn
 from torch.nn.functional import linear
 
 from torchlb.errors import InputError
+from torchlb.linalg.checks import check_choice
 from torchlb.nn.diffusion import diffusion_by, raw_of_time
 from torchlb.nn.gradient_features import GradientBlock, TangentMap
 from torchlb.nn.pointwise import unrounded
 from torchlb.nn.poisson_block import PoissonBlock
 from torchlb.nn.tangent import TangentBlock
 from torchlb.operator.laplace_beltrami import LaplaceBeltrami
-from torchlb.pde.checks import check_choice
 from torchlb.pde.heat import Method
 
 Place = Literal["vertices", "edges", "faces", "global_mean", "tangent"]

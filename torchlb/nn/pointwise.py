@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import warnings
 from collections import OrderedDict
 from collections.abc import Sequence
 
 import torch
 from torch import Tensor, nn
 
-from torchlb.errors import InputError
+from torchlb.errors import InputError, warn
 from torchlb.operator.pair_methods import PairMethods
 from torchlb.pde.checks import check_shape
 
@@ -37,10 +36,9 @@ def check_features(
             "them, x.to(…) or layer.to(…); the operator may have any type"
         )
     if k and not torch.compiler.is_compiling() and lb.modes.count and not lb.modes.has(k):
-        warnings.warn(
+        warn(
             f"the operator holds a basis of {lb.modes.count} pairs, a layer asks for k = {k}: it is solved anew, for "
-            f"each operator that is made; store k = {k} pairs, or give the layer k = {lb.modes.count}",
-            stacklevel=2,
+            f"each operator that is made; store k = {k} pairs, or give the layer k = {lb.modes.count}"
         )
     return torch.promote_types(x.dtype, torch.float32)
 

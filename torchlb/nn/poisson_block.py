@@ -17,6 +17,7 @@ from torch import Tensor, nn
 from torchlb.nn.gradient_features import GradientBlock, TangentMap
 from torchlb.nn.pointwise import check_features
 from torchlb.operator.laplace_beltrami import LaplaceBeltrami
+from torchlb.operator.systems import Tolerance
 from torchlb.pde.solves import potential
 
 SOURCE = 3.0
@@ -38,7 +39,7 @@ class PoissonFeatures(nn.Module):
     rotations
         Whether A is complex, see `TangentMap`.
     tolerance
-        Relative tolerance of the solves with the weak pair; None for one exact solve by P1 elements, which is accurate
+        Relative tolerance of the solves with the weak pair; "P1" for one exact solve by P1 elements, which is accurate
         enough for learning.
     """
 
@@ -48,10 +49,11 @@ class PoissonFeatures(nn.Module):
         *,
         fields: bool = False,
         rotations: bool = True,
-        tolerance: float | None = None,
+        tolerance: Tolerance = "P1",
     ) -> None:
         super().__init__()
-        self.channels, self.tolerance = channels, tolerance
+        self.channels = channels
+        self.tolerance: Tolerance = tolerance
         self.source = nn.Linear(channels, channels, bias=False)
         with torch.no_grad():
             self.source.weight.mul_(SOURCE)
@@ -103,7 +105,7 @@ class PoissonBlock(GradientBlock):
         gradient_features: bool = True,
         rotations: bool = True,
         fields: bool = False,
-        tolerance: float | None = None,
+        tolerance: Tolerance = "P1",
     ) -> None:
         layer = PoissonFeatures(width, fields=fields, rotations=rotations, tolerance=tolerance)
         super().__init__("features", layer, hidden, dropout, gradient_features, rotations)

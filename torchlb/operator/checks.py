@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from numbers import Real
 from typing import Any
 
 import torch
@@ -204,12 +205,12 @@ def check_boundary(boundary: Any, num_points: int) -> Bool[Tensor, " N"] | str |
     return check_mask(boundary, num_points, "boundary")
 
 
-def check_tolerance(tolerance: float | None) -> None:
-    """Raise InputError unless the tolerance is between 0 and 1, or None for a default.
+def check_tolerance(tolerance: Any) -> None:
+    """Raise InputError unless the tolerance is a number between 0 and 1.
 
     >>> check_tolerance(0.0)
     Traceback (most recent call last):
     torchlb.errors.InputError: tolerance: expected a number between 0 and 1, got 0.0
     """
-    if tolerance is not None and not 0 < tolerance < 1:
-        raise InputError(f"tolerance: expected a number between 0 and 1, got {tolerance}")
+    if not isinstance(tolerance, Real) or not 0 < float(tolerance) < 1:
+        raise InputError(f"tolerance: expected a number between 0 and 1, got {tolerance!r}")

@@ -124,8 +124,10 @@ def submesh(
     >>> submesh(square, [[0, 1, 2], [0, 2, 3]], [True, False, True, True])[1:]
     (tensor([[0, 1, 2]]), tensor([0, 2, 3]))
     """
-    inside = check_mask(mask, len(vertices))
-    whole = inside[check_corners(faces, len(vertices))].all(1)
+    count = len(check_points(vertices, "vertices"))
+    corners = check_corners(faces, count)
+    inside = check_mask(mask, count)
+    whole = inside[corners].all(1)
     if not whole.any():
         raise InputError(
             f"mask: no face has all its corners among its {int(inside.sum())} vertices"

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 from torch.utils.data import default_collate
 
-from torchlb.errors import InputError
+from torchlb.errors import InputError, shown
 from torchlb.operator.laplace_beltrami import LaplaceBeltrami
 
 INDICES = ("faces", "face_index", "edges")
@@ -36,6 +36,8 @@ def collate(samples: Sequence[Any]) -> Any:
     >>> lb.sizes, tuple(features.shape), labels.tolist()
     ((40, 50), (90, 3), [40, 50])
     """
+    if not isinstance(samples, Sequence) or not samples:
+        raise InputError(f"collate: expected a list of samples, got {shown(samples)}")
     first = samples[0]
     if isinstance(first, LaplaceBeltrami):
         return LaplaceBeltrami.batch(samples)

@@ -85,6 +85,11 @@ class Connection(PairMethods):
         self, c: Float[Tensor, "rows C"] | Float[Tensor, " rows"]
     ) -> Float[Tensor, "N n C"] | Float[Tensor, "N n"]:
         """The tangent field of space vectors, (N, n, C) or (N, n), with components `c`, (N d, C) or (N d,)."""
+        check_tensor(c, "c")
+        if c.ndim not in (1, 2) or len(c) != self.num_points:
+            raise InputError(
+                f"expected components of shape (N d,) or (N d, C) with N d = {self.num_points}, got {tuple(c.shape)}"
+            )
         return torch.einsum("ind,id...->in...", self.frames.to(c), c.unflatten(0, (-1, self.dim)))
 
     @classmethod

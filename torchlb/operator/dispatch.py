@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import inspect
 from collections.abc import Callable
-from typing import Any, Literal, get_args
+from typing import Any, Literal
 
 import numpy as np
 from torch import Tensor
 
 from torchlb.errors import InputError, InputTypeError
+from torchlb.linalg.checks import check_choice
 from torchlb.operator.checks import check_faces
 from torchlb.operator.inputs import ArrayLike, check_points
 from torchlb.operator.laplace_beltrami import LaplaceBeltrami
@@ -68,8 +69,7 @@ def check_options_of(operator: str, options: dict[str, Any]) -> None:
 
 def _builders(operator: str) -> list[Builder]:
     """The builders of an operator, on meshes and, if there is one, on clouds."""
-    if operator not in get_args(Operator):
-        raise InputError(f"operator: expected one of {list(get_args(Operator))}, got {operator!r}")
+    check_choice("operator", operator, Operator)
     if operator == "cotangent":
         return [LaplaceBeltrami.from_cotangent]
     return [LaplaceBeltrami.from_mesh, LaplaceBeltrami.from_points]

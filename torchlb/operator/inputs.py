@@ -11,7 +11,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from torchlb.errors import InputError, first_few, warn
+from torchlb.errors import InputError, InputTypeError, first_few, warn
 
 ArrayLike = Tensor | np.ndarray | Sequence[Any]
 """Input that becomes a tensor."""
@@ -68,6 +68,16 @@ def check_points(points: ArrayLike, what: str = "points") -> Float[Tensor, "N n"
             f"{what}: {len(bad)} are NaN or infinite ({first_few(bad)}); remove or repair them"
         )
     return points
+
+
+def check_path(path: Any, what: str = "path") -> Path:
+    """A path with the home directory for "~"; InputTypeError for anything else, as where arguments are swapped."""
+    if not isinstance(path, str | Path):
+        raise InputTypeError(
+            f"{what}: expected the name of a file or folder, got a {type(path).__name__}; write_shape(path, points, "
+            "cells), save_operator(lb, path), precompute_operators(shapes, out)"
+        )
+    return Path(path).expanduser()
 
 
 def check_mask(mask: ArrayLike, num_points: int, what: str = "mask") -> Bool[Tensor, " N"]:

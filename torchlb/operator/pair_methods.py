@@ -11,7 +11,7 @@ from scipy import sparse
 from torch import Tensor
 
 from torchlb.errors import InputError
-from torchlb.linalg.checks import check_rows, takes_arrays
+from torchlb.linalg.checks import check_choice, check_rows, takes_arrays
 from torchlb.linalg.csr import Csr
 from torchlb.linalg.sparse import csr_tensor, to_scipy
 from torchlb.linalg.threads import threads_for
@@ -90,8 +90,7 @@ class PairMethods(OperatorStorage):
 
     def _channel(self, name: str) -> tuple[Csr, int]:
         """The matrices that hold "laplacian", "stiffness", "mass" or "boundary_mass", and its channel in them."""
-        if not isinstance(name, str) or name not in get_args(MatrixName):
-            raise InputError(f"name: expected one of {list(get_args(MatrixName))}, got {name!r}")
+        check_choice("name", name, MatrixName)
         if name == "laplacian":
             return self.stencil, 0
         if not self._has_weak_form:
@@ -186,7 +185,8 @@ class PairMethods(OperatorStorage):
             Number of pairs, the constants among them.
         tolerance
             Bound on the estimated relative errors of the eigenvalues against those of the matrices (K, M); the basis
-            has the estimates as `relative_errors`. By default 1.5e-8 k², at order 4 1e-9, above 1e-11.
+            has the estimates as `relative_errors`. None for what suits k and the order: 1.5e-8 k², at order 4 1e-9,
+            above 1e-11.
         store
             Whether `state_dict` holds the basis from now on; it then loads into any operator.
 
@@ -212,7 +212,8 @@ class PairMethods(OperatorStorage):
         self, k: int, tolerance: float | None = None, store: bool = False
     ) -> Eigenbasis:
         """All eigenpairs known, at least k, solved anew where there are fewer, or where they are less exact."""
-        check_tolerance(tolerance)
+        if tolerance is not None:
+            check_tolerance(tolerance)
         errors = self.modes.relative_errors[..., :k]
         if not self.modes.has(k) or (tolerance is not None and (errors > tolerance).any()):
             # The basis is kept, and may be used in training.

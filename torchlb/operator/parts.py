@@ -203,7 +203,10 @@ class Modes(Tensors):
     def set_count(
         self, vectors: Float[Tensor, "N k"], free: Bool[Tensor, " N"], sizes: tuple[int, ...]
     ) -> None:
-        """Set `count` from the eigenvectors, whose padding columns are zero, and the free points."""
+        """Set `count`, the pairs known of every shape, all that the free points allow where these are fewer.
+
+        Columns of the eigenvectors that are zero on a shape are padding there.
+        """
         parts = zip(vectors.split(sizes), free.split(sizes), strict=True)
         counts = [(int((modes != 0).any(0).sum()), int(inside.sum())) for modes, inside in parts]
         most = max(sizes)

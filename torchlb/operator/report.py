@@ -116,7 +116,7 @@ class StencilReport:
         return found
 
     def __repr__(self) -> str:
-        """Summary of one screen."""
+        """Numbers of points by order reached, and reasons for lower orders, as a text of one screen."""
         total = len(self.order)
 
         def counted(name: str, count: int) -> str:

@@ -122,7 +122,10 @@ class StencilMethods(OperatorStorage):
         return self._turned("ind,id->in" if f.ndim == 1 else "ind,...idc->...inc", local)
 
     def _turned(self, equation: str, local: Tensor, frames: Tensor | None = None) -> Tensor:
-        """Frames times a field, in its type, also under autocast: rounding before a derivative grows by 1/h."""
+        """Product of the frames with a field, as einsum's `equation` says, in the type of the field.
+
+        Autocast does not change the type, since a derivative multiplies the rounding of the field by 1/h.
+        """
         frames = self.frames if frames is None else frames
         with torch.autocast(local.device.type, enabled=False):
             return torch.einsum(equation, frames.to(local.dtype), local)

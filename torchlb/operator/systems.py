@@ -14,7 +14,7 @@ import math
 from collections import OrderedDict
 from collections.abc import Callable
 from functools import cached_property, partial
-from typing import Any
+from typing import Any, Literal
 from weakref import finalize
 
 import numpy as np
@@ -38,6 +38,9 @@ KEPT = 8
 SPACING = 4.0
 """Ratio of successive times with factors: M + tK and the matrix of its factor differ by its square root at most."""
 
+Tolerance = float | Literal["P1"]
+"""Relative tolerance of a solve with the weak pair; "P1" for the solution by P1 elements, of second order."""
+
 
 def pair_system(lb: OperatorStorage) -> PairSystem:
     """The system of an operator with a weak pair, for all times."""
@@ -50,9 +53,9 @@ def solve_columns(
     lb: OperatorStorage,
     b: Float[Tensor, "N C"],
     time: Float[Tensor, " C"] | None,
-    tolerance: float | None,
+    tolerance: Tolerance,
 ) -> Float[Tensor, "N C"]:
-    """(M + tK)⁻¹b of every column by its time, or K⁻¹b for a time of None; by P1 elements for a tolerance of None."""
+    """(M + tK)⁻¹b of every column by its time, or K⁻¹b for a time of None."""
     time = None if time is None else time.detach()
     return _by_shape(lb, b, lambda system, part: system.solve(part, time, tolerance))
 
@@ -120,12 +123,12 @@ class PairSystem:
         return found.index_add(0, self.component, weights * x)[self.component]
 
     def solve(
-        self, b: Float[Tensor, "N C"], time: Float[Tensor, " C"] | None, tolerance: float | None
+        self, b: Float[Tensor, "N C"], time: Float[Tensor, " C"] | None, tolerance: Tolerance
     ) -> Float[Tensor, "N C"]:
-        """The solution, zero at Dirichlet points; for a Poisson problem, of mean zero on components where K1 = 0.
+        """Solve (M + tK)u = b for the time of every column, or Ku = b for a time of None; u is 0 at Dirichlet points.
 
-        On these components constants are split off, for which M + tK is M: constants and the mass are exact to
-        rounding. A tolerance of None takes the solution by the factors, of P1 elements.
+        The solution of a Poisson problem has mean zero on components where K1 = 0. There constants are split off, for
+        which M + tK is M: constants and the mass are exact to rounding.
         """
         if b.shape[1] == 0:
             return b.double()
@@ -138,7 +141,7 @@ class PairSystem:
         mean = self.mean(b)
         right = torch.addcmul(b, self.ones_mass, mean, value=-1)
         near = partial(self._near, self._levels(time, b.shape[1]))
-        x = near(right) if tolerance is None else self._solved(right, time, tolerance, near)
+        x = near(right) if tolerance == "P1" else self._solved(right, time, tolerance, near)
         shift = -self._mean(self.ones_mass, x)
         return x.add_(shift if time is None else shift + mean)
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import wraps
-from typing import Any, ParamSpec, TypeVar, get_args
+from typing import Any, ParamSpec, TypeVar
 
 import torch
 from torch import Tensor
@@ -71,9 +71,3 @@ def uncompiled(function: Callable[P, T]) -> Callable[P, T]:
         return function(*args, **options)
 
     return called
-
-
-def check_choice(name: str, value: str, choices: Any) -> None:
-    """Raise InputError unless the value is one of a Literal."""
-    if value not in get_args(choices):
-        raise InputError(f"{name}: expected one of {get_args(choices)}, got {value!r}")

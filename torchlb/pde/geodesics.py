@@ -12,14 +12,13 @@ from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Float
 from scipy import sparse
 from scipy.sparse import csgraph
 from torch import Tensor
 
-from torchlb.errors import InputError
 from torchlb.geometry.neighbors import mesh_graph
-from torchlb.linalg.checks import check_operator, takes_arrays
+from torchlb.linalg.checks import check_operator, check_sources, takes_arrays
 from torchlb.linalg.precision import NEGLIGIBLE
 from torchlb.operator.laplace_beltrami import LaplaceBeltrami
 from torchlb.operator.through import without
@@ -64,8 +63,9 @@ def geodesic_distance(
     >>> bool((distance - exact).abs().mean() < 0.02)
     True
     """
+    check_operator(lb)
     some: Any = sources if each and len(sources) else [sources]  # pyright: ignore[reportArgumentType]
-    starts = [source_points(lb, one) for one in some]
+    starts = [check_sources(one, lb.num_points).numpy() for one in some]
     points = np.ascontiguousarray(lb.points.detach().cpu().double().numpy())
     row, col = _edges(lb)
     length = _distances(points, row, col)
@@ -91,25 +91,6 @@ def _distance(
         order, fell = np.argsort(distance), np.ones(len(points), dtype=np.int64)
         kernels.straighten(distance, foot, order, points, *triangles, fell, enough)
     return distance
-
-
-def source_points(lb: LaplaceBeltrami, sources: Any) -> Int[np.ndarray, " S"]:
-    """Indices of the sources; InputError where there are none, or one is out of range."""
-    check_operator(lb)
-    try:
-        index = torch.as_tensor(sources)
-    except (TypeError, ValueError, RuntimeError):
-        index = torch.zeros(0)
-    if index.dtype == torch.bool and index.shape == (lb.num_points,):
-        index = index.nonzero()
-    index = index.reshape(-1)
-    whole = not (index.is_floating_point() or index.dtype == torch.bool)
-    if len(index) == 0 or not whole or bool(((index < 0) | (index >= lb.num_points)).any()):
-        raise InputError(
-            f"sources: expected numbers of points from 0 to {lb.num_points - 1}, or a mask of them with at least one, "
-            f"got {sources!r}"
-        )
-    return index.cpu().numpy()
 
 
 def _edges(lb: LaplaceBeltrami) -> tuple[np.ndarray, np.ndarray]:

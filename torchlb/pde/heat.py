@@ -1,9 +1,10 @@
 """Heat flow e^{tΔ}f = e^{−tM⁻¹K}f (`method.md`, section 8).
 
-method="deflated", the layer's default, splits off the span of the slow eigenvectors, where the flow is exact; the rest,
-which has decayed after about 16/λ_k, takes a short Chebyshev series of the P1 pair with lumped mass, since the mesh
-hardly resolves functions beyond the basis. "spectral" is the first part alone: everything beyond the basis is dropped,
-also as t → 0. "rational" needs no basis and is exact to the tolerance: the solves of `pair_flow`.
+`Method` names the ways to compute it. "rational", the default of functions, needs no basis and is exact to the
+tolerance: the solves of `pair_flow`. "spectral", the default of layers, is exact on the span of the slow eigenvectors;
+everything beyond the basis is dropped, also as t → 0. "deflated" is the same on that span; the rest, which has decayed
+after about 16/λ_k, takes a short Chebyshev series of the P1 pair with lumped mass, since the mesh hardly resolves
+functions beyond the basis.
 """
 
 from __future__ import annotations
@@ -16,8 +17,8 @@ import torch
 from jaxtyping import Shaped
 from torch import Tensor
 
-from torchlb.errors import InputError
-from torchlb.linalg.checks import check_tensor, takes_arrays
+from torchlb.errors import InputError, shown
+from torchlb.linalg.checks import check_choice, check_tensor, takes_arrays
 from torchlb.linalg.csr import shaped_like, side_by_side
 from torchlb.linalg.exponential import heat
 from torchlb.linalg.precision import ROOT_EPS
@@ -26,11 +27,11 @@ from torchlb.operator.checks import check_tolerance
 from torchlb.operator.inputs import check_mask
 from torchlb.operator.laplace_beltrami import LaplaceBeltrami
 from torchlb.operator.pair_methods import PairMethods, check_pair
-from torchlb.pde.checks import as_columns, as_times, check_choice, check_shape
+from torchlb.pde.checks import as_columns, as_times, check_shape
 from torchlb.pde.pair_flow import pair_flow
 from torchlb.spectral.eigenbasis import Eigenbasis
 
-Method = Literal["deflated", "spectral", "rational"]
+Method = Literal["rational", "spectral", "deflated"]
 
 
 @takes_arrays
@@ -57,7 +58,7 @@ def heat_flow(
     t
         Time ≥ 0 in ℓ², one for all channels or (C,). (In a time t a peak spreads to a width of √(2t).)
     method
-        "rational", which is exact to the tolerance, "deflated" or "spectral".
+        "rational", which is exact to the tolerance, "spectral" or "deflated" (`docs/conventions.md`).
     k
         Number of eigenpairs, for the last two.
     tolerance
@@ -112,7 +113,7 @@ def smooth(
         and NaN elsewhere, where f may be NaN, too. Without it NaN are an error.
     """
     if not isinstance(fwhm, Real) or not 0 <= fwhm < math.inf:
-        raise InputError(f"fwhm: expected a length of at least 0, got {fwhm!r}")
+        raise InputError(f"fwhm: expected a length of at least 0, got {shown(fwhm)}")
     time = float(fwhm) ** 2 / (16 * math.log(2))
     if mask is None:
         return heat_flow(lb, f, time)

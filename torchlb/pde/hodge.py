@@ -11,7 +11,7 @@ from torch import Tensor
 
 from torchlb.errors import InputError
 from torchlb.galerkin.weak_gradient import WeakGradient
-from torchlb.linalg.checks import check_operator
+from torchlb.linalg.checks import check_operator, check_tensor
 from torchlb.linalg.csr import Csr
 from torchlb.operator.laplace_beltrami import LaplaceBeltrami
 from torchlb.operator.medium import elements_of
@@ -60,6 +60,7 @@ def hodge_decomposition(
     True
     """
     check_operator(lb)
+    check_tensor(v, "v")
     check_surface(lb, "hodge_decomposition")
     if lb.sizes is not None or lb._in_medium:
         raise InputError(

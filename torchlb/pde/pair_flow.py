@@ -95,9 +95,11 @@ def _forms(
     """Forms with the derivative of ⟨g, Σ_k c_k v_k⟩ in K and M, v_k = T_k(2Z − 1)x.
 
     dZ = S(dM(1 − Z) − γ dK Z) with S = (M + γK)⁻¹; what v_k is multiplied by follows from Clenshaw's recurrence,
-    b_k = c_k g + 2Aᵀb_{k+1} − b_{k+2}, A = 2Z − 1, and 2⟨b_{k+1}, dA v_k⟩ add up, the first one once.
+    b_k = c_k g + 2Aᵀb_{k+1} − b_{k+2}, A = 2Z − 1, and 2⟨b_{k+1}, dA v_k⟩ add up, the first one once. They are the
+    columns of one form for each matrix.
     """
-    solver, times, forms = pair_system(lb), time.detach().cpu().numpy(), []
+    solver, times = pair_system(lb), time.detach().cpu().numpy()
+    terms: list[tuple[Tensor, ...]] = []
     x = solver.inside(x)
     for pole, chosen in poles(times):
         columns = torch.from_numpy(chosen).to(x.device)
@@ -123,8 +125,11 @@ def _forms(
             advanced = v[1] if k == 1 else (v[k] + v[k - 2]) / 2
             smooth = (v[k - 1] + advanced) / 2
             weight = torch.full((len(chosen),), 2.0 if k == 1 else 4.0, dtype=x.dtype)
-            forms += [
-                BilinearForm("energy", solved, smooth, -pole * weight),
-                BilinearForm("mass", solved, v[k - 1] - smooth, weight),
-            ]
-    return forms
+            terms.append((solved, smooth, v[k - 1] - smooth, -pole * weight, weight))
+    if not terms:
+        return []
+    w, smooth, rough, *weights = (torch.cat(columns, -1) for columns in zip(*terms, strict=True))
+    return [
+        BilinearForm("energy", w, smooth, weights[0]),
+        BilinearForm("mass", w, rough, weights[1]),
+    ]

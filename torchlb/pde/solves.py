@@ -18,7 +18,7 @@ from torchlb.linalg.sparse import compute_dtype, symmetric_product
 from torchlb.operator.checks import check_tolerance
 from torchlb.operator.laplace_beltrami import LaplaceBeltrami
 from torchlb.operator.pair_methods import PairMethods, check_pair
-from torchlb.operator.systems import means, solve_columns
+from torchlb.operator.systems import Tolerance, means, solve_columns
 from torchlb.operator.through import Origins, origins, without
 from torchlb.pde.checks import as_columns, as_times, uncompiled
 
@@ -77,7 +77,7 @@ def implicit_step(
     x = as_columns(f, lb)
     dtype = torch.float64 if tolerance < SINGLE else compute_dtype(x, lb.mass)
     columns, time = _columns(x, as_times(t, x, torch.float64), dtype)
-    lb = _conducting(lb, conductivity)
+    lb = _with_conductivity(lb, conductivity)
     given, fluxes = (_data(lb, d, n, f) for d, n in ((boundary_values, 0), (flux, 1)))
     right = _product(lb, 1, columns)
     if fluxes is not None:
@@ -116,7 +116,7 @@ def poisson_solve(
     check_tolerance(tolerance)
     x = as_columns(f, lb)
     columns, _ = _columns(x, None)
-    lb = _conducting(lb, conductivity)
+    lb = _with_conductivity(lb, conductivity)
     given, fluxes = (_data(lb, d, n, f) for d, n in ((boundary_values, 0), (flux, 1)))
     right = _product(lb, 1, columns)
     if fluxes is not None:
@@ -133,23 +133,18 @@ def potential(
     field: Float[Tensor, "*B N d C"] | None,
     source: Float[Tensor, "*B N C"] | None = None,
     *,
-    tolerance: float | None = None,
+    tolerance: Tolerance = "P1",
 ) -> Float[Tensor, "*B N C"]:
     """u with −Δu = s − ∇·v for a tangent field v, given in the frames, and a source s; differentiable.
 
     Ku = Σ_c G_cᵀ(π v_c) + π s, where G are the rows of the gradient and π is the mass. u has mean zero where no
     condition holds it. For a field alone, ∇u is closest to it; for v = ∇f, u is f less its mean, up to the order.
 
-    Parameters
-    ----------
-    field
-        (N, d, C) or (B, N, d, C), as `lb.local_gradient` gives it, units of u by 1/ℓ; None for no field.
-    source
-        (N, C) or (B, N, C), units of u by 1/ℓ²; its mean is subtracted.
-    tolerance
-        Relative tolerance of the solve with the weak pair; None for the solution by P1 elements, of second order.
+    Fields are (N, d, C) or (B, N, d, C), as `lb.local_gradient` gives them, sources (N, C) or (B, N, C), less their
+    means; without a field it is None. The tolerance is that of the weak pair's solve, or "P1".
     """
-    check_tolerance(tolerance)
+    if tolerance != "P1":
+        check_tolerance(tolerance)
     products = []
     if source is not None:
         products.append(lb.mass.to(source.dtype)[:, None] * source)
@@ -163,7 +158,7 @@ def potential(
     if source is None and field is not None:
         source = field[..., 0, :]
     assert source is not None, "neither field nor source"
-    if tolerance is None:
+    if tolerance == "P1":
         columns = without(lb, columns, "solutions by P1 elements")
         u = _solve(columns, None, None, None, lb, None, tolerance)
     else:
@@ -179,7 +174,7 @@ def _columns(
     return side_by_side(x.to(dtype)), time if x.ndim == 2 else time.repeat(len(x))
 
 
-def _conducting(lb: PairMethods, conductivity: Tensor | None) -> PairMethods:
+def _with_conductivity(lb: PairMethods, conductivity: Tensor | None) -> PairMethods:
     """The operator with this conductivity, if any."""
     if conductivity is None:
         return lb

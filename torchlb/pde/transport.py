@@ -12,10 +12,10 @@ from torch import Tensor
 from torch.nn.functional import normalize
 
 from torchlb.errors import InputError
-from torchlb.linalg.checks import check_operator, takes_arrays
+from torchlb.linalg.checks import check_operator, check_sources, check_tensor, takes_arrays
 from torchlb.linalg.precision import LOW, ROOT_EPS, ROUNDING, TINY
 from torchlb.operator.laplace_beltrami import LaplaceBeltrami
-from torchlb.pde.geodesics import geodesic_distance, source_points
+from torchlb.pde.geodesics import geodesic_distance
 from torchlb.pde.heat import heat_flow
 from torchlb.pde.solves import solved
 
@@ -86,7 +86,9 @@ def parallel_transport(
     >>> bool((moved.norm(dim=1) - 1).abs().max() < 1e-12)
     True
     """
-    index = torch.from_numpy(source_points(lb, sources)).to(lb.device)
+    check_operator(lb)
+    check_tensor(vectors, "vectors")
+    index = check_sources(sources, lb.num_points).to(lb.device)
     given = vectors[None] if vectors.ndim == 1 else vectors
     if given.ndim not in (2, 3) or given.shape[:2] != (len(index), lb.points.shape[1]):
         raise InputError(
@@ -127,7 +129,8 @@ def logarithmic_map(
     >>> bool((x.norm(dim=1) - geodesic_distance(lb, 0)).abs().max() < 1e-9)
     True
     """
-    index, dim = torch.from_numpy(source_points(lb, sources)).to(lb.device), lb.dim
+    check_operator(lb)
+    index, dim = check_sources(sources, lb.num_points).to(lb.device), lb.dim
     places = torch.arange(len(index)).to(index)
     start = torch.zeros(lb.num_points, dim, len(index), dim, dtype=torch.float64).to(index.device)
     start[index, :, places] = torch.eye(dim, dtype=torch.float64).to(start)

@@ -28,7 +28,7 @@ INK = "0.1"
 
 
 def axes_of(ax: Any) -> Any:
-    """The given axes, or new ones of pyplot, which no other function here needs."""
+    """Return the given axes, or new ones of `matplotlib.pyplot`; ImportError without matplotlib."""
     try:
         import matplotlib as mpl  # noqa: F401
     except ImportError as error:

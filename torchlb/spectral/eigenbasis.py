@@ -11,7 +11,7 @@ import torch
 from jaxtyping import Float, Shaped
 from torch import Tensor
 
-from torchlb.errors import InputError
+from torchlb.errors import InputError, shown
 from torchlb.linalg.checks import check_finite, check_tensor, takes_arrays
 
 
@@ -23,7 +23,7 @@ def check_num_pairs(k: object) -> int:
     torchlb.errors.InputError: k: expected a whole number of eigenpairs, at least 1, got 0
     """
     if isinstance(k, bool) or not isinstance(k, Integral) or k < 1:
-        raise InputError(f"k: expected a whole number of eigenpairs, at least 1, got {k!r}")
+        raise InputError(f"k: expected a whole number of eigenpairs, at least 1, got {shown(k)}")
     return int(k)
 
 

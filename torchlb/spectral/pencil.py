@@ -18,15 +18,8 @@ from torch.nn.functional import pad
 
 from torchlb.errors import EigenbasisError, warn
 from torchlb.linalg.lanczos import BLOCK, lanczos_of_pair
-from torchlb.linalg.precision import (
-    DENSE,
-    EPS,
-    ROOT_EPS,
-    ROUNDS,
-    SMALL,
-)
-from torchlb.linalg.sparse import multiply, on_device, on_one_pattern
-from torchlb.spectral.components import constants
+from torchlb.linalg.precision import DENSE, EPS, ROOT_EPS, ROUNDS, SMALL
+from torchlb.linalg.sparse import multiply, on_device
 from torchlb.spectral.eigenbasis import Eigenbasis
 from torchlb.spectral.sweeps import CHUNK, closed, swept
 
@@ -36,7 +29,6 @@ SHIFT = 10.0
 """Shift of the factor times the size of a component: about half of its first eigenvalue, were it a disk."""
 START = 0.003
 """Relative residual of the eigenpairs of the P1 pair, whose distance from (K, M) is of that order."""
-
 
 Sparse = sparse.csr_array
 Pair = tuple[Sparse, Sparse]
@@ -66,21 +58,11 @@ def pencil_eigenbasis(
 ) -> Eigenbasis:
     """The min(k, N) smallest eigenpairs of K u = λ M u, and more where a group of equal nonzero ones would be split.
 
-    Parameters
-    ----------
-    stiffness, mass_matrix, mass
-        K, positive semidefinite, M, positive definite, (N, N), and the diagonal mass, in float64, on the device of the
-        solve.
-    dim
-        d, from which the unit of a length follows: K is in ℓ^{d−2}, M in ℓ^d.
-    linear
-        K₁ and M₁ of the same points, spectrally close, with fewer entries. None if they are (K, M).
-    fixed
-        Points where functions vanish (Dirichlet).
-    losing
-        The fixed points, and points where K1 > 0 (Robin); on components without any K1 = 0. By default `fixed`.
-    tolerance
-        Bound on the estimated relative error of every eigenvalue, 1.5e-8 k² by default; closer ones are not separated.
+    K, in ℓ^{`dim`−2}, is positive semidefinite, and M, in ℓ^`dim`, positive definite; the solve is on the device of the
+    diagonal mass. `linear` are K₁ and M₁ of the same points, spectrally close, with fewer entries, None if they are
+    (K, M). Functions vanish at points that are `fixed` (Dirichlet), constants lose at the points `losing`, the fixed
+    ones by default, and those where K1 > 0 (Robin). The tolerance bounds the estimated relative error of every
+    eigenvalue, None for 1.5e-8 k²; closer ones are not separated.
 
     Raises EigenbasisError where that is not reached, K has a negative eigenvalue, or M a diagonal that is not positive.
 
@@ -114,13 +96,32 @@ def pencil_eigenbasis(
     return _merged(parts, found, (null, whole[1] @ null), mass, k, tolerance, (length**2, units[1]))
 
 
+def constants(
+    component: np.ndarray, areas: Float[np.ndarray, " P"], k: int
+) -> Float[np.ndarray, "N k"]:
+    """The first k of orthonormal functions that are constant on every component; the first is constant everywhere.
+
+    They vanish on components whose area is given as 0; k is at most the number of the others.
+
+    >>> constants(np.array([0, 0, 1]), np.array([2.0, 2.0]), 2)
+    array([[ 0.5,  0.5],
+           [ 0.5,  0.5],
+           [ 0.5, -0.5]])
+    """
+    on = areas > 0
+    root, values = np.sqrt(areas[on]), np.zeros((len(areas), k))
+    if k:
+        q = np.linalg.qr(np.column_stack([root, np.eye(len(root), k - 1)]))[0]
+        values[on] = q * np.sign(q[0, 0]) / root[:, None]
+        values[on, 0] = 1 / linalg.norm(root)
+    return values[component]
+
+
 def _components(whole: Pair, near: Pair | None) -> tuple[np.ndarray, Sparse]:
     """The connected component of every point under both matrices, and the pattern of the P1 pair."""
-    pattern = _joined(*(near or whole))
-    count, component = csgraph.connected_components(pattern, directed=False)
-    if near and count > 1:  # fits may connect components
-        component = csgraph.connected_components(_joined(*whole), directed=False)[1]
-    return component, pattern
+    patterns = [sparse.csr_array(abs(k) + abs(m)) for k, m in (near or whole, whole)]  # no zeros
+    component = csgraph.connected_components(patterns[1], directed=False)[1]  # fits may connect
+    return component, patterns[0]
 
 
 def _parts(
@@ -138,38 +139,18 @@ def _parts(
     for points in np.split(order, np.cumsum(np.bincount(component))[:-1]):
         free = points[~fixed[points]]
         if len(free):
-            linear = None if near is None else _renumbered(near, free)
-            k, m = _renumbered(whole, free)
-            parts.append(_Part(free, k, m, linear, bool(areas[component[free[0]]] > 0)))
+            matrices = (sparse.csr_array(m[free].T)[free] for m in (*whole, *(near or ())))
+            k, m, *linear = matrices  # symmetric
+            conserving = bool(areas[component[free[0]]] > 0)
+            parts.append(_Part(free, k, m, (linear[0], linear[1]) if linear else None, conserving))
     return parts
-
-
-def _renumbered(pair: Pair, order: np.ndarray) -> Pair:
-    """Symmetric matrices with these rows and columns, in this order."""
-    if not on_one_pattern(*pair):
-        one, other = (sparse.csr_array(matrix[order].T)[order] for matrix in pair)
-        return one, other
-    number = np.arange(pair[0].nnz, dtype=np.int32)
-    places = sparse.csr_array((number, pair[0].indices, pair[0].indptr), pair[0].shape)
-    places = sparse.csr_array(places[order].T)[order]  # with ascending columns
-    pattern = places.indices, places.indptr
-    one, other = (sparse.csr_array((m.data[places.data], *pattern), places.shape) for m in pair)
-    return one, other
 
 
 def _narrow(matrix: Sparse, unit: float) -> Sparse:
     """A matrix with 32-bit indices, in float64, divided by a unit."""
-    ends = (part.astype(np.int32, copy=False) for part in (matrix.indices, matrix.indptr))
+    # copies, since SciPy sorts in place
+    ends = (part.astype(np.int32) for part in (matrix.indices, matrix.indptr))
     return sparse.csr_array((np.divide(matrix.data, unit, dtype=float), *ends), shape=matrix.shape)
-
-
-def _joined(one: Sparse, other: Sparse) -> Sparse:
-    """|A| + |B|, without zeros; in a tenth of the time for a common pattern."""
-    if on_one_pattern(one, other):
-        data = abs(one.data) + abs(other.data)
-        if data.all():
-            return sparse.csr_array((data, one.indices, one.indptr), shape=one.shape)
-    return sparse.csr_array(abs(one) + abs(other))
 
 
 def _pairs(part: _Part, k: int, tolerance: float, device: torch.device) -> tuple[Tensor, ...]:

@@ -11,11 +11,11 @@ from collections.abc import Sequence
 from typing import Any
 
 import torch
-from jaxtyping import Float, Int, Shaped
+from jaxtyping import Float, Shaped
 from torch import Tensor
 
-from torchlb.errors import EigenbasisError, InputError
-from torchlb.linalg.checks import check_operator, takes_arrays
+from torchlb.errors import EigenbasisError, InputError, shown
+from torchlb.linalg.checks import check_operator, check_sources, takes_arrays
 from torchlb.spectral.eigenbasis import Eigenbasis, Spectral
 
 
@@ -57,7 +57,7 @@ def _numbers(name: str, given: Any, values: Tensor, least: float = 0.0) -> Float
     found = torch.as_tensor(given).to(values)
     if found.ndim > 1 or not found.numel() or not bool(((found >= least) & found.isfinite()).all()):
         raise InputError(
-            f"{name}: expected one finite number or more, none below {least:g}, got {given!r}"
+            f"{name}: expected one finite number or more, none below {least:g}, got {shown(given)}"
         )
     return found.reshape(-1)
 
@@ -192,24 +192,20 @@ def diffusion_map(
 
 
 def diffusion_distance(
-    lb: Spectral, sources: Int[Tensor, " S"] | Sequence[int], time: float, *, k: int = 128
+    lb: Spectral, sources: int | Sequence[int] | Tensor, time: float, *, k: int = 128
 ) -> Float[Tensor, "N S"]:
     """Diffusion distance of every point to each source: (Σ_k e^{−2λ_k t}(φ_k(x) − φ_k(y))²)^{1/2}, ℓ^{−d/2}.
 
     It is the L² distance between heat that spreads on `lb` from a point x and from y for the `time` t, ℓ², seen by `k`
-    eigenpairs. The `sources` y are numbers of points. Raises ValueError for others, and for a batch.
+    eigenpairs. The `sources` y are an index, several, or a mask of the points. Raises InputError for others, and for a
+    batch.
     """
     check_operator(lb)
     if lb.sizes is not None:
         raise InputError("diffusion_distance: got a batch; ask each shape by itself")
-    index = torch.as_tensor(sources)
-    whole = not (index.is_floating_point() or index.is_complex() or index.dtype == torch.bool)
-    if index.ndim != 1 or not whole or bool(((index < 0) | (index >= lb.num_points)).any()):
-        raise InputError(
-            f"sources: expected numbers of points from 0 to {lb.num_points - 1}, in a list or tensor, got {sources!r}"
-        )
+    index = check_sources(sources, lb.num_points)
     basis, values = _basis(lb, k)
     coordinates = basis.eigenvectors * torch.exp(-values * _numbers("time", time, values))
     # By a matrix product the distance of a point from itself would not be zero.
     mode = "donot_use_mm_for_euclid_dist"
-    return torch.cdist(coordinates, coordinates[index.long()], compute_mode=mode)
+    return torch.cdist(coordinates, coordinates[index.to(values.device)], compute_mode=mode)
