@@ -419,7 +419,7 @@ def test_a_file_of_an_older_format_is_refused_by_name_and_built_again(tmp_path):
     lb = load_or_build(VERTICES, FACES, **arguments)
     path = tmp_path / files_of(tmp_path)[0]
     of_format_1(path)
-    message = r"written by torchlb 0\.0\.9 in format 1, and torchlb .* reads format 3; build"
+    message = r"written by torchlb 0\.0\.9 in format 1, and torchlb .* reads format 4; build"
     with pytest.raises(OperatorFileError, match=message):
         load_operator(path)
     with pytest.warns(CacheWarning, match=f"{message}.*computed again and replaced"):

@@ -10,6 +10,8 @@ from contextvars import ContextVar
 from pathlib import Path
 from typing import Any
 
+import jaxtyping
+
 __all__ = [
     "CacheWarning",
     "DerivativeError",
@@ -29,7 +31,7 @@ __all__ = [
     "shown",
     "warn",
 ]
-HERE = str(Path(__file__).parent)
+HERE = str(Path(__file__).parent), str(Path(jaxtyping.__file__).parent)
 
 
 class TorchlbError(ValueError):
@@ -111,9 +113,16 @@ def shown(value: object, longest: int = 80) -> str:
     return text if len(text) <= longest else f"a {type(value).__name__}"
 
 
-def warn(message: str, category: type[Warning] = TorchlbWarning) -> None:
-    """Issue a warning at the line outside torchlb from which the call came."""
+def warn(
+    message: str, category: type[Warning] = TorchlbWarning, *, once: set[Any] | None = None
+) -> None:
+    """Issue a warning at the line outside torchlb from which the call came, not again for a line that is in `once`."""
     frame, level = sys._getframe(), 1
     while frame.f_back is not None and frame.f_code.co_filename.startswith(HERE):
         frame, level = frame.f_back, level + 1
+    place = frame.f_code.co_filename, frame.f_lineno
+    if once is not None:
+        if place in once:
+            return
+        once.add(place)
     warnings.warn(message, category, stacklevel=level)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Any
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -30,20 +31,26 @@ class Sides:
 
 @dataclass(frozen=True)
 class Nodes:
-    """Nodes of degree r: the vertices, then those inside each edge, inside each triangle, and so on.
+    """Nodes of degree r: `count` vertices, then those inside each edge, inside each triangle, and so on.
 
     `faces` are the cells with their orientation, `cells` those with ascending corners; `sides` has their sub-simplices
     by number of corners: edges, triangles, …, and facets. Nodes that are no vertices have barycentric coordinates
     `shares` with respect to `corners`; `elements` has the nodes of each cell in the order of `lattice`.
     """
 
+    count: int
     degree: int
+    closed: bool
     faces: Int[Tensor, "F corners"]
     cells: Int[Tensor, "F corners"]
     sides: dict[int, Sides]
     corners: Int[Tensor, "X corners"]
     shares: Float[Tensor, "X corners"]
     elements: Int[Tensor, "F n"]
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """State for files: what the nodes follow from."""
+        return lagrange_nodes, (self.faces, self.count, self.degree, self.closed)
 
     @property
     def dim(self) -> int:
@@ -90,7 +97,7 @@ class Nodes:
 
 
 def lagrange_nodes(
-    cells: Int[Tensor, "F corners"], num_points: int, degree: int, *, closed: bool = False
+    cells: Int[Tensor, "F corners"], num_points: int, degree: int, closed: bool = False
 ) -> Nodes:
     """Number the nodes of degree r on a complex of any topology; `closed` ignores its boundary.
 
@@ -116,7 +123,9 @@ def lagrange_nodes(
     if closed:
         sides[dim] = replace(sides[dim], uses=sides[dim].uses.clamp_min(2))
     return Nodes(
+        num_points,
         degree,
+        closed,
         faces,
         cells,
         sides,

@@ -129,6 +129,10 @@ class PairPlan:
     shares: Float[Tensor, " F"] | None
     lowered: Int[Tensor, " L"]
 
+    def __getstate__(self) -> dict[str, Any]:
+        """State for files, without the patterns."""
+        return {name: part for name, part in vars(self).items() if name != "patterns"}
+
     @cached_property
     def patterns(self) -> dict[str, Pattern]:
         """Patterns of the matrices evaluated so far, by their names in `WeakPair`."""

@@ -29,7 +29,7 @@ from torchlb.operator.laplace_beltrami import LaplaceBeltrami
 from torchlb.stencils.conditions import Condition
 from torchlb.version import __version__
 
-FORMAT = 3
+FORMAT = 4
 """Version of the file format; it changes when other versions of torchlb could not read the file."""
 
 

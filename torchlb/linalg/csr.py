@@ -7,7 +7,6 @@ any size loads into them, and they are joined to batches and split again.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from copy import copy
 from itertools import accumulate
 from typing import Any, TypeVar
 
@@ -68,7 +67,8 @@ class Tensors(nn.Module):
 
     def _alias(self: Held) -> Held:
         """A module of the same tensors, which is moved and cast by itself."""
-        other = copy(self)
+        other = type(self).__new__(type(self))
+        other.__dict__.update(self.__dict__)
         other._buffers = dict(self._buffers)
         other._modules = {
             name: module._alias() if isinstance(module, Tensors) else module

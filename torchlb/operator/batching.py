@@ -9,8 +9,8 @@ from typing import Any
 import torch
 
 from torchlb.errors import InputError
-from torchlb.linalg.csr import Csr, Record, starts, tensors_of
-from torchlb.operator.parts import DecidedAt, PairMatrices
+from torchlb.linalg.csr import Csr, Record, starts
+from torchlb.operator.parts import PairMatrices
 from torchlb.operator.storage import OperatorStorage
 
 Parts = dict[str, Any]
@@ -42,8 +42,7 @@ def joined_parts(shapes: Sequence[OperatorStorage]) -> Parts:
         masks = [s.mass < 0 if s.boundary is None else s.boundary for s in shapes]
         parts["_on_boundary"] = torch.cat(masks)
     parts["_record"] = Record.join([s._record for s in shapes])
-    if all(tensors_of(s._decided_at) for s in shapes):
-        parts["_decided_at"] = DecidedAt({"points": torch.cat([s._decided_points for s in shapes])})
+    parts["_plans"] = [plan for s in shapes for plan in s._known_plans]
     parts["stencil"] = Csr.join([s.stencil for s in shapes])
     parts["weak"] = PairMatrices.join([s.weak for s in shapes])
     return parts
@@ -63,9 +62,7 @@ def split_parts(batch: OperatorStorage, sizes: Sequence[int]) -> list[Parts]:
     columns["stencil"], columns["weak"] = batch.stencil.split(sizes), batch.weak.split(sizes)
     if len(batch._record.order):  # PyG data carry no report
         columns["_record"] = batch._record.split(sizes)
-    if tensors_of(batch._decided_at):
-        places = batch._decided_points.split(list(sizes))
-        columns["_decided_at"] = [DecidedAt({"points": own.clone()}) for own in places]
+    columns["_plans"] = [[plan] for plan in batch._known_plans]
     shapes = [dict(zip(columns, row, strict=True)) for row in zip(*columns.values(), strict=True)]
     for shape in shapes:
         if "_on_boundary" in shape and not shape["_on_boundary"].any():

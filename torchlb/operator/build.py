@@ -153,7 +153,7 @@ def finished(
     if pair_plan is not None and shape.plan is not None:
         planned = None if certificate else stencils.plan(rows), pair_plan, shape.low_order.flips
         of_cells = faces, order, shape.on_mesh, moved
-        plan = Plan(numbering, shape.plan, *planned, *of_cells, source, options)
+        plan = Plan(numbering, points, shape.plan, *planned, *of_cells, source, options)
     _warn_of_low_order(rows, shape, source, plan)
     found = {"certificate": certificate, "surface": surface and surface.summary}
     of_user = numbering, points, faces, source, options

@@ -5,9 +5,7 @@ from __future__ import annotations
 import sys
 from collections.abc import Callable
 from dataclasses import replace
-from typing import Any
 
-import numpy as np
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
@@ -26,7 +24,6 @@ from torchlb.galerkin.flips import flipped
 from torchlb.geometry.neighbors import nearest_neighbors
 from torchlb.geometry.numbering import Numbering
 from torchlb.geometry.thresholds import NEAREST
-from torchlb.linalg.precision import SINGLE
 from torchlb.linalg.threads import threads_for
 from torchlb.operator.build import finished, on_cells
 from torchlb.operator.checks import (
@@ -40,8 +37,7 @@ from torchlb.operator.checks import (
 )
 from torchlb.operator.inputs import ArrayLike, check_points
 from torchlb.operator.options import Options
-from torchlb.operator.plan import Parts, Plan, evaluate
-from torchlb.operator.storage import OperatorStorage
+from torchlb.operator.plan import Parts
 from torchlb.stencils.conditions import condition_of
 from torchlb.stencils.shape import surface_shape
 
@@ -154,34 +150,3 @@ def _on_surface(
     places = numbering.restored(points), faces, every, every[:0]
     rest = "points", options, numbering, progress
     return finished(shape, surface.cells, places, *rest, surface)
-
-
-def plan_again(lb: OperatorStorage) -> Plan:
-    """Decide on a mesh or a cloud again, from the points of the decisions, faces and options.
-
-    Raises InputError where the result differs: where points of a noisy curve were moved, or where cells through a cloud
-    came from normals or from a user's function.
-    """
-    points, options = lb._decided_points, Options(**lb.options)
-    boundary, cells = None if lb.boundary is None else lb.boundary.cpu(), lb.faces.cpu()
-    if lb.surface is None and (lb.source == "mesh" or lb.dim < 3 or lb.points.shape[1] == 3):
-        built = on_cells(points, points, cells, options, boundary, lb.source, progress=False)
-    else:
-        rest: Any = dict.fromkeys(("normals", "reconstruction"))
-        built = build_cloud(points, lb.dim, options, boundary=boundary, progress=False, **rest)
-    ours, theirs = (faces.sort(1).values.numpy() for faces in (built["faces"], cells))
-    rows = [torch.from_numpy(np.lexsort(faces.T)) for faces in (ours, theirs)]
-    same = np.array_equal(ours[rows[0]], theirs[rows[1]])
-    place = torch.empty_like(rows[0]).index_copy(0, *rows)  # index of each face among the user's
-    plan, mass = built["_plan"], built["mass"]
-    if same:
-        plan = replace(plan, faces=cells, order=place[plan.order])
-        if not torch.equal(points.to(lb.points), lb.points):  # moved since
-            mass = evaluate(plan, lb.points.detach().cpu().double())["mass"]
-    rtol = max(SINGLE, torch.finfo(lb.dtype).eps)
-    if not same or not torch.allclose(mass, lb.mass.cpu().double(), rtol=rtol, atol=0):
-        raise InputError(
-            "plan: it was not kept, and what is decided anew by the points alone is not what the operator is of, where "
-            "`normals`, `reconstruct`, noise of a curve, rounding or another version had a part; build it again"
-        )
-    return plan

@@ -22,7 +22,7 @@ from torchlb.operator.batching import (
     split_parts,
 )
 from torchlb.operator.build import build_cotangent, build_mesh
-from torchlb.operator.build_cloud import Reconstruction, build_cloud, plan_again
+from torchlb.operator.build_cloud import Reconstruction, build_cloud
 from torchlb.operator.checks import check_none
 from torchlb.operator.connection import Connection, connection_of
 from torchlb.operator.inputs import (
@@ -35,7 +35,7 @@ from torchlb.operator.inputs import (
 from torchlb.operator.medium import checked_fields, pair_in, split_fields
 from torchlb.operator.options import Options
 from torchlb.operator.pair_methods import PairMethods
-from torchlb.operator.parts import DecidedAt, MediumFields, Modes, PairMatrices
+from torchlb.operator.parts import MediumFields, Modes, PairMatrices
 from torchlb.operator.plan import Parts, Plan, check_fit, evaluate
 from torchlb.operator.stencil_methods import StencilMethods
 from torchlb.operator.through import carrying, origins
@@ -239,22 +239,21 @@ class LaplaceBeltrami(StencilMethods, PairMethods):
     def plan(self) -> Plan:
         """The decisions behind the operator, integers and flags.
 
-        Copies and operators from files make them again, at the points that they were made at, which are kept unrounded.
-        Raises InputError for batches, the cotangent operator, and operators without a weak pair.
+        Copies, files, and the shapes of a batch have them, too. Raises InputError for batches, the cotangent operator,
+        operators without a weak pair, and where they were let go.
         """
-        if self._plan is None and self.source in ("mesh", "points") and self._has_weak_form:
-            self._plan = plan_again(self)
-        if self._plan is None:
+        plan = None if self.sizes is not None else self._known_plans[0]
+        if plan is None:
             raise InputError(
-                f"plan: an operator of kind {self.source!r} has none, nor has one without a weak pair; those of "
-                "LaplaceBeltrami.from_mesh and from_points have"
+                f"plan: an operator of kind {self.source!r} has none here; those of LaplaceBeltrami.from_mesh and "
+                "from_points have, with a weak pair, unless they come from PyG's Data or it was let go"
             )
-        return self._plan
+        return plan
 
     @plan.deleter
     def plan(self) -> None:
-        """``del lb.plan`` frees it, some kilobytes a point; it is made again when it is asked for."""
-        self._plan = None
+        """``del lb.plan`` frees it, about a kilobyte a point."""
+        self._plans = []
 
     def at(self, points: ArrayLike) -> LaplaceBeltrami:
         """The operator of the shape moved to other points, by the same decisions: neighbours, degrees, cells.
@@ -283,11 +282,9 @@ class LaplaceBeltrami(StencilMethods, PairMethods):
                 f"points: expected {tuple(self.points.shape)}, as the operator has, got {tuple(there.shape)}"
             )
         plan = self.plan
-        decided = self._decided_points
-        check_fit(decided, there, plan.faces)
-        kept = {"surface": self.surface, "_decided_at": DecidedAt({"points": decided})}
+        check_fit(plan, there)
         with torch.inference_mode(False):
-            built = evaluate(plan, there) | kept
+            built = evaluate(plan, there) | {"surface": self.surface}
         lb = self._stored(built, points, self.device)
         return lb.with_medium(**tensors_of(self._known_medium)) if self._in_medium else lb
 
@@ -330,7 +327,7 @@ class LaplaceBeltrami(StencilMethods, PairMethods):
             medium, lb = checked_fields(self, given), self._alias()
             lb.weak = pair_in(self, medium.fields(self.num_points))
             lb.modes, lb._medium, lb._in_medium = Modes(None, self.mass), medium, True
-        lb._plan, lb.cache.elements = self._plan, self.cache.elements
+        lb.cache.elements = self.cache.elements
         return lb
 
     @property
@@ -375,7 +372,6 @@ torch.serialization.add_safe_globals(
         Csr,
         PairMatrices,
         MediumFields,
-        DecidedAt,
         Modes,
         Record,
         Certificate,

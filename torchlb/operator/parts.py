@@ -15,6 +15,9 @@ from torchlb.linalg.exponential import spectral_radius
 from torchlb.linalg.sparse import to_scipy
 from torchlb.spectral.eigenbasis import Eigenbasis
 
+FIT_FIELDS = ("fit_degree", "fit_reason", "edges", "curved_edges")
+REAL_FIELDS = ("growth", "condition", "off_diagonal_ratio")
+ROW_FIELDS = ("order", "normal_order", "num_neighbors", *REAL_FIELDS, "rule", "reason")
 BASIS = ("eigenvalues", "eigenvectors", "left", "relative_errors")
 
 
@@ -141,8 +144,8 @@ def _without_zeros(values: Float[Tensor, "terms nnz"]) -> Float[Tensor, "_ nnz"]
     return values[:count]
 
 
-class Named(Tensors):
-    """Buffers of which a state may hold any, or none."""
+class MediumFields(Tensors):
+    """The fields of a medium by `FieldName`; those that were not given are not there, also in a state."""
 
     def _load_from_state_dict(self, state_dict: Any, prefix: str, *given: Any) -> None:  # pyright: ignore[reportIncompatibleMethodOverride]
         self._buffers.clear()
@@ -151,23 +154,12 @@ class Named(Tensors):
                 self.register_buffer(key.removeprefix(prefix), torch.zeros(0))
         super()._load_from_state_dict(state_dict, prefix, *given)
 
-
-class MediumFields(Named):
-    """The fields of a medium by `FieldName`; those that were not given are not there."""
-
     def fields(self, num_points: int) -> dict[str, Field]:
         """The fields, which are on the faces where there are not as many as points."""
         return {
             name: Field(values, len(values) != num_points, name != "potential")
             for name, values in tensors_of(self).items()
         }
-
-
-class DecidedAt(Named):
-    """The points (N, n) that a plan was made at, float64 on the CPU: neither rounded nor moved with the operator."""
-
-    def _apply(self, fn: Any, recurse: bool = True) -> DecidedAt:
-        return self
 
 
 class Modes(Tensors):

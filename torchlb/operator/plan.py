@@ -8,8 +8,9 @@ points that the plan was made from it gives that operator, at points that moved 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cache
+from io import BytesIO
 from typing import Any
 
 import torch
@@ -19,24 +20,28 @@ from torch import Tensor
 from torchlb.errors import DerivativeError, InputError, first_few, renumbered, warn
 from torchlb.galerkin.absorption import absorbing
 from torchlb.galerkin.bilinear import BilinearForm
+from torchlb.galerkin.boundary import BoundaryCurves, OnCurves, OnSurface
+from torchlb.galerkin.curving import BoundaryNodesPlan, CurvingPlan
 from torchlb.galerkin.elements import subsets
 from torchlb.galerkin.forms import Forms, edge_lengths
 from torchlb.galerkin.medium import Medium
+from torchlb.galerkin.nodes import lagrange_nodes
 from torchlb.galerkin.pair import PairPlan, WeakPair
 from torchlb.galerkin.tangent import in_space
-from torchlb.geometry.boundary import boundary_faces
+from torchlb.geometry.boundary import BoundaryPlan, boundary_faces
+from torchlb.geometry.local_fits import FitPlan, Neighborhoods
 from torchlb.geometry.numbering import Numbering
 from torchlb.geometry.thresholds import FACTOR
 from torchlb.linalg.csr import Csr, Record
 from torchlb.linalg.threads import threads_for
 from torchlb.operator.options import Options
-from torchlb.operator.parts import DecidedAt, PairMatrices
-from torchlb.operator.storage import FIT_FIELDS, ROW_FIELDS
+from torchlb.operator.parts import FIT_FIELDS, ROW_FIELDS, PairMatrices
 from torchlb.stencils.assemble import Stencils
 from torchlb.stencils.conditions import Condition, condition_of
 from torchlb.stencils.low_order import MeshLowOrder
 from torchlb.stencils.rows import Rows, RowsPlan
-from torchlb.stencils.shape import Placed, Shape, ShapePlan
+from torchlb.stencils.shape import Beside, Placed, Shape, ShapePlan
+from torchlb.version import __version__
 
 Parts = dict[str, Any]
 """Attributes of an operator by name."""
@@ -50,6 +55,8 @@ class Plan:
     ----------
     numbering
         Map from the user's order of the points, and back.
+    points
+        (N, n), ℓ, where they were made, float64, by which `check_fit` judges others.
     shape, rows, pair
         Plans of frames, normals and boundary; of the stencils, None with a certificate; of the weak pair.
     flips
@@ -62,9 +69,12 @@ class Plan:
         Points of a noisy curve that were moved.
     source, options
         As of the operator.
+    warned
+        Lines of a program that were warned of points that moved too far.
     """
 
     numbering: Numbering
+    points: Float[Tensor, "N n"]
     shape: ShapePlan
     rows: RowsPlan | None
     pair: PairPlan
@@ -75,6 +85,7 @@ class Plan:
     moved: Int[Tensor, " m"]
     source: str
     options: Options
+    warned: set[Any] = field(default_factory=set)
 
     @property
     def num_points(self) -> int:
@@ -198,7 +209,7 @@ def operator_parts(
     parts = others | {
         "source": source,
         "options": {} if options is None else options.plain,
-        "_plan": plan,
+        "_plans": [plan],
         "points": points,
         "faces": faces,
         "mass": given(shape.areas),
@@ -207,8 +218,6 @@ def operator_parts(
         "stencil": Csr.with_transpose(rows.crow, rows.col, values),
         "_record": Record({name: report[name] for name in (*ROW_FIELDS, *FIT_FIELDS)}),
     }
-    if plan is not None:
-        parts["_decided_at"] = DecidedAt({"points": points})
     if shape.boundary is not None and shape.boundary.mask.any():
         parts["_on_boundary"] = given(shape.boundary.mask)
     if pair is not None:
@@ -223,13 +232,13 @@ def operator_parts(
     return parts
 
 
-def check_fit(
-    before: Float[Tensor, "N n"], after: Float[Tensor, "N n"], cells: Int[Tensor, "F corners"]
-) -> None:
+def check_fit(plan: Plan, after: Float[Tensor, "N n"]) -> None:
     """Warn where edges changed by more than `FACTOR` against all others, as what was decided may not fit there.
 
-    Raises InputError where triangles of the plane, or tetrahedra of space, were turned inside out.
+    It warns once for each line of a program. Raises InputError where triangles of the plane, or tetrahedra of space,
+    were turned inside out.
     """
+    before, cells = plan.points, plan.faces
     edges = cells[:, torch.tensor(subsets(cells.shape[1] - 1, 2))]
     one, two = (edge_lengths(x, cells) for x in (before, after))
     stretch = torch.where(one > 0, two / one, 1.0)
@@ -239,7 +248,8 @@ def check_fit(
         warn(
             f"at: {len(changed)} points ({first_few(changed)}) have edges that grew or shrank by more than "
             f"{FACTOR:.0f} times against the others since neighbours, degrees and cells were decided; build the "
-            "operator of these points anew"
+            "operator of these points anew",
+            once=plan.warned,
         )
     if cells.shape[1] == before.shape[1] + 1:
         sides = [
@@ -252,6 +262,36 @@ def check_fit(
                 f"points: cells at {len(inverted)} of them ({first_few(inverted)}) are turned inside out; smaller "
                 "steps, or other cells, are needed"
             )
+
+
+PARTS = [
+    *(Plan, Options, Numbering, ShapePlan, Beside, RowsPlan, PairPlan, CurvingPlan, lagrange_nodes),
+    *(BoundaryNodesPlan, OnCurves, BoundaryCurves, OnSurface, BoundaryPlan, FitPlan, Neighborhoods),
+]
+"""Classes and functions that a packed plan is made of."""
+
+
+def packed(plans: Sequence[Plan | None]) -> Tensor:
+    """The plans as bytes, (B,), on the CPU."""
+    plain = [
+        plan and replace(plan, options=Options(**plan.options.plain), warned=set())
+        for plan in plans
+    ]
+    file = BytesIO()
+    torch.save((__version__, plain), file)
+    return torch.frombuffer(bytearray(file.getvalue()), dtype=torch.uint8)
+
+
+def unpacked(data: Tensor) -> list[Plan | None]:
+    """Inverse of `packed`, which runs no code from the data; InputError for those of another version."""
+    with torch.serialization.safe_globals(PARTS):
+        version, plans = torch.load(BytesIO(data.cpu().numpy().tobytes()), weights_only=True)
+    if version != __version__:
+        raise InputError(
+            f"plan: it was made by torchlb {version}, and torchlb {__version__} does not read it; build the operator "
+            "again"
+        )
+    return plans
 
 
 def stencils_of(shape: Shape, options: Options) -> Stencils:

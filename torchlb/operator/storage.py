@@ -15,13 +15,18 @@ from torchlb.certified.certificate import Certificate
 from torchlb.cloud.surface import SurfaceSummary
 from torchlb.errors import InputError, first_few, warn
 from torchlb.linalg.csr import Csr, Record, Tensors, tensors_of
-from torchlb.operator.parts import DecidedAt, MediumFields, Modes, OperatorCache, PairMatrices
+from torchlb.operator.parts import (
+    FIT_FIELDS,
+    REAL_FIELDS,
+    ROW_FIELDS,
+    MediumFields,
+    Modes,
+    OperatorCache,
+    PairMatrices,
+)
+from torchlb.operator.plan import packed, unpacked
 from torchlb.spectral.eigenbasis import Eigenbasis
 from torchlb.stencils.conditions import Condition, condition_of, kind_of
-
-FIT_FIELDS = ("fit_degree", "fit_reason", "edges", "curved_edges")
-REAL_FIELDS = ("growth", "condition", "off_diagonal_ratio")
-ROW_FIELDS = ("order", "normal_order", "num_neighbors", *REAL_FIELDS, "rule", "reason")
 
 Storage = TypeVar("Storage", bound="OperatorStorage")
 
@@ -48,7 +53,6 @@ class OperatorStorage(Tensors):
     modes: Modes
     _record: Record
     _medium: MediumFields
-    _decided_at: DecidedAt
 
     def __init__(self) -> None:
         none, whole = torch.zeros(0), torch.zeros(0, dtype=torch.int64)
@@ -61,16 +65,36 @@ class OperatorStorage(Tensors):
         self._sizes: list[Tensor] | None = None
         self._states: list[dict[str, Any]] | None = None  # of the shapes of a batch
         self._in_medium = self._carries = False  # whether shapes of a batch require gradients
-        self._plan: Any = None
+        self._plans: (
+            list[Any] | Tensor
+        ) = []  # one for each shape; in a state packed, until asked for
         self._cache: OperatorCache | None = None
-        self._medium, self._decided_at = MediumFields({}), DecidedAt({})
+        self._medium = MediumFields({})
         self.stencil, self.weak, self.modes = Csr(order_t=whole), PairMatrices(), Modes(None, none)
         fields = {n: none if n in REAL_FIELDS else whole for n in (*ROW_FIELDS, *FIT_FIELDS)}
         self._record = Record(fields)
 
     def __getstate__(self) -> dict[str, Any]:
-        """State for copies and files, without the plan, which is made again on demand, and the cache."""
-        return {**self.__dict__, "_plan": None, "_cache": None}
+        """State for copies and files, without the cache."""
+        return {**self.__dict__, "_plans": self._packed_plans(), "_cache": None}
+
+    @property
+    def _known_plans(self) -> list[Any]:
+        """The plan of each shape, None where there is none."""
+        if isinstance(self._plans, Tensor):
+            self._plans = unpacked(self._plans)
+        return self._plans or [None] * len(self.sizes or (1,))
+
+    def _packed_plans(self) -> list[Any] | Tensor:
+        if isinstance(self._plans, Tensor):
+            return self._plans
+        return packed(self._plans) if any(self._plans) else []
+
+    def _save_to_state_dict(self, destination: Any, prefix: str, keep_vars: bool) -> None:
+        super()._save_to_state_dict(destination, prefix, keep_vars)
+        plans = self._packed_plans()
+        if len(plans):
+            destination[f"{prefix}plans"] = plans
 
     @property
     def cache(self) -> OperatorCache:
@@ -193,12 +217,6 @@ class OperatorStorage(Tensors):
         self.modes = modes
 
     @property
-    def _decided_points(self) -> Float[Tensor, "N n"]:
-        """The points that the plan was made at, or is made at, float64 on the CPU."""
-        held = tensors_of(self._decided_at).get("points")
-        return self.points.detach().cpu().double() if held is None else held
-
-    @property
     def _known_medium(self) -> MediumFields:
         """The medium; InputError where only the batch that the operator comes from knew it."""
         if self._in_medium and not tensors_of(self._medium):
@@ -277,7 +295,7 @@ class OperatorStorage(Tensors):
                     f"{len(theirs)} others; leave it out of the state to keep the one that is there"
                 )
         vectors = state_dict.get(f"{prefix}modes.eigenvectors")
-        self._plan = self._cache = None
+        self._plans, self._cache = state_dict.pop(f"{prefix}plans", []), None
         super()._load_from_state_dict(state_dict, prefix, *given)
         self.modes = Modes(None, self.mass)
         self._keep_basis(stored=vectors is not None, loaded=vectors)
