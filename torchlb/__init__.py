@@ -41,11 +41,11 @@ from torchlb.operator.connection import Connection
 from torchlb.operator.laplace_beltrami import LaplaceBeltrami
 from torchlb.operator.report import StencilReport
 from torchlb.operator.stencil_methods import Curvatures
-from torchlb.pde.geodesics import geodesic_distance
+from torchlb.pde.geodesics import geodesic_distance, logarithmic_map
 from torchlb.pde.heat import heat_flow, smooth
 from torchlb.pde.hodge import HodgeParts, hodge_decomposition
 from torchlb.pde.solves import implicit_step, poisson_solve
-from torchlb.pde.transport import logarithmic_map, parallel_transport, vector_heat_flow
+from torchlb.pde.transport import parallel_transport, vector_heat_flow
 from torchlb.spectral.eigenbasis import Eigenbasis
 from torchlb.spectral.signatures import (
     diffusion_distance,

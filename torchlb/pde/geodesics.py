@@ -1,27 +1,33 @@
-"""Geodesic distance: shortest paths along edges, straightened across the triangles between them.
+"""Geodesic distance: shortest paths along edges, straightened across triangles, and corrected by the curvature.
 
 The heat method (Crane, Weischedel, Wardetzky 2013) computes the distance in the least-squares sense, which smooths the
 cut locus, and its heat is negative at up to half of the points where triangles are obtuse. Updates across triangles
-(Novotni, Klein 2002) avoid both: their mean error is 0.2 to 0.6 of its on real shapes of 4.8k points.
+(Novotni, Klein 2002) avoid both: their mean error is 0.2 to 0.6 of its on real shapes of 4.8k points. They take wave
+fronts for circles around the source in the plane. Jacobi's equation has their radius on a curved surface, with which
+the order is two in place of one.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from scipy import sparse
 from scipy.sparse import csgraph
 from torch import Tensor
 
+from torchlb.errors import InputError
 from torchlb.geometry.neighbors import mesh_graph
+from torchlb.geometry.thresholds import SLIGHT
 from torchlb.linalg.checks import check_operator, check_sources, takes_arrays
-from torchlb.linalg.precision import NEGLIGIBLE
+from torchlb.linalg.precision import NEGLIGIBLE, TINY
 from torchlb.operator.laplace_beltrami import LaplaceBeltrami
 from torchlb.operator.through import without
+
+Polar = tuple[Float[np.ndarray, " N"], Float[np.ndarray, " N"]]
 
 FROM_MESH = ("mesh", "cotangent")
 """Sources of operators for which all edges are those of the faces."""
@@ -33,10 +39,10 @@ def geodesic_distance(
 ) -> Float[Tensor, " N"] | Float[Tensor, "N S"]:
     """Distance along the surface to the nearest of the sources, ℓ; infinite where no path leads to one.
 
-    On surfaces the error falls a little faster than the spacing: on a sphere of 2,000 vertices it is 0.4 % in the mean.
-    For several sources, the result is the least of their distances, with about the same error. It is never below the
-    straight line. On curves, in more dimensions, and without triangles, paths follow edges. Computed on the CPU,
-    without derivatives.
+    On smooth surfaces the error falls with the square of the spacing: on a sphere of 2,000 vertices it is 0.05 % in the
+    mean. Where triangles do not resolve the curvature, it falls like the spacing. For several sources, the result is
+    the least of their distances, with about the same error. It is never below the straight line. On curves, in more
+    dimensions, and without triangles, paths follow edges. Computed on the CPU, without derivatives.
 
     Parameters
     ----------
@@ -66,31 +72,111 @@ def geodesic_distance(
     check_operator(lb)
     some: Any = sources if each and len(sources) else [sources]  # pyright: ignore[reportArgumentType]
     starts = [check_sources(one, lb.num_points).numpy() for one in some]
-    points = np.ascontiguousarray(lb.points.detach().cpu().double().numpy())
-    row, col = _edges(lb)
-    length = _distances(points, row, col)
-    graph = sparse.csr_array((length, (row, col)), shape=lb.shape)
-    triangles = _triangles(lb, points) if lb.dim == 2 and len(row) else None
-    enough = NEGLIGIBLE * float(length.mean()) if len(row) else 0.0
-    found = [_distance(graph, points, triangles, start, enough) for start in starts]
+    found = [distance for distance, _ in _paths(lb, starts)]
     distance = torch.from_numpy(np.stack(found, 1) if each else found[0])
     return without(lb, distance.to(lb.mass), "distances")
 
 
-def _distance(
-    graph: Any, points: np.ndarray, triangles: Any, start: np.ndarray, enough: float
-) -> Float[np.ndarray, " N"]:
-    """Distance to the nearest of the points in `start`, along edges and then across triangles."""
-    distance, _, nearest = csgraph.dijkstra(
-        graph, indices=start, min_only=True, return_predecessors=True
-    )
-    if triangles is not None:
-        from torchlb.linalg import kernels
+@takes_arrays
+def logarithmic_map(
+    lb: LaplaceBeltrami, sources: int | Sequence[int] | Int[Tensor, " S"]
+) -> Float[Tensor, "N 2"] | Float[Tensor, "N 2 S"]:
+    """Normal coordinates of all points: the initial velocities, in the source's frame, of shortest paths in unit time.
 
-        foot = np.maximum(nearest, 0).astype(np.int64)  # arbitrary where no path leads to a source
-        order, fell = np.argsort(distance), np.ones(len(points), dtype=np.int64)
-        kernels.straighten(distance, foot, order, points, *triangles, fell, enough)
-    return distance
+    They are geodesic polar coordinates (Melvær, Reimers 2012): the distance, and the angle at the source, which
+    is carried along the paths of `geodesic_distance`. On smooth surfaces both are accurate to second order.
+
+    Parameters
+    ----------
+    lb
+        Operator of one surface or of a batch.
+    sources
+        Index of a point, or indices of several.
+
+    Returns
+    -------
+    (N, 2) for one source, (N, 2, S) for several. NaN where no path leads to the source; not smooth where shortest paths
+    meet. Without derivatives in the points.
+
+    Raises
+    ------
+    InputError
+        For indices out of range, and where there are no triangles.
+
+    Examples
+    --------
+    >>> from torchlb.surfaces import Sphere
+    >>> lb = LaplaceBeltrami.from_mesh(*Sphere().mesh(500))
+    >>> x = logarithmic_map(lb, 0)
+    >>> bool((x.norm(dim=1) - geodesic_distance(lb, 0)).abs().max() < 1e-9)
+    True
+    """
+    check_operator(lb)
+    index = check_sources(sources, lb.num_points)
+    if lb.dim != 2 or len(lb.faces) == 0:
+        raise InputError(
+            f"logarithmic_map: expected the operator of a surface with triangles, got {lb.dim} dimensions and "
+            f"{len(lb.faces)} cells"
+        )
+    distance, angle = (
+        np.stack(x, 1) for x in zip(*_paths(lb, index[:, None].numpy()), strict=True)
+    )
+    found = torch.from_numpy(np.stack([distance * np.cos(angle), distance * np.sin(angle)], 1))
+    found[index, :, torch.arange(len(index))] = 0.0
+    found = found if torch.as_tensor(sources).ndim else found[..., 0]
+    return without(lb, found.to(lb.points), "normal coordinates")
+
+
+def _paths(lb: LaplaceBeltrami, starts: Iterable[np.ndarray]) -> Iterator[Polar]:
+    """Polar coordinates for each set of sources: distance, and the angle in the frame of a single source, or NaN."""
+    points = np.ascontiguousarray(lb.points.detach().cpu().double().numpy())
+    row, col = _edges(lb)
+    length = _distances(points, row, col)
+    graph = sparse.csr_array((length, (row, col)), shape=lb.shape)
+    enough = NEGLIGIBLE * float(length.mean()) if len(row) else 0.0
+    on_triangles = lb.dim == 2 and len(row) > 0
+    triangles = _triangles(lb, points) if on_triangles else ()
+    curvature = _curvature(*triangles) if on_triangles else points[:0, 0]
+    for start in starts:
+        distance, _, nearest = csgraph.dijkstra(
+            graph, indices=start, min_only=True, return_predecessors=True
+        )
+        angle = np.full(len(points), np.nan)
+        if on_triangles:
+            from torchlb.linalg.kernels import bend, straighten
+
+            if len(start) == 1:
+                near = graph.indices[graph.indptr[start[0]] : graph.indptr[start[0] + 1]]
+                frame = lb.frames[int(start[0])].detach().cpu().double().numpy()
+                x, y = ((points[near] - points[start]) @ frame).T
+                angle[near] = np.arctan2(y, x)
+            foot = np.maximum(nearest, 0).astype(np.int64)  # arbitrary out of reach
+            order, fell = np.argsort(distance), np.ones(len(points), dtype=np.int64)
+            straighten(distance, foot, order, points, *triangles, fell, enough)
+            order, given, (result, *room) = (
+                np.argsort(distance),
+                angle.copy(),
+                np.empty((3, len(points))),
+            )
+            for again in (False, True):
+                bend(
+                    distance, foot, order, *triangles, curvature, again, given, angle, result, *room
+                )
+            distance = np.maximum(result, _distances(points, foot, slice(None)))
+        yield distance, angle
+
+
+def _curvature(first: np.ndarray, _: np.ndarray, sides: np.ndarray) -> Float[np.ndarray, " N"]:
+    """Gaussian curvature, 1/ℓ²: the angle defect over a third of the area. Not a number where the defect is large.
+
+    There triangles do not resolve the curvature, or the point is on the boundary. Arguments are those of `_triangles`.
+    """
+    to_j, to_k, base, height, _ = sides.T
+    angle = np.arctan2(base * height, (to_j**2 + to_k**2 - base**2) / 2)
+    of = np.repeat(np.arange(len(first) - 1), np.diff(first))
+    total, area = (np.bincount(of, x, len(first) - 1) for x in (angle, base * height / 6))
+    defect = 2 * np.pi - total
+    return np.where((abs(defect) <= SLIGHT) & (area > 0), defect / np.maximum(area, TINY), np.nan)
 
 
 def _edges(lb: LaplaceBeltrami) -> tuple[np.ndarray, np.ndarray]:
@@ -107,7 +193,7 @@ def _edges(lb: LaplaceBeltrami) -> tuple[np.ndarray, np.ndarray]:
     return row[row != column], column[row != column]
 
 
-def _distances(points: np.ndarray, a: np.ndarray, b: np.ndarray) -> np.ndarray:
+def _distances(points: np.ndarray, a: Any, b: Any) -> np.ndarray:
     return np.linalg.norm(points[a] - points[b], axis=1)
 
 

@@ -1,4 +1,4 @@
-"""Tangent fields: their heat flow, parallel transport, and the logarithmic map (`method.md`, section 15)."""
+"""Tangent fields: their heat flow, and parallel transport (`method.md`, section 15)."""
 
 from __future__ import annotations
 
@@ -111,35 +111,6 @@ def parallel_transport(
         lengths = lengths.clamp(size.amin(0), size.amax(0))
     moved = (direction * lengths[:, None]).to(vectors)
     return moved if given.ndim == 3 else moved[..., 0]
-
-
-@takes_arrays
-def logarithmic_map(
-    lb: LaplaceBeltrami, sources: int | Sequence[int] | Int[Tensor, " S"]
-) -> Float[Tensor, "N d"] | Float[Tensor, "N d S"]:
-    """Normal coordinates of all points: the initial velocities, in the source's frame, of shortest paths in unit time.
-
-    At a point at the distance r they are r times the direction of ∇(r²/2) there, in the parallel transport of the
-    frame. One map for one source, (N, d), maps (N, d, S) for several. Not smooth where shortest paths from a source
-    meet; NaN where no path leads to it. Errors as for `parallel_transport`; without derivatives in the points.
-
-    >>> from torchlb.surfaces import Sphere
-    >>> lb = LaplaceBeltrami.from_mesh(*Sphere().mesh(500))
-    >>> x = logarithmic_map(lb, 0)
-    >>> bool((x.norm(dim=1) - geodesic_distance(lb, 0)).abs().max() < 1e-9)
-    True
-    """
-    check_operator(lb)
-    index, dim = check_sources(sources, lb.num_points).to(lb.device), lb.dim
-    places = torch.arange(len(index)).to(index)
-    start = torch.zeros(lb.num_points, dim, len(index), dim, dtype=torch.float64).to(index.device)
-    start[index, :, places] = torch.eye(dim, dtype=torch.float64).to(start)
-    distance = geodesic_distance(lb, index, each=True).double()
-    frame = _directions(lb, start.flatten(2), _time(lb, distance)).unflatten(2, (-1, dim))
-    slope = lb.gradient(torch.where(distance.isfinite(), distance, 0.0).square() / 2)
-    local = normalize(torch.einsum("insd,ins->ids", frame, slope), dim=1, eps=TINY)
-    found = torch.where(distance == 0, 0.0, distance)[:, None] * local
-    return (found if torch.as_tensor(sources).ndim else found[..., 0]).to(lb.points)
 
 
 def _time(lb: LaplaceBeltrami, distance: Tensor) -> Float[Tensor, ""]:
