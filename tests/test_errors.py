@@ -455,6 +455,11 @@ SWAPPED = {
     "save_operator": lambda lb, v, path: torchlb.save_operator(path, lb),
     "load_operator": lambda lb, v, path: torchlb.load_operator(lb),
     "precompute_operators": lambda lb, v, path: torchlb.precompute_operators(path, [VERTICES]),
+    "plot_surface": lambda lb, v, path: torchlb.plot.plot_surface(VERTICES, v, FACES),
+    "plot_surface, operator": lambda lb, v, path: torchlb.plot.plot_surface(lb, FACES, v[:, 0]),
+    "plot_vectors": lambda lb, v, path: torchlb.plot.plot_vectors(VERTICES, v, FACES),
+    "to_trimesh": lambda lb, v, path: torchlb.interop.trimesh.to_trimesh(VERTICES),
+    "to_operator": lambda lb, v, path: torchlb.interop.pyg.to_operator(lb),
     "tangent layer": lambda lb, v, path: torchlb.TangentDiffusion(3)(lb, v),
 }
 
