@@ -10,25 +10,6 @@ from contextvars import ContextVar
 from pathlib import Path
 from typing import Any
 
-__all__ = [
-    "CacheWarning",
-    "DerivativeError",
-    "DiffusionError",
-    "EigenbasisError",
-    "InputError",
-    "InputTypeError",
-    "OperatorFileError",
-    "StabilityError",
-    "StabilityWarning",
-    "StencilError",
-    "TorchlbError",
-    "TorchlbWarning",
-    "as_given",
-    "first_few",
-    "renumbered",
-    "shown",
-    "warn",
-]
 HERE = str(Path(__file__).parent)
 
 
