@@ -2,6 +2,7 @@
 
 import re
 import warnings
+from functools import cache
 
 import numpy as np
 import pytest
@@ -454,14 +455,24 @@ SWAPPED = {
     "save_operator": lambda lb, v, path: torchlb.save_operator(path, lb),
     "load_operator": lambda lb, v, path: torchlb.load_operator(lb),
     "precompute_operators": lambda lb, v, path: torchlb.precompute_operators(path, [VERTICES]),
+    "plot_surface": lambda lb, v, path: torchlb.plot.plot_surface(VERTICES, v, FACES),
+    "plot_surface, operator": lambda lb, v, path: torchlb.plot.plot_surface(lb, FACES, v[:, 0]),
+    "plot_vectors": lambda lb, v, path: torchlb.plot.plot_vectors(VERTICES, v, FACES),
+    "to_trimesh": lambda lb, v, path: torchlb.interop.trimesh.to_trimesh(VERTICES),
+    "to_operator": lambda lb, v, path: torchlb.interop.pyg.to_operator(lb),
     "tangent layer": lambda lb, v, path: torchlb.TangentDiffusion(3)(lb, v),
 }
+
+
+@cache
+def first_order():
+    return LaplaceBeltrami.from_mesh(VERTICES, FACES, order=1)
 
 
 @pytest.mark.parametrize("name", SWAPPED)
 def test_a_wrong_order_of_arguments_is_an_error_of_input(unchecked, tmp_path, name):
     """It says in some lines what was expected, and prints no tensors."""
-    lb = LaplaceBeltrami.from_mesh(VERTICES, FACES, order=1)
+    lb = first_order()
     with pytest.raises(torchlb.InputError, match="expected") as told:
         SWAPPED[name](lb, VERTICES, tmp_path / "a.npz")
     assert len(str(told.value)) < 400

@@ -51,7 +51,6 @@ LAYERS = {
     "poisson block": lambda: PoissonBlock(CHANNELS),
     "poisson block, fields": lambda: PoissonBlock(CHANNELS, fields=True),
     "net": lambda: DiffusionNet(CHANNELS, 5, **SMALL),
-    "original net": lambda: DiffusionNet(CHANNELS, 5, method="spectral", **SMALL),
     "implicit net": lambda: DiffusionNet(CHANNELS, 5, block="implicit", **SMALL),
     "poisson net": lambda: DiffusionNet(CHANNELS, 5, block="poisson", **SMALL),
     "tangent net": lambda: DiffusionNet(CHANNELS, 5, tangent=True, **SMALL),
@@ -370,7 +369,7 @@ def compiled_as_one_graph():
     lb = LaplaceBeltrami.from_mesh(vertices.float(), faces, order=1)
     lb.eigenbasis(K)
     x = features(lb)
-    names = ["deflated", "spectral", "convolution", "gradients", "net", "original net"]
+    names = ["deflated", "spectral", "convolution", "gradients", "net"]
     functions = [partial(layer_of(name), lb=lb) for name in names]
     functions += [lb, lb.gradient, lambda f: lb.divergence(lb.gradient(f[:, 0]))]
     functions += [lambda f: lb.eigenbasis(K).from_basis(lb.eigenbasis(K).to_basis(f))]

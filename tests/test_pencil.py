@@ -1,7 +1,5 @@
 """Factors, block Lanczos and the eigenbasis of a symmetric pair (K, M)."""
 
-import sys
-
 import igl
 import numpy as np
 import pytest
@@ -68,15 +66,6 @@ def test_complex_systems_are_refused(unchecked):
     for call in (lambda: cholesky(1j * matrix), lambda: cholesky(matrix).solve(b)):
         with pytest.raises(InputError, match="expected real numbers"):
             call()
-
-
-def test_a_factor_does_without_cholespy(monkeypatch):
-    matrix, b = path_matrix(30, 1.0), torch.randn(30, 2, dtype=torch.float64)
-    solution = cholesky(matrix).solve(b)
-    monkeypatch.setitem(sys.modules, "cholespy", None)
-    factor = cholesky(matrix)
-    assert not factor.is_cholesky
-    torch.testing.assert_close(factor.solve(b), solution)
 
 
 def cycle_matrix(size):

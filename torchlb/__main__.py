@@ -31,8 +31,6 @@ from torchlb.pde import geodesics, heat
 from torchlb.plot.comparison import draw_comparison, spectrum_table
 from torchlb.version import __version__
 
-__all__ = ["main"]
-
 FILE = click.Path(exists=True, dir_okay=False, path_type=Path)
 FOLDER = click.Path(file_okay=False, path_type=Path)
 COUNT = click.IntRange(min=1)

@@ -12,25 +12,6 @@ from typing import Any
 
 import jaxtyping
 
-__all__ = [
-    "CacheWarning",
-    "DerivativeError",
-    "DiffusionError",
-    "EigenbasisError",
-    "InputError",
-    "InputTypeError",
-    "OperatorFileError",
-    "StabilityError",
-    "StabilityWarning",
-    "StencilError",
-    "TorchlbError",
-    "TorchlbWarning",
-    "as_given",
-    "first_few",
-    "renumbered",
-    "shown",
-    "warn",
-]
 HERE = str(Path(__file__).parent), str(Path(jaxtyping.__file__).parent)
 
 

@@ -16,7 +16,7 @@ def absorbing(pair: WeakPair, a: Float[Tensor, " N"], at_boundary: Bool[Tensor, 
     """Append R_ij = B_ij √(a_i a_j), a ≥ 0 at the boundary vertices, to the pair; return the pair itself where R = 0.
 
     R is positive semidefinite for every a ≥ 0, equals aB for constant a, and is as accurate as B where a is smooth and
-    positive. The linear pair takes B lumped to its row sums, but at least to a tenth of its absolute row sums.
+    positive. The P1 pair takes B lumped to its row sums, but at least to a tenth of its absolute row sums.
     """
     whole, near = pair.matrices, pair.linear
     if len(whole.values) < 3 or not (a[at_boundary] > 0).any():

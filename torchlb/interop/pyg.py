@@ -30,7 +30,7 @@ except ModuleNotFoundError as error:
         name=error.name,
     ) from error
 
-from torchlb.errors import InputError, TorchlbError, first_few, warn
+from torchlb.errors import InputError, TorchlbError, first_few, shown, warn
 from torchlb.io.cache import load_or_build
 from torchlb.linalg.csr import Csr
 from torchlb.operator.batching import join_states
@@ -197,8 +197,10 @@ def to_operator(data: Any) -> LaplaceBeltrami:
         For data without the keys, for `pos` changed since by more than a translation, and for nodes in another order,
         since transforms permute nodes, not matrices.
     """
-    if "lb_stencil_index" not in data:
-        raise InputError(f"expected data that went through LaplaceBeltramiTransform, got {data}")
+    if not hasattr(data, "keys") or "lb_stencil_index" not in data:
+        raise InputError(
+            f"expected data that went through LaplaceBeltramiTransform, got {shown(data)}"
+        )
     batched = isinstance(data, Batch)
     infos = [json.loads(text) for text in (data["lb_info"] if batched else [data["lb_info"]])]
     sizes = data["ptr"].diff() if batched else data.lb_mass.new_tensor([len(data.lb_mass)]).long()

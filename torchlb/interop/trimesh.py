@@ -9,6 +9,7 @@ from torch import Tensor
 
 from torchlb.errors import InputError
 from torchlb.io.files import SUFFIXES, arrays_of, read_shape
+from torchlb.linalg.checks import check_operator
 from torchlb.operator.dispatch import Operator, build_operator
 from torchlb.operator.laplace_beltrami import LaplaceBeltrami
 
@@ -62,6 +63,7 @@ def to_trimesh(lb: LaplaceBeltrami, faces: Any = None, **attributes: Any) -> Any
     """
     import trimesh
 
+    check_operator(lb)
     if lb.points.ndim != 2 or lb.points.shape[1] != 3:
         raise InputError(f"expected points in R³, got shape {tuple(lb.points.shape)}")
     arrays = {name: _array(value) for name, value in attributes.items()}

@@ -33,9 +33,9 @@ def factorized(matrix: sparse.csc_array, threshold: float) -> SuperLU:
 def cholesky(matrix: Any) -> Factor:
     """Factor of a sparse matrix, (N, N), scipy's or anything scipy accepts, for right-hand sides on any device.
 
-    CHOLMOD (`cholespy`) is 2.5 times faster than SuperLU, and 6 times in the solves. SuperLU takes over where cholespy
-    is not installed or the matrix is not symmetric and positive definite. InputError for a complex matrix or right-hand
-    side, and for a matrix that is singular, or so close to singular that the rounding of its entries decides.
+    CHOLMOD (`cholespy`) is 2.5 times faster than SuperLU, and 6 times in the solves. SuperLU takes over where the
+    matrix is not symmetric and positive definite. InputError for a complex matrix or right-hand side, and for a matrix
+    that is singular, or so close to singular that the rounding of its entries decides.
 
     >>> cholesky(sparse.diags_array([2.0, 4.0])).solve(torch.tensor([2.0, 2.0]))
     tensor([1.0000, 0.5000])
@@ -116,20 +116,14 @@ class Factor:
         return self._solvers[key]
 
     def _factored(self, device: torch.device) -> Any:
-        try:
-            if self.is_cholesky:
-                return _cholespy(self._matrix, device)
-        except (ImportError, ValueError):  # not installed; not positive definite
-            self.is_cholesky = False
+        from cholespy import CholeskySolverD, MatrixType  # pyright: ignore[reportAttributeAccessIssue]
+
+        if self.is_cholesky:
+            # As CSC the arrays are sorted and reallocated in place, at times wrongly; CSR, here the same, is copied.
+            arrays = self._matrix.indptr.astype(np.int32), self._matrix.indices.astype(np.int32)
+            parts = (torch.from_numpy(x).to(device) for x in (*arrays, self._matrix.data))
+            try:
+                return CholeskySolverD(len(arrays[0]) - 1, *parts, MatrixType.CSR)
+            except ValueError:  # not positive definite
+                self.is_cholesky = False
         return factorized(sparse.csc_array(self._matrix), 1e-1)
-
-
-def _cholespy(matrix: sparse.csr_array, device: torch.device) -> Any:
-    from cholespy import CholeskySolverD, MatrixType  # pyright: ignore[reportAttributeAccessIssue]
-
-    # As CSC the arrays are sorted and reallocated in place, at times wrongly; CSR, here the same, is copied.
-    indptr, indices = (
-        torch.from_numpy(t.astype(np.int32)) for t in (matrix.indptr, matrix.indices)
-    )
-    parts = (t.to(device) for t in (indptr, indices, torch.from_numpy(matrix.data)))
-    return CholeskySolverD(len(matrix.indptr) - 1, *parts, MatrixType.CSR)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import partial
+
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
@@ -32,22 +34,20 @@ def two_grid(product: Linear, sums: Float[Tensor, "N _"], coarse: Linear) -> Lin
     >>> cycle(diagonal).T.round(decimals=2)
     tensor([[0.95, 0.95]])
     """
-    scale = torch.where(sums > 0, 1 / sums, 0.0)
+    return partial(_cycle, product, torch.where(sums > 0, 1 / sums, 0.0), coarse)
 
-    def smooth(r: Tensor) -> Tensor:
-        p = scale * r
-        q = product(p).mul_(scale)
-        return p.mul_(FIRST).add_(q, alpha=SECOND)
 
-    def left(r: Tensor, x: Tensor) -> Tensor:
-        return product(x).neg_().add_(r)
+def _cycle(product: Linear, scale: Tensor, coarse: Linear, r: Tensor) -> Tensor:
+    x = _smoothed(product, scale, r)
+    x += coarse(product(x).neg_().add_(r))
+    return x.add_(_smoothed(product, scale, product(x).neg_().add_(r)))
 
-    def cycle(r: Tensor) -> Tensor:
-        x = smooth(r)
-        x += coarse(left(r, x))
-        return x.add_(smooth(left(r, x)))
 
-    return cycle
+def _smoothed(product: Linear, scale: Tensor, r: Tensor) -> Tensor:
+    """D⁻¹(a + b AD⁻¹)r."""
+    p = scale * r
+    q = product(p).mul_(scale)
+    return p.mul_(FIRST).add_(q, alpha=SECOND)
 
 
 def without_small_entries(

@@ -226,12 +226,7 @@ class PairSystem:
 
         The cycle is of K alone where M is small for the shortest time.
         """
-
-        def coarse(r: Tensor) -> Tensor:
-            x = near(r.double()).mul_(unit)
-            # Where K is singular, rounding adds large constants.
-            return (x - self._mean(self.ones_mass, x) if centered else x).to(r)
-
+        coarse = partial(self._coarse, unit, near, centered)
         if not self.smooths:
             return coarse
         shares = [share.float() for share in shares]
@@ -241,6 +236,11 @@ class PairSystem:
             terms = terms[:1]
         cycle = two_grid(partial(self._product, terms), sum(sums[1:], sums[0]), coarse)
         return lambda r: cycle(r.float()).to(r)
+
+    def _coarse(self, unit: Tensor, near: Linear, centered: bool, r: Tensor) -> Tensor:
+        """The factors' solve, less the large constants that rounding adds where K is singular."""
+        x = near(r.double()).mul_(unit)
+        return (x - self._mean(self.ones_mass, x) if centered else x).to(r)
 
     def _product(self, terms: list[tuple[Tensor, Matrix]], x: Tensor) -> Tensor:
         """Product of every column with its shares of the matrices."""

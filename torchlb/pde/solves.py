@@ -73,19 +73,7 @@ def implicit_step(
     >>> bool((u - vertices[:, 2] / 2).abs().max() < 1e-4)
     True
     """
-    check_tolerance(tolerance)
-    x = as_columns(f, lb)
-    dtype = torch.float64 if tolerance < SINGLE else compute_dtype(x, lb.mass)
-    columns, time = _columns(x, as_times(t, x, torch.float64), dtype)
-    lb = _with_conductivity(lb, conductivity)
-    given, fluxes = (_data(lb, d, n, f) for d, n in ((boundary_values, 0), (flux, 1)))
-    right = _product(lb, 1, columns)
-    if fluxes is not None:
-        right = right + time * lb.product("boundary_mass", fluxes)
-    if given is not None:
-        right = right - _product(lb, 1, given) - time * _product(lb, 0, given)
-    u = solved(lb, right, time, columns, given, tolerance)
-    return shaped_like(u, f).to(x.dtype)
+    return _solution(lb, f, t, boundary_values, flux, conductivity, tolerance)
 
 
 @takes_arrays
@@ -113,17 +101,35 @@ def poisson_solve(
     >>> bool((u - vertices[:, 2] / 2).abs().max() < 1e-4)
     True
     """
+    return _solution(lb, f, None, boundary_values, flux, conductivity, tolerance)
+
+
+def _solution(
+    lb: PairMethods,
+    f: Tensor,
+    t: float | Tensor | None,
+    boundary_values: Tensor | float | None,
+    flux: Tensor | float | None,
+    conductivity: Tensor | None,
+    tolerance: float,
+) -> Tensor:
+    """The implicit step for the times t, or the solution of the Poisson problem for t = None."""
     check_tolerance(tolerance)
     x = as_columns(f, lb)
-    columns, _ = _columns(x, None)
+    time, dtype = None, torch.float64
+    if t is not None:
+        time = as_times(t, x, dtype).repeat(len(x) if x.ndim == 3 else 1)
+        dtype = dtype if tolerance < SINGLE else compute_dtype(x, lb.mass)
+    columns = side_by_side(x.to(dtype))
     lb = _with_conductivity(lb, conductivity)
     given, fluxes = (_data(lb, d, n, f) for d, n in ((boundary_values, 0), (flux, 1)))
-    right = _product(lb, 1, columns)
+    right, share = _product(lb, 1, columns), 1.0 if time is None else time
     if fluxes is not None:
-        right = right + lb.product("boundary_mass", fluxes)
+        right = right + share * lb.product("boundary_mass", fluxes)
     if given is not None:
-        right = right - _product(lb, 0, given)
-    u = solved(lb, right, None, columns, given, tolerance)
+        right = right - share * _product(lb, 0, given)
+        right = right if time is None else right - _product(lb, 1, given)
+    u = solved(lb, right, time, columns, given, tolerance)
     return shaped_like(u, f).to(x.dtype)
 
 
@@ -154,7 +160,7 @@ def potential(
             lb.stencil.product(1 + c, weighted[..., c, :], transposed=True) for c in range(lb.dim)
         ]
     check_pair(lb)
-    columns, _ = _columns(sum(products[1:], products[0]), None)
+    columns = side_by_side(sum(products[1:], products[0]).double())
     if source is None and field is not None:
         source = field[..., 0, :]
     assert source is not None, "neither field nor source"
@@ -164,14 +170,6 @@ def potential(
     else:
         u = solved(lb, columns, None, torch.zeros_like(columns), None, tolerance)
     return shaped_like(u, source).to(source.dtype)
-
-
-def _columns(
-    x: Tensor, time: Tensor | None, dtype: torch.dtype = torch.float64
-) -> tuple[Tensor, Tensor]:
-    """The functions of a stack (B, N, C) as further columns, with a time for each."""
-    time = x.new_zeros(0) if time is None else time
-    return side_by_side(x.to(dtype)), time if x.ndim == 2 else time.repeat(len(x))
 
 
 def _with_conductivity(lb: PairMethods, conductivity: Tensor | None) -> PairMethods:
@@ -201,8 +199,7 @@ def _data(lb: PairMethods, data: Tensor | float | None, kind: int, f: Tensor) ->
         raise InputError(
             f"{name}: expected the shape of f, {tuple(f.shape)}, got {tuple(values.shape)}"
         ) from error
-    values = values[:, None] if f.ndim == 1 else values
-    columns, _ = _columns(values, None)
+    columns = side_by_side(values.double())
     columns = torch.where(counts[:, None], columns, 0.0)
     check_finite(columns, name)
     return columns

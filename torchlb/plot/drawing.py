@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from torchlb.errors import InputError
+from torchlb.errors import InputError, InputTypeError, shown
 
 Eye = tuple[float, float]
 """Elevation of the eye above the plane of x and y, and azimuth from x, in degrees."""
@@ -41,7 +41,12 @@ def axes_of(ax: Any) -> Any:
 
 
 def _numpy(values: Any) -> np.ndarray:
-    return torch.as_tensor(values).detach().cpu().double().numpy()
+    try:
+        return torch.as_tensor(values).detach().cpu().double().numpy()
+    except (TypeError, ValueError, RuntimeError) as error:
+        raise InputTypeError(
+            f"expected a tensor or array, got {shown(values)}; an operator has lb.points and lb.faces"
+        ) from error
 
 
 def cloud_of(points: Any, name: str = "points") -> np.ndarray:
