@@ -19,13 +19,7 @@ from torchlb.operator.batching import shapes_of
 from torchlb.operator.checks import check_tolerance
 from torchlb.operator.medium import elements_of
 from torchlb.operator.storage import OperatorStorage
-from torchlb.operator.through import (
-    BEYOND,
-    origins,
-    through_eigenpairs,
-    through_product,
-    without,
-)
+from torchlb.operator.through import BEYOND, origins, through_eigenpairs, through_product, without
 from torchlb.spectral.eigenbasis import (
     Eigenbasis,
     check_num_pairs,

@@ -8,7 +8,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from torchlb.galerkin.bilinear import BilinearForm
+from torchlb.galerkin.forms import BilinearForm
 from torchlb.linalg.exponential import chebyshev_vectors, poles, rational_coefficients
 from torchlb.linalg.once import once_differentiable
 from torchlb.operator.pair_methods import PairMethods
