@@ -14,6 +14,7 @@ from scipy import sparse
 from torch import Tensor
 
 from torchlb.galerkin.assembly import (
+    Elements,
     area_element,
     assembled,
     metric,
@@ -162,15 +163,10 @@ class PairPlan:
         self, form: BilinearForm, nodes: list[Tensor], points: Tensor, mesh: CurvedMesh
     ) -> Float[Tensor, ""]:
         """The value of a form of the boundary mass, as `boundary_mass` has it."""
-        cell, elements = self.curving.nodes.boundary()
-        shape = simplex(self.curving.nodes.dim - 1, self.curving.nodes.degree)
-        coarse = self.curving.coarse[cell]
-        g = metric(mesh.places, elements[~coarse], shape)
-        total = weighted_products(g, shape, outer(elements[~coarse], nodes, form.c), None).sum()
-        if mesh.cover is not None:
-            shares = boundary_shares(points, elements[coarse, :2], mesh.cover)
-            total = total + (shares[:, None] * form.w * form.u * form.c).sum()
-        return total
+        rim, shares = boundary_elements(points, self.curving, mesh)
+        blocks = outer(rim.nodes, nodes, form.c)
+        total = weighted_products(rim.metric, rim.element, blocks, None).sum()
+        return total + (shares[:, None] * form.w * form.u * form.c).sum()
 
     @property
     def counts(self) -> Int[Tensor, "4 N"]:
@@ -271,18 +267,23 @@ def positive_mass(
     return mass, torch.from_numpy(np.flatnonzero(lowered) - count)
 
 
-def boundary_mass(points: Tensor, plan: CurvingPlan, mesh: CurvedMesh, p: Any) -> Any:
-    """Boundary mass ∫ φ_i φ_j, 1 at the end of a curve, lumped at coarse triangles; None for a closed shape."""
-    nodes, shape = plan.nodes, simplex(plan.nodes.dim - 1, plan.nodes.degree)
-    cell, elements = nodes.boundary()
-    if len(cell) == 0:
-        return None
-    coarse = plan.coarse[cell]
-    size = area_element(metric(mesh.places, elements[~coarse], shape))
-    blocks = (shape.weights * size) @ squares(shape)
-    result = p.T @ summed(blocks, elements[~coarse], len(mesh.places)) @ p
-    result = (result + result.T) / 2
+def boundary_elements(
+    points: Points, plan: CurvingPlan, mesh: CurvedMesh
+) -> tuple[Elements, Float[Tensor, " N"]]:
+    """Elements along the boundary, and the lumped boundary mass of the vertices at coarse triangles."""
+    nodes, (cell, elements) = plan.nodes, plan.nodes.boundary()
+    coarse, shape = plan.coarse[cell], simplex(nodes.dim - 1, nodes.degree)
+    own, shares = elements[~coarse], torch.zeros_like(points[:, 0])
     if mesh.cover is not None:
         shares = boundary_shares(points, elements[coarse, :2], mesh.cover)
-        result = result + sparse.diags_array(shares.numpy(), format="csr")
-    return result
+    return Elements(own, metric(mesh.places, own, shape), shape), shares
+
+
+def boundary_mass(points: Points, plan: CurvingPlan, mesh: CurvedMesh, p: Any) -> Any:
+    """Boundary mass ∫ φ_i φ_j, 1 at the end of a curve, lumped at coarse triangles; None for a closed shape."""
+    if len(plan.nodes.boundary()[0]) == 0:
+        return None
+    rim, shares = boundary_elements(points, plan, mesh)
+    blocks = (rim.element.weights * area_element(rim.metric)) @ squares(rim.element)
+    result = p.T @ summed(blocks, rim.nodes, len(mesh.places)) @ p
+    return (result + result.T) / 2 + sparse.diags_array(shares.numpy(), format="csr")

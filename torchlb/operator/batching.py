@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from math import isnan
 from typing import Any
 
+import numpy as np
 import torch
 
 from torchlb.errors import InputError
@@ -106,9 +106,10 @@ def _joined_certificate(certificates: Sequence[dict[str, Any] | None]) -> dict[s
     known = [each for each in certificates if each is not None]
     if len(known) < len(certificates):
         return None
-    how: dict[str, Any] = {"holds": all, "min_pi": min, "max_s": _largest, "rounds": max}
+    how: dict[str, Any] = {
+        "holds": all,
+        "min_pi": min,
+        "max_s": lambda x: float(np.max(x)),
+        "rounds": max,
+    }
     return {key: how.get(key, sum)([each[key] for each in known]) for key in known[0]}
-
-
-def _largest(values: Sequence[float]) -> float:
-    return max(values, key=lambda x: (isnan(x), x))
