@@ -280,7 +280,7 @@ def test_a_batch_searches_nothing(monkeypatch):
     """The spectral radius comes with the data, and a batch joins them."""
     batch = Batch.from_data_list([LaplaceBeltramiTransform(order=1, k=4)(d) for d in DATA])
     expected = LaplaceBeltrami.batch([direct(i) for i in range(3)]).weak.radius
-    monkeypatch.setattr("torchlb.operator.parts.spectral_radius", None)
+    monkeypatch.setattr("torchlb.galerkin.matrices.spectral_radius", None)
     lb = to_operator(batch)
     assert lb.weak.radius == expected
     Diffusion(2, method="deflated", k=4)(torch.randn(batch.num_nodes, 2), lb.float())

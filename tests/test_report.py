@@ -9,6 +9,7 @@ import trimesh
 from torchlb import LaplaceBeltrami
 from torchlb.fits.rules import reference
 from torchlb.stencils.assemble import Stencils, assemble
+from torchlb.stencils.options import Options
 from torchlb.stencils.rows import Reason
 from torchlb.stencils.shape import mesh_shape
 from torchlb.surfaces import Sphere, Torus
@@ -185,7 +186,7 @@ def test_fewer_points_than_polynomials_have_low_order_rows():
     signs = [[1, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1]]
     points = torch.tensor(signs, dtype=torch.float64)
     faces = torch.tensor([[0, 1, 2], [0, 3, 1], [0, 2, 3], [1, 3, 2]])
-    rows = assemble(Stencils(mesh_shape(points, faces, 4), 3))
+    rows = assemble(Stencils(mesh_shape(points, faces, Options(3)), Options(3)))
     assert rows.order.tolist() == [0] * 4
     assert rows.reason.tolist() == [Reason.FEW] * 4
     torch.testing.assert_close(rows.off_diagonal_ratio, torch.ones(4).double())

@@ -31,6 +31,7 @@ from torchlb.geometry.frames import mesh_frames
 from torchlb.linalg.sparse import to_scipy
 from torchlb.stencils.assemble import Stencils, assemble
 from torchlb.stencils.conditions import Condition, condition_of, kind_of
+from torchlb.stencils.options import Options
 from torchlb.stencils.shape import mesh_shape
 from torchlb.surfaces import Sphere, UnitDisk
 
@@ -228,9 +229,10 @@ def test_from_neumann_to_dirichlet(a, bound):
 def test_low_order_rows_lose_through_their_share_of_the_boundary():
     """All of them, in the place of stencils: first eigenvalues to some percent, and none would be without."""
     vertices, faces = UnitDisk().mesh(700)
-    shape = mesh_shape(vertices, faces, 2, condition=Robin(A), progress=False)
+    options = Options(1, condition=Robin(A))
+    shape = mesh_shape(vertices, faces, options, progress=False)
     assert float(shape.boundary.sizes.sum()) == pytest.approx(2 * math.pi, rel=1e-2)
-    stencils = Stencils(shape, 1)
+    stencils = Stencils(shape, options)
     every = torch.arange(700)
     rows = stencils.rows(every, torch.full_like(every, len(stencils.candidates)))
     assert (rows.order == 0).all()
@@ -478,8 +480,9 @@ def test_another_condition_is_one_class(monkeypatch, tmp_path):
         assert relative(other.eigenbasis(6).eigenvalues, of_disk(6)) < 1e-3
         u = poisson_solve(other, torch.ones(700, dtype=torch.float64))
         assert largest(u - (1 - vertices.norm(dim=1) ** 2) / 4 - 1 / (2 * A)) < 1e-4
-    shape = mesh_shape(vertices, faces, 4, condition=skin, progress=False)
-    assert (assemble(Stencils(shape, 3), progress=False).order == 3).double().mean() > 0.95
+    options = Options(3, condition=skin)
+    shape = mesh_shape(vertices, faces, options, progress=False)
+    assert (assemble(Stencils(shape, options), progress=False).order == 3).double().mean() > 0.95
 
 
 def test_where_the_boundary_has_no_measure_it_is_refused():

@@ -22,18 +22,10 @@ from torchlb.linalg.precision import SINGLE
 class Weights:
     """Weights of the gradient, 1/ℓ, and of the Laplacian, 1/ℓ², at the centre of a batch of stencils, centre first.
 
-    Attributes
-    ----------
-    radius
-        ρ, ℓ, the distance of the farthest neighbour in local coordinates.
-    condition
-        That of `left_inverse`; above 1e10, or not finite, without full rank.
-    residual
-        Largest violation of the moment equations, in units of the largest right-hand side.
-    height_residual
-        Scatter of the heights about their fit, relative to the distances; 0 without heights.
-    slope
-        Degree of the gradient's fit where it has one of its own, else 0.
+    `radius` is ρ, ℓ, the distance of the farthest neighbour in local coordinates; `condition` that of `left_inverse`,
+    above 1e10, or not finite, without full rank; `residual` the largest violation of the moment equations, in units of
+    the largest right-hand side; `height_residual` the scatter of the heights about their fit, relative to the
+    distances, 0 without heights; `slope` the degree of the gradient's fit where it has one of its own, else 0.
     """
 
     gradient: Float[Tensor, "B K d"]

@@ -4,9 +4,8 @@ Decisions (`CurvingPlan`, `PairPlan`) are kept apart from what is evaluated at g
 elements on the reference simplex. `nodes`: the numbering of Lagrange nodes on a complex. `assembly`: K_FE and M_FE.
 `curving`: positions of the nodes on the surface, and which cells stay flat. `coarse`: triangles too coarse for the
 fits; `delaunay`: the intrinsic Delaunay tufted cover that replaces them. `prolongation`: P, from the vertices to the
-nodes. `boundary`: nodes on curves along the boundary of a surface, or on the boundary surface of a solid.
-`flips`: edge flips that remove folded triangles and slivers. `medium`: conductivity, density and potential. `forms`:
-PᵀK_FE P and PᵀM_FE P, in any medium; `bilinear`: what they do to two functions. `tangent`: matrices of tangent
-fields; `weak_gradient`: between these and functions. `pair`: an operator's matrices and positive lumped mass.
-`absorption`: the term that Robin conditions add to K.
+nodes. `boundary`: nodes on curves along the boundary of a surface, or on the boundary surface of a solid. `flips`:
+edge flips that remove folded triangles and slivers. `medium`: conductivity, density and potential. `forms`: PᵀK_FE P
+and PᵀM_FE P, in any medium, and bilinear forms; `matrices`: K, M and what is added to them. `tangent`: matrices of
+tangent fields, and between these and functions. `pair`: an operator's matrices and positive lumped mass.
 """

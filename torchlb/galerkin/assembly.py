@@ -6,6 +6,7 @@ A symmetric (d, d) matrix is stored as its upper triangle, row by row.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from itertools import combinations_with_replacement
 from typing import Any, NamedTuple
 
@@ -16,6 +17,7 @@ from scipy import sparse
 from torch import Tensor
 
 from torchlb.galerkin.elements import Element, simplex, subsets
+from torchlb.geometry.vectors import at
 from torchlb.linalg.precision import AT_ONCE
 
 
@@ -161,28 +163,6 @@ def squares(shape: Element) -> Float[Tensor, "Q n_times_n"]:
     return (shape.values[:, :, None] * shape.values[:, None, :]).flatten(1)
 
 
-def linear_blocks(
-    lengths: Float[Tensor, "T e"],
-    cells: Int[Tensor, "T corners"],
-    conductivity: Tensor | None = None,
-    density: Float[Tensor, " T"] | None = None,
-    lumped: Float[Tensor, " N"] | None = None,
-) -> Complex[Tensor, "T n_times_n"]:
-    """Element matrices K + iM of P1 elements on flat simplices with these edge lengths.
-
-    The conductivity, a number (T,) or a tensor as `in_cells` has it, (T, S), and the density are constant in each. With
-    factors `lumped` for the points, M is lumped in equal shares to the corners, times these.
-    """
-    shape, g = simplex(cells.shape[1] - 1, 1), flat_metric(lengths)
-    medium = [None if x is None else spread(x, shape) for x in (conductivity, density)]
-    blocks = element_matrices(spread(g, shape), shape, *medium)
-    if lumped is not None:
-        corners, total = cells.shape[1], blocks.imag.sum(1, keepdim=True)
-        blocks.imag.zero_()
-        blocks.imag[:, :: corners + 1] = lumped[cells] * total / corners
-    return blocks
-
-
 def spread(x: Tensor, shape: Element) -> Tensor:
     """A value for each cell, (T, …), at its Gauss points, (T, Q, …)."""
     return x[:, None].expand(-1, len(shape.weights), *x.shape[1:])
@@ -212,6 +192,62 @@ class ElementMatrices(NamedTuple):
         """M1 of the assembled matrix of `count` nodes."""
         shares = self.blocks.imag.unflatten(1, 2 * self.nodes.shape[1:]).sum(2).flatten()
         return shares.new_zeros(count).index_add_(0, self.nodes.flatten(), shares).numpy()
+
+
+@dataclass(frozen=True)
+class Elements:
+    """Elements of the cells of a complex, curved ones, or flat ones of degree 1, with their nodes and metric, ℓ².
+
+    A field of a medium has values at their Gauss points, (T, Q, …), of flat elements all equal; one left out is 1. Of
+    each element the fraction `share` is integrated, a number or (T,). `mix`, (T, F), has the share of each face of the
+    mesh in an element, None where elements are beside the faces. With factors `lumped` for the points, the mass is in
+    equal shares at the corners, times these.
+
+    """
+
+    nodes: Int[Tensor, "T n"]
+    metric: Float[Tensor, "T Q S"]
+    element: Element
+    share: Any = 1.0
+    mix: Any = None
+    lumped: Float[Tensor, " N"] | None = None
+
+    @classmethod
+    def flat(
+        cls, cells: Int[Tensor, "T corners"], lengths: Float[Tensor, "T e"], **others: Any
+    ) -> Elements:
+        """Linear elements on flat cells with these edge lengths, ℓ."""
+        shape = simplex(cells.shape[1] - 1, 1)
+        return cls(cells, spread(flat_metric(lengths), shape), shape, **others)
+
+    def slopes(self, places: Float[Tensor, "NX n"]) -> Float[Tensor, "T Q n d"]:
+        """Derivatives of the position in reference coordinates at the Gauss points."""
+        return torch.einsum("tnk,qnd->tqkd", at(places, self.nodes), self.element.gradients)
+
+    def conductivity(self, a: Tensor | None, places: Float[Tensor, "NX n"]) -> Tensor | None:
+        """A conductivity as `conductance` takes it; the plane of a cell is that of its nodes, whatever the metric."""
+        if a is None or a.ndim == 2:
+            return a
+        slopes = self.slopes(places)
+        if self.element.is_linear:
+            return spread(in_cells(a[:, 0], slopes[:, 0], self.metric[:, 0]), self.element)
+        return in_cells(a, slopes, self.metric)
+
+    def shared(self, x: Tensor) -> Tensor:
+        """Values of the elements, (T, …), times the fractions of these that are integrated."""
+        share = self.share
+        return (share.view(-1, *[1] * (x.ndim - 1)) if isinstance(share, Tensor) else share) * x
+
+    def matrices(
+        self, conductivity: Tensor | None = None, density: Float[Tensor, "T Q"] | None = None
+    ) -> ElementMatrices:
+        """Their matrices, of a conductivity as `conductance` takes it."""
+        blocks = element_matrices(self.metric, self.element, conductivity, density)
+        if self.lumped is not None:
+            corners, total = self.nodes.shape[1], blocks.imag.sum(1, keepdim=True)
+            blocks.imag.zero_()
+            blocks.imag[:, :: corners + 1] = self.lumped[self.nodes] * total / corners
+        return ElementMatrices(self.nodes, self.shared(blocks))
 
 
 def upper_congruence(p: Any, lots: Sequence[ElementMatrices]) -> sparse.csr_array:

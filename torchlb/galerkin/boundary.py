@@ -30,13 +30,11 @@ from torchlb.geometry.frames import mesh_frames
 from torchlb.geometry.local_fits import FitPlan, LocalFits
 from torchlb.geometry.neighbors import GraphNeighborhoods, mesh_graph
 from torchlb.geometry.thresholds import CREASE, FACTOR, KINK
+from torchlb.geometry.vectors import Points
 
 
 def boundary_nodes(
-    points: Float[Tensor, "N n"],
-    nodes: Nodes,
-    degrees: tuple[int, ...],
-    held: Bool[Tensor, " N"] | None = None,
+    points: Points, nodes: Nodes, degrees: tuple[int, ...], held: Bool[Tensor, " N"] | None = None
 ) -> BoundaryNodesPlan:
     """Plan the nodes along the boundary, for fits of functions of these degrees, best first.
 
@@ -65,7 +63,7 @@ class OnCurves(BoundaryNodesPlan):
     outer: Int[Tensor, " G"]
     curves: BoundaryCurves
 
-    def at(self, points: Float[Tensor, "N n"]) -> BoundaryNodes:
+    def at(self, points: Points) -> BoundaryNodes:
         """Positions and values of the boundary nodes."""
         nodes, outer = self.nodes, self.outer
         index, valid = self.curves.index, self.curves.valid
@@ -148,7 +146,7 @@ class OnSurface(BoundaryNodesPlan):
         here = torch.cat([on.flatten(), within.flatten()])
         return cls(nodes, vertices, cells, plan, curving, here, inside)
 
-    def at(self, points: Float[Tensor, "N n"]) -> BoundaryNodes:
+    def at(self, points: Points) -> BoundaryNodes:
         """Positions and values of the boundary nodes."""
         places, own = points[self.vertices], self.curving.nodes
         fits = LocalFits.at(self.fits, places, mesh_frames(places, self.cells))
@@ -175,7 +173,7 @@ class BoundaryCurves:
     index: Int[Tensor, "G S"]
     valid: Bool[Tensor, "G S"]
 
-    def arcs(self, points: Float[Tensor, "N n"]) -> Float[Tensor, "G S"]:
+    def arcs(self, points: Points) -> Float[Tensor, "G S"]:
         """Arc length of these vertices from the first end of the edge, ℓ."""
         index, steps = self.index, self.index.shape[1] // 2 - 1
         arcs = []
@@ -197,9 +195,7 @@ def lagrange(
     return (to / gap[:, None]).prod(-1) * valid[:, None]
 
 
-def boundary_curves_plan(
-    points: Float[Tensor, "N n"], edges: Int[Tensor, "G 2"], width: int
-) -> BoundaryCurves:
+def boundary_curves_plan(points: Points, edges: Int[Tensor, "G 2"], width: int) -> BoundaryCurves:
     """Plan curves through `width` vertices, fewer near corners, over the boundary edges `edges`."""
     mate = _mates(points, edges)
     walks = [_walk(edges, mate, side, width - 2) for side in (0, 1)]
@@ -223,7 +219,7 @@ def boundary_curves_plan(
         curves.valid[steep, (distance * curves.valid)[steep].argmax(1)] = False
 
 
-def _mates(points: Float[Tensor, "N n"], edges: Int[Tensor, "G 2"]) -> Int[Tensor, " two_G"]:
+def _mates(points: Points, edges: Int[Tensor, "G 2"]) -> Int[Tensor, " two_G"]:
     """Edge end that smoothly continues each edge end, −1 for none; end s of edge e has number e + G s."""
     count = len(edges)
     vertex = torch.cat([edges[:, 0], edges[:, 1]])

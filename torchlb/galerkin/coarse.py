@@ -13,11 +13,11 @@ from torchlb.geometry.complex import edges_of
 from torchlb.geometry.fit_search import IN_ROWS
 from torchlb.geometry.local_fits import FitPlan
 from torchlb.geometry.thresholds import CREASE, FACTOR, KINK
-from torchlb.geometry.vectors import at
+from torchlb.geometry.vectors import Points, at
 from torchlb.linalg.precision import SINGLE, rows_at_once
 
 
-def with_area(points: Float[Tensor, "N n"], faces: Int[Tensor, "F 3"]) -> Bool[Tensor, " F"]:
+def with_area(points: Points, faces: Int[Tensor, "F 3"]) -> Bool[Tensor, " F"]:
     """Mask of triangles that drops boundary slivers of rounding height, unless a vertex would lose its last one."""
     kept, count = torch.ones(len(faces), dtype=torch.bool), len(points)
     corners = at(points, faces)
@@ -39,18 +39,13 @@ def with_area(points: Float[Tensor, "N n"], faces: Int[Tensor, "F 3"]) -> Bool[T
 
 
 def coarse_triangles(
-    points: Float[Tensor, "N n"],
-    nodes: Nodes,
-    fits: FitPlan,
-    free: Bool[Tensor, " E"],
+    points: Points, nodes: Nodes, fits: FitPlan, free: Bool[Tensor, " E"]
 ) -> Bool[Tensor, " F"]:
     """Triangles that lie along the free boundary, or among creases, boundary and vertices without a fit only."""
     return lying_triangles(points, nodes, free) | _without_inside(points, nodes, fits)
 
 
-def lying_triangles(
-    points: Float[Tensor, "N n"], nodes: Nodes, free: Bool[Tensor, " E"]
-) -> Bool[Tensor, " F"]:
+def lying_triangles(points: Points, nodes: Nodes, free: Bool[Tensor, " E"]) -> Bool[Tensor, " F"]:
     """Triangles with an obtuse angle opposite a free boundary edge, or opposite an edge of another such triangle.
 
     The angle opposite an edge without length counts as obtuse, so that a chain of such triangles may lead through
@@ -106,9 +101,7 @@ def _around(nodes: Nodes, values: Shaped[Tensor, " N"]) -> Shaped[Tensor, " N"]:
     return total
 
 
-def boundary_shares(
-    points: Float[Tensor, "N n"], ends: Int[Tensor, "G 2"], cover: Cover
-) -> Float[Tensor, " N"]:
+def boundary_shares(points: Points, ends: Int[Tensor, "G 2"], cover: Cover) -> Float[Tensor, " N"]:
     """Lumped boundary mass of coarse triangles at the vertices, ℓ; its sum is the length of their boundary edges.
 
     An edge of the cover that joins a vertex to its own copy crosses a boundary edge, half its length away from the

@@ -33,6 +33,11 @@ class Element(NamedTuple):
         """Dimension d."""
         return self.gradients.shape[2]
 
+    @property
+    def is_linear(self) -> bool:
+        """Whether the degree is 1."""
+        return self.values.shape[1] == self.dim + 1
+
 
 @cache
 def subsets(dim: int, size: int) -> tuple[tuple[int, ...], ...]:

@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from torchlb.galerkin.delaunay import apart
+from torchlb.geometry.complex import edges_of
 from torchlb.geometry.frames import vertex_normals
 from torchlb.geometry.thresholds import CREASE
 from torchlb.geometry.vectors import dot
@@ -91,29 +92,22 @@ def _flips(
     for _ in range(2):  # every face that may have the new edge of a flip
         around = _touching(faces, faces[around])
     faces, bad = faces[around], torch.searchsorted(around, bad)
-    count = len(faces)
-    half = torch.cat([faces[:, [k, (k + 1) % 3]] for k in range(3)])  # h is of face h mod F
-    opposite = torch.cat([faces[:, 2], faces[:, 0], faces[:, 1]])
-    keys = _keys(half[:, 0], half[:, 1], size)
-    unique, edge, uses = torch.unique(keys, return_inverse=True, return_counts=True)
-    order = edge.argsort(stable=True)
-    first = uses.cumsum(0) - uses
-    twin = torch.full_like(edge, -1)
-    two = first[uses == 2]
-    twin[order[two]], twin[order[two + 1]] = order[two + 1], order[two]
-    sides = (bad[:, None] + count * torch.arange(3)).flatten()
+    edges, corners = edges_of(faces.numpy(), size), faces.flatten()
+    start, end, one, two = (torch.from_numpy(x) for x in (*edges.ends, *edges.twins))
+    twin = torch.full_like(corners, -1)
+    twin[one], twin[two] = two, one
+    sides = (3 * bad[:, None] + torch.tensor([2, 0, 1])).flatten()
     sides = sides[twin[sides] >= 0]
-    other = twin[sides]
-    c, d = opposite[sides], opposite[other]
-    known = torch.isin(_keys(c, d, size), torch.cat([unique, gone]))
-    wound = half[sides, 0] == half[other, 1]
-    keep = wound & (c != d) & ~known
-    sides, other, c, d = sides[keep], other[keep], c[keep], d[keep]
-    if len(sides) == 0:
+    c, d = corners[sides], corners[twin[sides]]
+    there = torch.from_numpy(edges.find(c.numpy(), d.numpy())[1] > 0)
+    wound = start[sides] == end[twin[sides]]
+    keep = wound & (c != d) & ~there & ~torch.isin(_keys(c, d, size), gone)
+    if not keep.any():
         return None
-    a, b = half[sides].unbind(1)
+    sides, c, d = sides[keep], c[keep], d[keep]
+    a, b = start[sides], end[sides]
     after = torch.stack([torch.stack([c, d, b], 1), torch.stack([d, c, a], 1)], dim=1)
-    return around[sides % count], around[other % count], after
+    return around[sides // 3], around[twin[sides] // 3], after
 
 
 def _independent(

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from torchlb.galerkin.elements import facet_nodes, inner, subsets
 from torchlb.geometry.boundary import sub_simplices
-from torchlb.geometry.vectors import at
+from torchlb.geometry.vectors import Points, at
 
 
 @dataclass(frozen=True)
@@ -72,7 +72,7 @@ class Nodes:
         """Sub-simplices of dimension 2 and higher, cells included."""
         return [self.sides[size] for size in range(3, self.dim + 2)]
 
-    def lengths(self, points: Float[Tensor, "N n"]) -> Float[Tensor, "F e"]:
+    def lengths(self, points: Points) -> Float[Tensor, "F e"]:
         """Edge lengths of each cell, ℓ."""
         ends = at(points, self.edges)
         return (ends[:, 1] - ends[:, 0]).norm(dim=1)[self.edge]

@@ -14,6 +14,7 @@ from scipy import sparse
 from torch import Tensor
 
 from torchlb.galerkin.assembly import (
+    Elements,
     area_element,
     assembled,
     metric,
@@ -21,37 +22,20 @@ from torchlb.galerkin.assembly import (
     summed,
     upper_congruence,
 )
-from torchlb.galerkin.bilinear import BilinearForm, outer, weighted_products
 from torchlb.galerkin.boundary import boundary_nodes
 from torchlb.galerkin.coarse import boundary_shares
 from torchlb.galerkin.curving import CurvedMesh, CurvingPlan, curve
 from torchlb.galerkin.elements import simplex
-from torchlb.galerkin.forms import Forms
+from torchlb.galerkin.forms import BilinearForm, Forms, outer, weighted_products
+from torchlb.galerkin.matrices import PairMatrices
 from torchlb.galerkin.medium import Medium
 from torchlb.galerkin.nodes import lagrange_nodes
 from torchlb.galerkin.prolongation import prolonged
 from torchlb.geometry.local_fits import FitPlan, LocalFits
 from torchlb.geometry.numbering import Numbering
+from torchlb.geometry.vectors import Points
+from torchlb.linalg.csr import Csr
 from torchlb.linalg.precision import LOW
-from torchlb.linalg.sparse import values_on
-
-
-@dataclass(frozen=True)
-class SparsePair:
-    """K and M, and B on a shape with a boundary, on one CSR pattern with ascending columns.
-
-    On a surface stiffness has no unit, mass that of ℓ², and boundary mass that of ℓ.
-    """
-
-    crow: Int[Tensor, " N_plus_1"]
-    col: Int[Tensor, " nnz"]
-    values: Float[Tensor, "terms nnz"]
-
-    def beside(self, others: Sequence[Any], number: np.ndarray | None = None) -> SparsePair:
-        """The pair with other matrices on its pattern, whose rows have these numbers here."""
-        place = self.crow.numpy(), self.col.numpy()
-        extra = [torch.from_numpy(values_on(*place, other, number))[None] for other in others]
-        return replace(self, values=torch.cat([self.values, *extra]))
 
 
 @dataclass(frozen=True)
@@ -92,23 +76,11 @@ class Pattern:
         """The values of the full matrix from those of the upper triangle."""
         return upper.copy().take(self.order, mode="clip")  # this mode is not buffered
 
-    def pair(self, upper: Any) -> SparsePair:
+    def pair(self, upper: Any) -> Csr:
         """Unpack K + iM into real matrices, rows of K summing to zero."""
         values = np.stack([self.whole(upper.data.real), self.whole(upper.data.imag)])
         values[0, self.diagonal] -= np.add.reduceat(values[0], self.crow.numpy()[:-1])
-        return SparsePair(self.crow, self.col, torch.from_numpy(values))
-
-
-@dataclass(frozen=True)
-class WeakPair:
-    """The pair (K, M), that of P1 elements near it, None where both are the same, and the lumped mass.
-
-    The mass is positive and sums to the area, ℓ^d; None for that of the operator's shape.
-    """
-
-    matrices: SparsePair
-    linear: SparsePair | None = None
-    mass: Float[Tensor, " N"] | None = None
+        return Csr(self.crow, self.col, torch.from_numpy(values))
 
 
 ELEMENTS = {1: (2, (2,)), 2: (2, (2,)), 3: (2, (3, 2)), 4: (3, (4, 2)), 5: (4, (6, 4, 2))}
@@ -135,7 +107,7 @@ class PairPlan:
 
     @cached_property
     def patterns(self) -> dict[str, Pattern]:
-        """Patterns of the matrices evaluated so far, by their names in `WeakPair`."""
+        """Patterns of the matrices evaluated so far, "whole" and "linear"."""
         return {}
 
     def forms(
@@ -146,14 +118,17 @@ class PairPlan:
         rest = mesh, self.stars, self.shares
         return Forms.curved(self.fits, fits, self.curving, *rest, prolong=prolong)
 
-    def at(self, fits: LocalFits, numbering: Numbering) -> tuple[PairPlan, WeakPair]:
-        """Weak pair from the fits at given points, in the user's numbers.
+    def at(
+        self, fits: LocalFits, numbering: Numbering
+    ) -> tuple[PairPlan, PairMatrices, Float[Tensor, " N"]]:
+        """Weak pair and lumped mass from the fits at given points, in the user's numbers and in those of the plan.
 
-        The plan returned with it also has the rows of P that a positive lumped mass wants lowered at these points.
+        The plan returned with them also has the rows of P that a positive lumped mass wants lowered at these points.
         """
         mesh = self.curving.at(fits.points, self.fits, fits)
-        pair, lowered = assembled_pair(self, fits, mesh, numbering, self.patterns)
-        return (self if len(lowered) == len(self.lowered) else replace(self, lowered=lowered)), pair
+        pair, mass, lowered = assembled_pair(self, fits, mesh, numbering, self.patterns)
+        plan = self if len(lowered) == len(self.lowered) else replace(self, lowered=lowered)
+        return plan, pair, mass
 
     def bilinear(
         self, fits: LocalFits, forms: Sequence[BilinearForm], medium: Medium
@@ -188,15 +163,10 @@ class PairPlan:
         self, form: BilinearForm, nodes: list[Tensor], points: Tensor, mesh: CurvedMesh
     ) -> Float[Tensor, ""]:
         """The value of a form of the boundary mass, as `boundary_mass` has it."""
-        cell, elements = self.curving.nodes.boundary()
-        shape = simplex(self.curving.nodes.dim - 1, self.curving.nodes.degree)
-        coarse = self.curving.coarse[cell]
-        g = metric(mesh.places, elements[~coarse], shape)
-        total = weighted_products(g, shape, outer(elements[~coarse], nodes, form.c), None).sum()
-        if mesh.cover is not None:
-            shares = boundary_shares(points, elements[coarse, :2], mesh.cover)
-            total = total + (shares[:, None] * form.w * form.u * form.c).sum()
-        return total
+        rim, shares = boundary_elements(points, self.curving, mesh)
+        blocks = outer(rim.nodes, nodes, form.c)
+        total = weighted_products(rim.metric, rim.element, blocks, None).sum()
+        return total + (shares[:, None] * form.w * form.u * form.c).sum()
 
     @property
     def counts(self) -> Int[Tensor, "4 N"]:
@@ -210,7 +180,7 @@ class PairPlan:
 
 
 def mesh_pair(
-    points: Float[Tensor, "N n"],
+    points: Points,
     cells: Int[Tensor, "F corners"],
     fit_plan: FitPlan,
     fits: LocalFits,
@@ -220,8 +190,8 @@ def mesh_pair(
     held: Bool[Tensor, " N"] | None = None,
     shares: Float[Tensor, " F"] | None = None,
     numbering: Numbering | None = None,
-) -> tuple[PairPlan, WeakPair]:
-    """Weak pair of a mesh of d-simplices, from the fits at its vertices, with elements of degree r ≥ 2.
+) -> tuple[PairPlan, PairMatrices, Float[Tensor, " N"]]:
+    """Plan, weak pair and lumped mass of a mesh of d-simplices, from fits at its vertices, by elements of degree ≥ 2.
 
     K and M are symmetric, K1 = 0, K ≥ 0 and M > 0 whatever the fits are, since the rows of P sum to one and P has full
     column rank. `degrees` lists the degrees of the fits of functions, best first; `held` marks vertices with a
@@ -232,8 +202,8 @@ def mesh_pair(
     curving, *mesh = curve(points, fit_plan, fits, nodes, boundary, held)
     stars = cells[:0] if stars is None else stars
     plan = PairPlan(fit_plan, curving, stars, shares, torch.zeros(0, dtype=torch.int64))
-    pair, lowered = assembled_pair(plan, fits, mesh.pop(), numbering, {})  # keeps no reference
-    return replace(plan, lowered=lowered), pair
+    found = assembled_pair(plan, fits, mesh.pop(), numbering, {})  # keeps no reference
+    return replace(plan, lowered=found[2]), *found[:2]
 
 
 def assembled_pair(
@@ -242,8 +212,8 @@ def assembled_pair(
     mesh: CurvedMesh,
     numbering: Numbering | None,
     patterns: dict[str, Pattern],
-) -> tuple[WeakPair, Int[Tensor, " L"]]:
-    """Assemble the matrices in the user's numbers and the lumped mass; return also the rows of P lowered for it.
+) -> tuple[PairMatrices, Float[Tensor, " N"], Int[Tensor, " L"]]:
+    """Assemble the matrices in the user's numbers, and the lumped mass; return also the rows of P lowered for it.
 
     Missing `patterns` are computed and added.
     """
@@ -251,7 +221,7 @@ def assembled_pair(
     p, count = forms.prolongation, len(fits.points)
     given = torch.arange(count) if numbering is None else numbering.given
     boundary = boundary_mass(fits.points, plan.curving, mesh, p)
-    own, linear, *flats = forms.curved_elements(), forms.linear_elements(), *forms.flat_elements()
+    own, linear, *flats = (lot.matrices() for lot in (forms.lots[0], forms.linear, *forms.lots[1:]))
     del forms, mesh  # some of these are as large as the pair
     fits.let_go()
     weights = own.row_sums(p.shape[0])
@@ -260,20 +230,17 @@ def assembled_pair(
     near, upper = assembled([linear, *flats], count), upper_congruence(p, [own, *flats])
     del p, own, linear, flats
     found = {}
-    for name, matrix in {"linear": near, "matrices": upper}.items():
+    for name, matrix in {"linear": near, "whole": upper}.items():
         if name not in patterns or not patterns[name].is_of(matrix):
             patterns[name] = Pattern.of(matrix, given)
         found[name] = patterns[name].pair(matrix)
-    if boundary is not None:
-        found["matrices"] = found["matrices"].beside([boundary], given.numpy())
-    return WeakPair(**found, mass=torch.from_numpy(mass)), lowered
+    whole = found["whole"].beside([] if boundary is None else [boundary], given.numpy())
+    matrices = PairMatrices(whole.crow, whole.col, whole.values, found["linear"])
+    return matrices, torch.from_numpy(mass), lowered
 
 
 def positive_mass(
-    p: Any,
-    weights: Float[np.ndarray, " NX"],
-    plan: PairPlan,
-    linear: Float[np.ndarray, " N"],
+    p: Any, weights: Float[np.ndarray, " NX"], plan: PairPlan, linear: Float[np.ndarray, " N"]
 ) -> tuple[Float[np.ndarray, " N"], Int[Tensor, " L"]]:
     """Lumped mass Pᵀw, w = M_FE 1: quadrature weights of high order at the vertices, which sum to the area.
 
@@ -300,18 +267,23 @@ def positive_mass(
     return mass, torch.from_numpy(np.flatnonzero(lowered) - count)
 
 
-def boundary_mass(points: Tensor, plan: CurvingPlan, mesh: CurvedMesh, p: Any) -> Any:
-    """Boundary mass ∫ φ_i φ_j, 1 at the end of a curve, lumped at coarse triangles; None for a closed shape."""
-    nodes, shape = plan.nodes, simplex(plan.nodes.dim - 1, plan.nodes.degree)
-    cell, elements = nodes.boundary()
-    if len(cell) == 0:
-        return None
-    coarse = plan.coarse[cell]
-    size = area_element(metric(mesh.places, elements[~coarse], shape))
-    blocks = (shape.weights * size) @ squares(shape)
-    result = p.T @ summed(blocks, elements[~coarse], len(mesh.places)) @ p
-    result = (result + result.T) / 2
+def boundary_elements(
+    points: Points, plan: CurvingPlan, mesh: CurvedMesh
+) -> tuple[Elements, Float[Tensor, " N"]]:
+    """Elements along the boundary, and the lumped boundary mass of the vertices at coarse triangles."""
+    nodes, (cell, elements) = plan.nodes, plan.nodes.boundary()
+    coarse, shape = plan.coarse[cell], simplex(nodes.dim - 1, nodes.degree)
+    own, shares = elements[~coarse], torch.zeros_like(points[:, 0])
     if mesh.cover is not None:
         shares = boundary_shares(points, elements[coarse, :2], mesh.cover)
-        result = result + sparse.diags_array(shares.numpy(), format="csr")
-    return result
+    return Elements(own, metric(mesh.places, own, shape), shape), shares
+
+
+def boundary_mass(points: Points, plan: CurvingPlan, mesh: CurvedMesh, p: Any) -> Any:
+    """Boundary mass ∫ φ_i φ_j, 1 at the end of a curve, lumped at coarse triangles; None for a closed shape."""
+    if len(plan.nodes.boundary()[0]) == 0:
+        return None
+    rim, shares = boundary_elements(points, plan, mesh)
+    blocks = (rim.element.weights * area_element(rim.metric)) @ squares(rim.element)
+    result = p.T @ summed(blocks, rim.nodes, len(mesh.places)) @ p
+    return (result + result.T) / 2 + sparse.diags_array(shares.numpy(), format="csr")

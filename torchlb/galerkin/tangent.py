@@ -1,4 +1,4 @@
-"""Tangent fields on the elements: the connection Laplacian by matrices of functions (`method.md`, section 15).
+"""Tangent fields on the elements (`method.md`, section 15): connection Laplacian, and gradients in the weak form.
 
 A tangent field has the components c in the frames E of the vertices, and is the vector field Ec of space, prolonged
 component by component. With the projector Π onto the tangent plane its covariant derivative is Π∇ũ, so that
@@ -25,22 +25,22 @@ from torch import Tensor
 
 from torchlb.galerkin.assembly import (
     ElementMatrices,
+    Elements,
+    area_element,
     conductance,
-    flat_metric,
     gradient_products,
     spread,
+    summed,
 )
-from torchlb.galerkin.bilinear import BilinearForm
-from torchlb.galerkin.elements import Element, simplex
-from torchlb.galerkin.forms import Forms, cell_mean
+from torchlb.galerkin.forms import BilinearForm, Forms, times
 from torchlb.galerkin.medium import orthonormal
 from torchlb.galerkin.pair import Pattern
-from torchlb.geometry.vectors import at, dot
+from torchlb.geometry.vectors import Frames, at, dot
 from torchlb.linalg.csr import Csr
 from torchlb.linalg.sparse import values_on
 
 
-def in_space(forms: Sequence[BilinearForm], frames: Float[Tensor, "N n d"]) -> list[BilinearForm]:
+def in_space(forms: Sequence[BilinearForm], frames: Frames) -> list[BilinearForm]:
     """Forms of the components (N d, C) of tangent fields as forms of functions, differentiable in the frames."""
     known: dict[int, tuple[Tensor, ...]] = {}
     for f in (f for form in forms for f in (form.w, form.u)):
@@ -73,8 +73,8 @@ class _Part(NamedTuple):
 def tangent_matrices(
     forms: Forms,
     conductivity: list[Tensor] | None,
-    frames: Float[Tensor, "N n d"],
-    others: tuple[Csr, Csr | None],
+    frames: Frames,
+    others: Sequence[Csr],
     *,
     hodge: bool = False,
 ) -> list[Csr]:
@@ -86,41 +86,45 @@ def tangent_matrices(
     axes = range(frames.shape[1])
     parts = [_Part(k, m, False) for k, m in combinations_with_replacement(axes, 2)]
     parts += [_Part(k, m, True) for k, m in combinations(axes, 2)] if hodge else []
-    curved, linear, *flats = _elements(forms, conductivity)
-    same: Any = sparse.eye_array(len(forms.points), format="csr")
-    found = []
-    for p, own, other in zip((forms.prolongation, same), (curved, linear), others, strict=True):
-        if other is not None:
-            upper, values = _assembled(forms, p, [own, *flats], parts)
-            found.append(_framed(upper, values, forms.given, frames, other))
+    tangents, found = forms.tangents(), []
+    kinds = [(forms.prolongation, forms.lots, tangents, conductivity)]
+    if len(others) > 1:
+        same, shape = sparse.eye_array(len(forms.given), format="csr"), forms.linear.element
+        flat = orthonormal(forms.flattened(tangents)[0][:, 0])
+        lots, tangents = [forms.linear, *forms.lots[1:]], [spread(flat, shape), *tangents[1:]]
+        kinds.append((same, lots, tangents, conductivity and forms.flattened(conductivity)))
+    for (p, lots, tangents, kappa), other in zip(kinds, others, strict=True):
+        elements = [
+            _Elements(lot, lot.conductivity(a, forms.places), e)
+            for lot, a, e in zip(lots, kappa or [None] * len(lots), tangents, strict=True)
+        ]
+        upper, values = _assembled(forms, p, elements, parts)
+        found.append(_framed(upper, values, forms.given, frames, other))
     return found
 
 
 @dataclass(frozen=True)
 class _Elements:
-    """Elements of functions, orthonormal tangent vectors at their Gauss points, and the share of each that counts."""
+    """Elements of functions, a conductivity, and orthonormal tangent vectors at their Gauss points."""
 
-    nodes: Int[Tensor, "T nodes"]
-    metric: Float[Tensor, "T Q S"]
-    element: Element
+    lot: Elements
     conductivity: Tensor | None
     tangents: Float[Tensor, "T Q n d"]
-    share: Any
 
     @cached_property
     def covariant(self) -> tuple[Float[Tensor, "T Q S"], Float[Tensor, "Q S n_times_n"]]:
         """The element matrices of S_kl are sums of products of these, and of Π_kl."""
-        slopes = conductance(self.metric, self.conductivity)
-        return self.share * self.element.weights[:, None] * slopes, gradient_products(self.element)
+        shape, slopes = self.lot.element, conductance(self.lot.metric, self.conductivity)
+        return self.lot.shared(shape.weights[:, None] * slopes), gradient_products(shape)
 
     @cached_property
     def turning(self) -> tuple[Float[Tensor, "T Q 1"], Float[Tensor, "Q 1 n_times_n"]]:
         """The same with ω_kl."""
-        kappa = self.conductivity
-        kappa = torch.ones_like(self.metric[..., 0]) if kappa is None else kappa
-        one, two = self.element.gradients.unbind(-1)
+        shape, kappa = self.lot.element, self.conductivity
+        kappa = torch.ones_like(self.lot.metric[..., 0]) if kappa is None else kappa
+        one, two = shape.gradients.unbind(-1)
         cross = one[:, :, None] * two[:, None]
-        slopes = self.share * (self.element.weights * kappa)[..., None]
+        slopes = self.lot.shared((shape.weights * kappa)[..., None])
         return slopes, (cross - cross.mT).flatten(1)[:, None]
 
     def blocks(self, part: _Part) -> Float[Tensor, "T n_times_n"]:
@@ -133,30 +137,8 @@ class _Elements:
         return (direction[..., None] * slopes).flatten(1) @ products.flatten(0, 1)
 
 
-def _elements(forms: Forms, conductivity: list[Tensor] | None) -> list[_Elements]:
-    """The curved elements, those of P1 in their place, and every lot of flat cells."""
-    kappa: list[Any] = [None] * (1 + len(forms.flats)) if conductivity is None else conductivity
-    tangents, corners = forms.tangents(), simplex(forms.element.dim, 1)
-    share = 1.0 if forms.shares is None else forms.shares[:, None, None]
-    mean = None if kappa[0] is None else cell_mean(kappa[0], forms.element)
-    flat = orthonormal(cell_mean(tangents[0], forms.element))
-    lots = [(forms.cells, forms.lengths, share, mean, flat)]
-    lots += [
-        (flat.cells, flat.lengths, flat.share, a, e)
-        for flat, a, e in zip(forms.flats, kappa[1:], tangents[1:], strict=True)
-    ]
-    a = forms.on_curved(kappa[0])
-    found = [_Elements(forms.nodes, forms.metric, forms.element, a, tangents[0], share)]
-    for cells, lengths, part, a, e in lots:
-        a = forms.on_flat(a, cells, lengths)
-        a = None if a is None else spread(a, corners)
-        g = spread(flat_metric(lengths), corners)
-        found.append(_Elements(cells, g, corners, a, spread(e, corners), part))
-    return found
-
-
 def _assembled(
-    forms: Forms, p: Any, lots: list[_Elements], parts: list[_Part]
+    forms: Forms, p: Any, elements: list[_Elements], parts: list[_Part]
 ) -> tuple[Any, Float[Tensor, "n n upper"]]:
     """Upper triangles on one pattern, the last of them, and S for all k and l; two are computed at a time."""
     values, upper = [], None
@@ -164,13 +146,13 @@ def _assembled(
         upper = forms.upper(
             p,
             [
-                ElementMatrices(lot.nodes, torch.complex(*(lot.blocks(part) for part in pair)))
-                for lot in lots
+                ElementMatrices(x.lot.nodes, torch.complex(*(x.blocks(part) for part in pair)))
+                for x in elements
             ],
         )
         both = torch.from_numpy(upper.data)
         values += [both.real, both.imag]
-    size = forms.points.shape[1]
+    size = forms.places.shape[1]
     found = values[0].new_zeros(size, size, len(values[0]))
     for (k, m, turning), value in zip(parts, values, strict=False):
         found[k, m] += value
@@ -183,7 +165,7 @@ def _framed(
     upper: Any,
     stiffness: Float[Tensor, "n n upper"],
     given: Int[Tensor, " N"],
-    frames: Float[Tensor, "N n d"],
+    frames: Frames,
     others: Csr,
 ) -> Csr:
     """Σ_kl E_kᵀ S_kl E_l of the upper triangles of S_kl, with Σ_k E_kᵀ A E_k of the other channels A."""
@@ -210,3 +192,56 @@ def _framed(
     values = torch.from_numpy(np.stack([each.data for each in found]))
     rows, columns = (torch.from_numpy(x).long() for x in (found[0].indptr, found[0].indices))
     return Csr(rows, columns, values)
+
+
+class WeakGradient(NamedTuple):
+    """The bilinear form ∫v·∇u of functions u and fields v on a surface, or ∫v·(ν × ∇u), for prolonged u and v.
+
+    Its matrices, (NX, NX), are ∫φ_j (∇φ_i)_k for each component k in space.
+    """
+
+    prolongation: Any
+    matrices: list[Any]
+
+    @classmethod
+    def of(cls, forms: Forms, normals: Float[Tensor, "N 3"] | None = None) -> WeakGradient:
+        """The form with ∇u, or, with normals ν at the vertices, ν × ∇u."""
+        found = []
+        for lot in forms.lots:
+            shape, slopes = lot.element, lot.slopes(forms.places)
+            directions = _directions(lot.metric, slopes, lot.nodes[:, :3], normals)
+            entries = lot.shared(shape.weights[:, None, None] * directions).unbind(2)
+            products = torch.einsum("qia,qj->qaij", shape.gradients, shape.values).flatten(2)
+            blocks = [entry.flatten(1) @ products.flatten(0, 1) for entry in entries]
+            found.append([summed(block, lot.nodes, len(forms.places)) for block in blocks])
+        return cls(forms.prolongation, [sum(each) for each in zip(*found, strict=True)])
+
+    def divergence(self, v: Float[Tensor, "N n C"]) -> Float[Tensor, "N C"]:
+        """∫v·∇φ_i of a field in space, differentiable in it."""
+        nodes = (times(self.prolongation, x) for x in v.unbind(1))
+        inside = [times(d, x) for d, x in zip(self.matrices, nodes, strict=True)]
+        return times(self.prolongation.T, torch.stack(inside).sum(0))
+
+    def gradient(self, u: Float[Tensor, "N C"]) -> Float[Tensor, "N n C"]:
+        """∫e_kφ_i·∇u, the adjoint of `divergence`, differentiable in u."""
+        nodes = times(self.prolongation, u)
+        found = [times(self.prolongation.T, times(d.T, nodes)) for d in self.matrices]
+        return torch.stack(found, 1)
+
+
+def _directions(
+    g: Float[Tensor, "T Q 3"],
+    slopes: Float[Tensor, "T Q n 2"],
+    cells: Any,
+    normals: Float[Tensor, "N 3"] | None,
+) -> Float[Tensor, "T Q n 2"]:
+    """√det G times the vectors d_a with ∇u = Σ_a d_a ∂_a u, or with ν × ∇u: the tangent vectors, turned or dual."""
+    one, two = slopes.unbind(-1)
+    if normals is None:
+        xx, xy, yy = (entry[..., None] for entry in g.unbind(-1))
+        dual = [yy * one - xy * two, xx * two - xy * one]
+        return torch.stack(dual, -1) / area_element(g)[..., None, None]
+    outer = at(normals, cells).sum(1)
+    across = torch.linalg.cross(one, two, dim=-1).sum(1)
+    side = (outer * across).sum(-1).sign()[:, None, None, None]
+    return side * torch.stack([two, -one], -1)

@@ -31,13 +31,14 @@ except ModuleNotFoundError as error:
     ) from error
 
 from torchlb.errors import InputError, TorchlbError, first_few, shown, warn
+from torchlb.galerkin.matrices import PairMatrices
 from torchlb.io.cache import load_or_build
 from torchlb.linalg.csr import Csr
 from torchlb.operator.batching import join_states
 from torchlb.operator.dispatch import Operator, build_operator
 from torchlb.operator.inputs import warn_of_gradients
 from torchlb.operator.laplace_beltrami import LaplaceBeltrami
-from torchlb.operator.parts import BASIS, PairMatrices
+from torchlb.operator.parts import BASIS
 from torchlb.spectral.eigenbasis import Eigenbasis, stack_eigenbases
 from torchlb.stencils.conditions import kind_of
 

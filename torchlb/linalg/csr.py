@@ -17,7 +17,7 @@ from torch import Tensor, nn
 from torch.nn.functional import pad
 
 from torchlb.linalg.checks import check_rows
-from torchlb.linalg.sparse import csr_product, csr_tensor, to_scipy, transpose_pattern
+from torchlb.linalg.sparse import csr_product, csr_tensor, to_scipy, transpose_pattern, values_on
 
 Held = TypeVar("Held", bound="Tensors")
 
@@ -197,6 +197,12 @@ class Csr(Tensors):
         check_rows(f, self.num_rows)
         values = self.values[channel] if dtype is None else self.values[channel].to(dtype)
         return shaped_like(csr_product(self.pattern, values, side_by_side(f), transposed), f)
+
+    def beside(self, others: Sequence[Any], number: Any = None) -> Csr:
+        """These symmetric matrices and scipy's others, whose rows have these numbers here, on their pattern."""
+        place = self.crow.numpy(), self.col.numpy()
+        extra = [torch.from_numpy(values_on(*place, other, number))[None] for other in others]
+        return Csr(self.crow, self.col, torch.cat([self.values, *extra]))
 
     @staticmethod
     def join(records: Sequence[Csr]) -> Csr:

@@ -3,17 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from math import isnan
 from typing import Any
 
+import numpy as np
 import torch
 
 from torchlb.errors import InputError
-from torchlb.linalg.csr import Csr, Record, starts
-from torchlb.operator.parts import PairMatrices
+from torchlb.galerkin.matrices import PairMatrices
+from torchlb.linalg.csr import Csr, Record, starts, tensors_of
 from torchlb.operator.storage import OperatorStorage
 
 Parts = dict[str, Any]
+BY_POINT = ("mass", "points", "frames", "normals", "_on_boundary")
+"""Tensors with a row for each point; normals, and the mask of the boundary, are empty where there are none."""
 
 
 def check_alike(shapes: Sequence[OperatorStorage]) -> None:
@@ -31,16 +33,15 @@ def check_alike(shapes: Sequence[OperatorStorage]) -> None:
 
 def joined_parts(shapes: Sequence[OperatorStorage]) -> Parts:
     """The tensors, matrices and records of the block-diagonal operator, from those of its shapes."""
-    parts: Parts = {
-        n: torch.cat([getattr(s, n) for s in shapes]) for n in ("mass", "points", "frames")
-    }
+    parts: Parts = {}
+    for name in BY_POINT:
+        tensors = [getattr(s, name) for s in shapes]
+        if name == "_on_boundary" and any(len(mask) for mask in tensors):
+            tensors = [s.mass < 0 if s.boundary is None else s.boundary for s in shapes]
+        if all(len(tensor) for tensor in tensors):
+            parts[name] = torch.cat(tensors)
     first = starts([s.num_points for s in shapes])
     parts["faces"] = torch.cat([s.faces + start for s, start in zip(shapes, first, strict=True)])
-    if all(len(s.normals) for s in shapes):
-        parts["normals"] = torch.cat([s.normals for s in shapes])
-    if any(s.boundary is not None for s in shapes):
-        masks = [s.mass < 0 if s.boundary is None else s.boundary for s in shapes]
-        parts["_on_boundary"] = torch.cat(masks)
     parts["_record"] = Record.join([s._record for s in shapes])
     parts["_plans"] = [plan for s in shapes for plan in s._known_plans]
     parts["stencil"] = Csr.join([s.stencil for s in shapes])
@@ -50,11 +51,9 @@ def joined_parts(shapes: Sequence[OperatorStorage]) -> Parts:
 
 def split_parts(batch: OperatorStorage, sizes: Sequence[int]) -> list[Parts]:
     """Inverse of `joined_parts`."""
-    names = [
-        n for n in ("mass", "points", "frames", "normals", "_on_boundary") if len(getattr(batch, n))
-    ]
-    by_point = Record({name: getattr(batch, name) for name in names}).split(sizes)
-    columns: dict[str, Any] = {n: [getattr(part, n) for part in by_point] for n in names}
+    whole = Record({n: getattr(batch, n) for n in BY_POINT if len(getattr(batch, n))})
+    by_point = [tensors_of(part) for part in whole.split(sizes)]
+    columns: dict[str, Any] = {n: [part[n] for part in by_point] for n in by_point[0]}
     first = batch.faces.new_tensor(starts(sizes))
     of_shape = torch.bucketize(batch.faces[:, 0].contiguous(), first[1:], right=True)
     faces = batch.faces.split(torch.bincount(of_shape, minlength=len(sizes)).tolist())
@@ -107,9 +106,10 @@ def _joined_certificate(certificates: Sequence[dict[str, Any] | None]) -> dict[s
     known = [each for each in certificates if each is not None]
     if len(known) < len(certificates):
         return None
-    how: dict[str, Any] = {"holds": all, "min_pi": min, "max_s": _largest, "rounds": max}
+    how: dict[str, Any] = {
+        "holds": all,
+        "min_pi": min,
+        "max_s": lambda x: float(np.max(x)),
+        "rounds": max,
+    }
     return {key: how.get(key, sum)([each[key] for each in known]) for key in known[0]}
-
-
-def _largest(values: Sequence[float]) -> float:
-    return max(values, key=lambda x: (isnan(x), x))

@@ -1,9 +1,11 @@
-"""Build an operator on a mesh: checks, shape, weak pair, stencils, certificate."""
+"""Build an operator on a mesh, or on a complex through a cloud: checks, shape, weak pair, stencils, certificate."""
 
 from __future__ import annotations
 
 import sys
+from collections.abc import Callable
 from dataclasses import replace
+from typing import Any
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -12,26 +14,49 @@ from torch.nn.functional import pad
 
 from torchlb.baseline.cotangent import cotangent_laplacian
 from torchlb.certified.certificate import certify
-from torchlb.cloud.doubts import warn_of_doubts, warn_of_joins
+from torchlb.cloud.complexes import Complex
+from torchlb.cloud.doubts import (
+    on_rim,
+    warn_of_buried,
+    warn_of_doubts,
+    warn_of_joins,
+    warn_of_layers,
+    warn_of_near_duplicates,
+)
+from torchlb.cloud.reconstruction import reconstruct
 from torchlb.cloud.surface import CloudSurface
 from torchlb.errors import InputError, first_few, renumbered, warn
 from torchlb.galerkin.coarse import lying_triangles, with_area
 from torchlb.galerkin.flips import flipped
+from torchlb.galerkin.matrices import PairMatrices
 from torchlb.galerkin.nodes import lagrange_nodes
-from torchlb.galerkin.pair import SparsePair, WeakPair, mesh_pair
+from torchlb.galerkin.pair import mesh_pair
 from torchlb.geometry.boundary import open_sides, outward_sums
+from torchlb.geometry.neighbors import nearest_neighbors
 from torchlb.geometry.numbering import Numbering
+from torchlb.geometry.thresholds import NEAREST
+from torchlb.geometry.vectors import Points
 from torchlb.linalg.precision import LOW
 from torchlb.linalg.threads import threads_for
-from torchlb.operator.checks import check_boundary, check_faces, check_scale, mended_faces
+from torchlb.operator.checks import (
+    check_boundary,
+    check_dimension,
+    check_distinct,
+    check_faces,
+    check_normals,
+    check_scale,
+    mended_faces,
+)
 from torchlb.operator.inputs import ArrayLike, check_points
-from torchlb.operator.options import Options
-from torchlb.operator.plan import Parts, Plan, operator_parts, stencils_of
-from torchlb.stencils.assemble import assemble
+from torchlb.operator.plan import Parts, Plan, operator_parts
+from torchlb.stencils.assemble import Stencils, assemble
 from torchlb.stencils.conditions import Condition
+from torchlb.stencils.options import Options
 from torchlb.stencils.rows import Reason, Rows, matrix_rows
-from torchlb.stencils.shape import Shape, mesh_shape
+from torchlb.stencils.shape import Shape, mesh_shape, surface_shape
 
+Reconstruction = Callable[[Tensor], ArrayLike | Complex]
+"""Function from points, (N, n) float64, to cells through them."""
 MANY = 0.5
 """Share of low-order rows from which a warning reports them."""
 REMEDIES = {
@@ -68,9 +93,105 @@ def _checked(vertices: ArrayLike, faces: ArrayLike) -> tuple[Tensor, Tensor]:
     return vertices, check_faces(faces, len(vertices))
 
 
+def build_cloud(
+    points: ArrayLike,
+    dim: int | None,
+    options: Options,
+    *,
+    normals: ArrayLike | None,
+    boundary: ArrayLike | str | None,
+    reconstruction: Reconstruction | None,
+    progress: bool,
+) -> Parts:
+    """Build an operator on a point cloud; arguments as for `LaplaceBeltrami.from_points`."""
+    points = check_points(points)
+    check_scale(points)
+    check_distinct(points)
+    ambient, found = points.shape[1], None
+    if reconstruction is None:
+        d = check_dimension(points, dim, hypersurface=normals is not None)
+    else:
+        found = _given_complex(points, reconstruction, dim)
+        d = found.cells.shape[1] - 1
+    options.check(len(points), ambient, d)
+    where = check_boundary(boundary, len(points))
+    held = options.held
+    if where is None and held is not None and not held.conserves:
+        raise InputError(
+            f"boundary: condition={held!r} holds at boundary points; pass a mask of them, or 'detect'"
+        )
+    if normals is not None:
+        if d != ambient - 1:
+            raise InputError(f"normals: only hypersurfaces have them, not dim={d} in R^{ambient}")
+        normals = check_normals(normals, points)
+    index, progress = torch.arange(len(points)), progress and sys.stderr.isatty()
+    numbering = Numbering.along_tree(points) if found is None else Numbering(index, index)
+    here = numbering.sorted(points)
+    mask = numbering.sorted(where) if isinstance(where, Tensor) else None
+    normals = None if normals is None else numbering.sorted(normals)
+    with renumbered(numbering.given), threads_for(len(points)):
+        if found is None:
+            found = reconstruct(here, d, normals=normals, boundary=mask)
+        if found.shares is not None and held and not held.conserves and not held.fixes:
+            raise InputError(
+                f"condition={held!r}: the boundary of a cloud of dimension {d} in R^{ambient} is that of a mask, which "
+                "has no measure; 'neumann' and 'dirichlet' can hold there, and from_mesh takes every condition"
+            )
+        if mask is not None and found.shares is None:
+            warn_of_buried(found.cells, mask)
+        if isinstance(found, CloudSurface):
+            return _on_surface(points, here, found, options, mask, numbering, progress)
+        if d == 1:
+            warn_of_near_duplicates(here, nearest_neighbors(here, min(NEAREST, len(here))), 1)
+    cells, edge = numbering.given[found.cells], None
+    if isinstance(where, Tensor):
+        edge = where if found.shares is not None else where & on_rim(cells, len(points))
+    rest = numbering.restored(found.points), cells, options, edge, "points", progress, found.shares
+    return on_cells(points, *rest)
+
+
+def _given_complex(points: Points, reconstruction: Reconstruction, dim: int | None) -> Complex:
+    """The complex that a user's function makes of the points, checked."""
+    found = reconstruction(points.clone())
+    if isinstance(found, CloudSurface):
+        return found
+    if isinstance(found, Complex) and found.shares is not None:
+        return found
+    places, cells = (found.points, found.cells) if isinstance(found, Complex) else (points, found)
+    places = check_points(places)
+    cells = mended_faces(places, check_faces(cells, len(points)))
+    if places.shape != points.shape or dim not in (None, cells.shape[1] - 1):
+        raise InputError(
+            f"reconstruct: expected cells through the {len(points)} points, of dimension {dim or 'any'}, got some of "
+            f"shape {tuple(cells.shape)} through {tuple(places.shape)}"
+        )
+    return Complex(points=places, cells=cells)
+
+
+def _on_surface(
+    points: Points,
+    here: Points,
+    surface: CloudSurface,
+    options: Options,
+    boundary: Bool[Tensor, " N"] | None,
+    numbering: Numbering,
+    progress: bool,
+) -> Parts:
+    """Build an operator on a cloud in R² or R³, sorted `here`, by the surface through it."""
+    warn_of_near_duplicates(here, surface.neighbors, 2)
+    if here.shape[1] == 3:
+        warn_of_layers(here)
+    surface = replace(surface, cells=flipped(surface.points, surface.cells))
+    own = options.taken(numbering)
+    shape = surface_shape(here, surface, own, boundary=boundary, progress=progress)
+    faces, order = numbering.given[surface.cells], torch.arange(len(surface.cells))
+    plan = _plan(shape, numbering, points, faces, order, order[:0], "points", options)
+    return finished(plan, shape, surface.cells, progress, surface)
+
+
 def on_cells(
-    given: Float[Tensor, "N n"],
-    vertices: Float[Tensor, "N n"],
+    given: Points,
+    vertices: Points,
     cells: Int[Tensor, "F corners"],
     options: Options,
     boundary: Bool[Tensor, " N"] | str | None,
@@ -94,81 +215,74 @@ def on_cells(
         shape = mesh_shape(
             here,
             corners,
-            options.q,
-            num_neighbors=options.num_neighbors,
+            options.taken(numbering),
             boundary=numbering.sorted(boundary) if isinstance(boundary, Tensor) else None,
-            condition=options.held(numbering),
-            fit_degrees=options.elements[1],
             progress=progress,
             shares=None if shares is None else shares[order],
             on_mesh=source == "mesh",
         )
         moved = (vertices != given).any(1).nonzero()[:, 0]
-        places = given, cells, order, moved
-        return finished(shape, corners, places, source, options, numbering, progress)
+        plan = _plan(shape, numbering, given, cells, order, moved, source, options)
+        return finished(plan, shape, corners, progress)
+
+
+def _plan(shape: Shape, numbering: Numbering, points: Tensor, *rest: Any) -> Plan:
+    """Plan of a shape, whose stencils and pair are still to be decided."""
+    assert shape.plan is not None
+    return Plan(numbering, points, shape.plan, None, None, [], *rest)
 
 
 def finished(
+    plan: Plan,
     shape: Shape,
     cells: Int[Tensor, "G corners"],
-    places: tuple[Tensor, Tensor, Tensor, Tensor],
-    source: str,
-    options: Options,
-    numbering: Numbering,
     progress: bool,
     surface: CloudSurface | None = None,
 ) -> Parts:
-    """The operator of a shape of cells: weak pair, rows, certified if asked for, and plan.
-
-    `places` are the user's points and cells, the place of each cell of the shape among these, and moved points.
-    """
-    (degree, degrees), pair, pair_plan, plan = options.elements, None, None, None
-    if degree > 0:
-        assert shape.plan is not None
-        assert shape.fits is not None
-        own = shape.plan.fits, shape.fits, degree, degrees
+    """The operator of a shape of cells: weak pair, rows, certified if asked for, and the rest of the plan."""
+    options, pair, fits = plan.options.taken(plan.numbering), None, plan.shape.fits
+    if options.weak_form:
         stars = None if surface is None else surface.stars
-        rest = stars, shape.held, shape.plan.shares, numbering
-        pair_plan, pair = mesh_pair(shape.points, cells, *own, *rest)
-        assert pair.mass is not None
-        shape = replace(shape, areas=pair.mass)
+        rest = stars, shape.held, plan.shape.shares, plan.numbering
+        assert shape.fits is not None
+        own = fits, shape.fits, *options.elements
+        pair_plan, pair, mass = mesh_pair(shape.points, cells, *own, *rest)
+        plan, shape = replace(plan, pair=pair_plan), replace(shape, mass=mass)
     if surface is not None:
-        if pair_plan is not None:
-            warn_of_doubts(surface, pair_plan.fits, shape.areas)
+        if pair is not None:
+            warn_of_doubts(surface, fits, shape.areas)
         warn_of_joins(surface)
-    stencils = stencils_of(shape, options)
+    stencils = Stencils(shape, options)
     rows, certificate = assemble(stencils, progress=progress), None
     if options.certify:
         last, outflow = len(stencils.candidates), not shape.condition.conserves
         rows, mass, certificate = certify(
             rows, shape.areas, stencils.rows, last, outflow=outflow, progress=progress
         )
-        shape = replace(shape, areas=mass)
+        shape = replace(shape, mass=mass)
     if shape.boundary is None and not shape.condition.conserves:
         warn(
             f"condition={shape.condition!r} holds nowhere: no boundary, or `boundary` has none of it; leave the "
             "condition out"
         )
-    points, faces, order, moved = places
-    if pair_plan is not None and shape.plan is not None:
-        planned = None if certificate else stencils.plan(rows), pair_plan, shape.low_order.flips
-        of_cells = faces, order, shape.on_mesh, moved
-        plan = Plan(numbering, points, shape.plan, *planned, *of_cells, source, options)
-    _warn_of_low_order(rows, shape, source, plan)
+    planned = None if certificate else stencils.plan(rows)
+    plan = replace(plan, rows=planned, flips=shape.low_order.flips)
+    _warn_of_low_order(rows, plan)
     found = {"certificate": certificate, "surface": surface and surface.summary}
-    of_user = numbering, points, faces, source, options
-    return operator_parts(rows, shape, pair, *of_user, plan, **found)
+    return operator_parts(plan, plan.points, rows, shape, pair, **found)
 
 
-def _warn_of_low_order(rows: Rows, shape: Shape, source: str, plan: Plan | None) -> None:
+def _warn_of_low_order(rows: Rows, plan: Plan) -> None:
     """Warn if most points have only low-order rows."""
     low = rows.order == 0
     share = float(low.double().mean())
     if share < MANY:
         return
     reason = Reason(int(rows.reason[low].mode().values)).text
-    reason += f". {REMEDIES[source].format(shape.frames.shape[-1])}; `print(lb.report)` says more"
-    if plan is not None:
+    reason += (
+        f". {REMEDIES[plan.source].format(plan.faces.shape[1] - 1)}; `print(lb.report)` says more"
+    )
+    if plan.pair is not None:
         _, _, edges, curved = plan.pair.counts.sum(1).tolist()
         share_curved = f"{curved / max(edges, 1):.0%} of its edges curved"
         reason += f". Spectrum, diffusion and solves have the weak pair, {share_curved}"
@@ -186,7 +300,8 @@ def build_cotangent(vertices: ArrayLike, faces: ArrayLike) -> Parts:
     corners = mended_faces(vertices, corners)
     _warn_of_long_triangles(vertices, corners)
     matrix, mass = cotangent_laplacian(vertices, corners)
-    shape = replace(mesh_shape(vertices, corners, 0, condition=None), areas=mass)
+    options = Options(1, 0, condition=None, weak_form=False)
+    shape = replace(mesh_shape(vertices, corners, options), mass=mass)
     centers = torch.arange(len(vertices))
     rows = matrix_rows(matrix, shape.points, shape.frames, centers)
     row = centers.repeat_interleave(rows.length)
@@ -195,12 +310,13 @@ def build_cotangent(vertices: ArrayLike, faces: ArrayLike) -> Parts:
     _, length = outward_sums(vertices, *open_sides(corners))
     if length.any():  # lumped, as the mass is
         weak.append(length[row] / 2 * diagonal)
-    pair = WeakPair(SparsePair(rows.crow, rows.col, torch.stack(weak)))
-    of_user = Numbering(centers, centers), vertices, corners, "cotangent", None, None
-    return operator_parts(rows, shape, pair, *of_user)
+    pair = PairMatrices(rows.crow, rows.col, torch.stack(weak))
+    every, same = torch.arange(len(corners)), Numbering(centers, centers)
+    plan = _plan(shape, same, vertices, corners, every, every[:0], "cotangent", options)
+    return operator_parts(plan, vertices, rows, shape, pair)
 
 
-def _warn_of_long_triangles(vertices: Float[Tensor, "N n"], faces: Int[Tensor, "F 3"]) -> None:
+def _warn_of_long_triangles(vertices: Points, faces: Int[Tensor, "F 3"]) -> None:
     """Warn where long triangles lie along much of the boundary."""
     nodes = lagrange_nodes(faces, len(vertices), 2)
     outer = nodes.sides[2].uses == 1

@@ -12,6 +12,7 @@ from scipy.spatial import KDTree
 from torch import Tensor
 
 from torchlb.errors import InputError, InputTypeError, first_few, warn
+from torchlb.geometry.vectors import Points
 from torchlb.linalg.precision import NEGLIGIBLE, ROUNDING, SMALL
 from torchlb.operator.cleaning import (
     are_quads,
@@ -35,7 +36,7 @@ def check_none(given: Sequence[Any], what: str) -> None:
         )
 
 
-def check_scale(points: Float[Tensor, "N n"]) -> None:
+def check_scale(points: Points) -> None:
     """Raise ValueError if the points extend so far, or so little, that 1/ℓ² leaves the range of numbers."""
     extent = float((points - points[0]).abs().max())
     if len(points) > 1 and extent == 0:
@@ -47,7 +48,7 @@ def check_scale(points: Float[Tensor, "N n"]) -> None:
         )
 
 
-def check_distinct(points: Float[Tensor, "N n"]) -> None:
+def check_distinct(points: Points) -> None:
     """Raise a ValueError that names coincident points."""
     spacing, other, bad = coincident(points)
     _warn_of_rounding(points, spacing)
@@ -59,7 +60,7 @@ def check_distinct(points: Float[Tensor, "N n"]) -> None:
         )
 
 
-def _warn_of_rounding(points: Float[Tensor, "N n"], spacing: Float[Tensor, " N"]) -> None:
+def _warn_of_rounding(points: Points, spacing: Float[Tensor, " N"]) -> None:
     """Warn of single-precision positions so far from 0 that their rounding shows between neighbours."""
     step = torch.finfo(torch.float32).eps * float(points.abs().max())
     width = float(spacing.median())
@@ -70,9 +71,7 @@ def _warn_of_rounding(points: Float[Tensor, "N n"], spacing: Float[Tensor, " N"]
         )
 
 
-def check_dimension(
-    points: Float[Tensor, "N n"], dim: int | None, *, hypersurface: bool = False
-) -> int:
+def check_dimension(points: Points, dim: int | None, *, hypersurface: bool = False) -> int:
     """Return `dim`, or its default n − 1; ValueError if points of R², R⁴, R⁵, … do not look like a hypersurface.
 
     The local dimension is estimated from the 3n nearest neighbours of a point, as the median over up to 500 points,
@@ -94,7 +93,7 @@ def check_dimension(
     return n - 1
 
 
-def _local_dimension(points: Float[Tensor, "N n"], thin: float) -> int:
+def _local_dimension(points: Points, thin: float) -> int:
     """Median number of directions, over a sample, in which neighbours spread by more than `thin` of the largest."""
     centers = points[:: -(-len(points) // 500)].numpy()
     _, near = KDTree(points.numpy()).query(centers, k=3 * points.shape[1])
@@ -103,7 +102,7 @@ def _local_dimension(points: Float[Tensor, "N n"], thin: float) -> int:
     return int((spread > thin * spread[:, :1]).sum(1).median())
 
 
-def mended_faces(vertices: Float[Tensor, "N n"], faces: Int[Tensor, "F v"]) -> Int[Tensor, "G v"]:
+def mended_faces(vertices: Points, faces: Int[Tensor, "F v"]) -> Int[Tensor, "G v"]:
     """Faces without duplicates and with triangles oriented alike; warnings name changed faces and coincident vertices.
 
     Raises ValueError for quads, and for triangles none of which has an area.
@@ -178,7 +177,7 @@ def check_faces(faces: ArrayLike, num_points: int) -> Int[Tensor, "F v"]:
     return proper_faces(faces)
 
 
-def check_normals(normals: ArrayLike, points: Float[Tensor, "N n"]) -> Float[Tensor, "N n"]:
+def check_normals(normals: ArrayLike, points: Points) -> Points:
     """Unit normals of the shape of `points`; ValueError for wrong shapes, NaN or zero vectors."""
     normals = check_points(normals, "normals")
     if normals.shape != points.shape:

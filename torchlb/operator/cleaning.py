@@ -13,13 +13,12 @@ from torch.nn.functional import pad
 
 from torchlb.errors import InputError
 from torchlb.geometry.complex import edges_of, two_orientations
+from torchlb.geometry.vectors import Points
 from torchlb.linalg.precision import ROUNDING
 from torchlb.operator.inputs import ArrayLike, as_tensor, check_corners, check_mask, check_points
 
 
-def coincident(
-    points: Float[Tensor, "N n"],
-) -> tuple[Float[Tensor, " N"], Int[Tensor, " N"], Int[Tensor, " T"]]:
+def coincident(points: Points) -> tuple[Float[Tensor, " N"], Int[Tensor, " N"], Int[Tensor, " T"]]:
     """Nearest other point of each: (distance, its index, indices of the points that coincide with it to rounding)."""
     tree = KDTree(points.numpy())
     distance, nearest = tree.query(points.numpy(), k=min(2, len(points)))
@@ -171,7 +170,7 @@ def are_quads(faces: Int[Tensor, "F 4"]) -> bool:
 
 
 def merged(
-    places: Float[Tensor, "N n"], reach: float, apart: Int[Tensor, "E 2"] | None = None
+    places: Points, reach: float, apart: Int[Tensor, "E 2"] | None = None
 ) -> Int[Tensor, " N"]:
     """First point of each point's cluster (single linkage: clusters are chains with steps of at most `reach`).
 
@@ -194,7 +193,7 @@ def merged(
     return torch.from_numpy(first[back.reshape(-1)])
 
 
-def triangles_of(vertices: Float[Tensor, "N n"], polygons: Int[Tensor, "F c"]) -> Tensor:
+def triangles_of(vertices: Points, polygons: Int[Tensor, "F c"]) -> Tensor:
     """Triangles (F, c − 2, 3) of polygons with c corners each, in space or in the plane.
 
     A polygon becomes a fan around the corner whose longest diagonal is shortest, among corners from which all triangles

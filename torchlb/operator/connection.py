@@ -10,13 +10,15 @@ from jaxtyping import Float
 from torch import Tensor
 
 from torchlb.errors import DerivativeError, InputError
+from torchlb.galerkin.matrices import PairMatrices
 from torchlb.galerkin.tangent import in_space, tangent_matrices
+from torchlb.geometry.vectors import Points
 from torchlb.linalg.checks import check_tensor
 from torchlb.linalg.csr import Csr
 from torchlb.operator.batching import remember_shapes, shapes_of
 from torchlb.operator.medium import elements_of, plain
 from torchlb.operator.pair_methods import PairMethods, check_pair
-from torchlb.operator.parts import Modes, PairMatrices
+from torchlb.operator.parts import Modes
 
 
 class Connection(PairMethods):
@@ -67,7 +69,7 @@ class Connection(PairMethods):
         return self.cache.connection
 
     def components(
-        self, v: Float[Tensor, "N n C"] | Float[Tensor, "N n"]
+        self, v: Float[Tensor, "N n C"] | Points
     ) -> Float[Tensor, "rows C"] | Float[Tensor, " rows"]:
         """Components in the frames, (N d, C) or (N d,), of the tangential part of the space vectors `v`.
 
@@ -83,7 +85,7 @@ class Connection(PairMethods):
 
     def vectors(
         self, c: Float[Tensor, "rows C"] | Float[Tensor, " rows"]
-    ) -> Float[Tensor, "N n C"] | Float[Tensor, "N n"]:
+    ) -> Float[Tensor, "N n C"] | Points:
         """The tangent field of space vectors, (N, n, C) or (N, n), with components `c`, (N d, C) or (N d,)."""
         check_tensor(c, "c")
         if c.ndim not in (1, 2) or len(c) != self.num_points:
@@ -121,8 +123,8 @@ def _of_shape(lb: Any, *, hodge: bool = False) -> Connection:
     with torch.no_grad():
         kappa = medium.get("conductivity")
         kappa = None if kappa is None else elements.values(kappa)
-        linear = lb.weak.linear if lb.weak.linear.num_rows else None
-        found = tangent_matrices(elements, kappa, frames, (lb.weak, linear), hodge=hodge)
+        others = [lb.weak, *([lb.weak.linear] if lb.weak.linear.num_rows else [])]
+        found = tangent_matrices(elements, kappa, frames, others, hodge=hodge)
     whole, *near = (each.to(lb.weak.values) for each in found)
     weak = PairMatrices(whole.crow, whole.col, whole.values, *near, of_functions=False)
     own = Connection._of(lb, weak)

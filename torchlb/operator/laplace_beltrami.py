@@ -11,6 +11,7 @@ from torchlb.certified.certificate import Certificate
 from torchlb.cloud.surface import SurfaceSummary
 from torchlb.errors import InputError, InputTypeError
 from torchlb.fits.rules import WeightsName
+from torchlb.galerkin.matrices import PairMatrices
 from torchlb.geometry.frames import Projection
 from torchlb.linalg.csr import Csr, Record, tensors_of
 from torchlb.operator.batching import (
@@ -21,8 +22,7 @@ from torchlb.operator.batching import (
     shapes_of,
     split_parts,
 )
-from torchlb.operator.build import build_cotangent, build_mesh
-from torchlb.operator.build_cloud import Reconstruction, build_cloud
+from torchlb.operator.build import Reconstruction, build_cloud, build_cotangent, build_mesh
 from torchlb.operator.checks import check_none
 from torchlb.operator.connection import Connection, connection_of
 from torchlb.operator.inputs import (
@@ -33,14 +33,14 @@ from torchlb.operator.inputs import (
     warn_of_gradients,
 )
 from torchlb.operator.medium import checked_fields, pair_in, split_fields
-from torchlb.operator.options import Options
 from torchlb.operator.pair_methods import PairMethods
-from torchlb.operator.parts import MediumFields, Modes, PairMatrices
+from torchlb.operator.parts import MediumFields, Modes
 from torchlb.operator.plan import Parts, Plan, check_fit, evaluate
 from torchlb.operator.stencil_methods import StencilMethods
 from torchlb.operator.through import carrying, origins
 from torchlb.spectral.eigenbasis import stack_eigenbases, unstack_eigenbases
 from torchlb.stencils.conditions import Condition, ConditionName
+from torchlb.stencils.options import Options
 
 
 class LaplaceBeltrami(StencilMethods, PairMethods):
@@ -367,14 +367,5 @@ class LaplaceBeltrami(StencilMethods, PairMethods):
 
 # A whole module can be read back with torch.load(weights_only=True) where torchlb is imported.
 torch.serialization.add_safe_globals(
-    [
-        LaplaceBeltrami,
-        Csr,
-        PairMatrices,
-        MediumFields,
-        Modes,
-        Record,
-        Certificate,
-        SurfaceSummary,
-    ]
+    [LaplaceBeltrami, Csr, PairMatrices, MediumFields, Modes, Record, Certificate, SurfaceSummary]
 )

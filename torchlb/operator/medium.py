@@ -12,14 +12,14 @@ from torch.nn.functional import pad
 
 from torchlb.errors import InputError, first_few
 from torchlb.galerkin.forms import Forms
+from torchlb.galerkin.matrices import PairMatrices
 from torchlb.galerkin.medium import Field, Medium
 from torchlb.galerkin.pair import Pattern
 from torchlb.linalg.checks import check_tensor
 from torchlb.linalg.csr import Csr
 from torchlb.linalg.precision import ROOT_EPS, ROUNDING
-from torchlb.linalg.sparse import to_scipy
 from torchlb.operator.inputs import ArrayLike
-from torchlb.operator.parts import MediumFields, PairMatrices
+from torchlb.operator.parts import MediumFields
 from torchlb.operator.storage import OperatorStorage
 
 Given = Mapping[str, ArrayLike | float | None]
@@ -31,7 +31,7 @@ def elements_of(lb: Any) -> Any:
         points = lb.points.detach().cpu().double()
         linear = lb.source == "cotangent"
         mass = lb.mass.detach().cpu().double()
-        made = Forms.linear(points, lb.faces.cpu(), mass) if linear else lb.plan.forms(points)
+        made = Forms.flat(points, lb.faces.cpu(), mass) if linear else lb.plan.forms(points)
         lb.cache.elements = made
     return lb.cache.elements
 
@@ -128,7 +128,7 @@ def plain(medium: Medium) -> dict[str, Field]:
 def pair_in(lb: OperatorStorage, medium: Medium) -> PairMatrices:
     """The weak pair of one shape in a medium: K and M of its conductivity and density, and C of its potential."""
     elements = elements_of(lb)
-    if any(flat.mix is None for flat in elements.flats):
+    if any(lot.mix is None for lot in elements.lots):
         faces = [name for name, field in medium.items() if field.on_faces]
         if faces:
             raise InputError(
@@ -150,8 +150,7 @@ def pair_in(lb: OperatorStorage, medium: Medium) -> PairMatrices:
 def _stored(elements: Forms, pair: Csr, upper: Any, potential: Any) -> Csr:
     """K and M in a medium from the upper triangle, with B and what a condition and the potential add to K."""
     pattern = Pattern.of(upper, elements.given)
-    shape = pair.num_rows, pair.num_rows
-    rest = [to_scipy(pair.crow, pair.col, v.double(), shape) for v in pair.values[2:4]]
+    rest = [pair.to_scipy(channel) for channel in range(2, min(len(pair.values), 4))]
     found = pattern.pair(upper).beside(rest)
     values = found.values
     if potential is not None:

@@ -19,13 +19,7 @@ from torchlb.operator.batching import shapes_of
 from torchlb.operator.checks import check_tolerance
 from torchlb.operator.medium import elements_of
 from torchlb.operator.storage import OperatorStorage
-from torchlb.operator.through import (
-    BEYOND,
-    origins,
-    through_eigenpairs,
-    through_product,
-    without,
-)
+from torchlb.operator.through import BEYOND, origins, through_eigenpairs, through_product, without
 from torchlb.spectral.eigenbasis import (
     Eigenbasis,
     check_num_pairs,
@@ -218,6 +212,7 @@ class PairMethods(OperatorStorage):
         if not self.modes.has(k) or (tolerance is not None and (errors > tolerance).any()):
             # The basis is kept, and may be used in training.
             with torch.inference_mode(False), threads_for(self.num_points):
+                check_pair(self)
                 self._keep_basis(self._solved_basis(max(k, self.modes.count), tolerance))
         if store:
             self._keep_basis(stored=True)
@@ -227,12 +222,10 @@ class PairMethods(OperatorStorage):
 
     def _solved_basis(self, k: int, tolerance: float | None) -> Eigenbasis:
         """Solve for k eigenpairs; the shapes of a batch solve for their own and keep them, where they are known."""
-        check_pair(self)
-        shapes = shapes_of(self)
-        if shapes:
-            bases = [shape._known_basis(k, tolerance) for shape in shapes]
-            return stack_eigenbases([part for basis in bases for part in unstack_eigenbases(basis)])
-        return self._pair_eigenbasis(k, tolerance)
+        if not (shapes := shapes_of(self)):
+            return self._pair_eigenbasis(k, tolerance)
+        bases = [shape._known_basis(k, tolerance) for shape in shapes]
+        return stack_eigenbases([part for basis in bases for part in unstack_eigenbases(basis)])
 
     def _pair_eigenbasis(self, k: int, tolerance: float | None) -> Eigenbasis:
         """Eigenpairs of the weak pair of each shape; the default tolerance falls with the order."""

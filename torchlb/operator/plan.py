@@ -18,27 +18,27 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from torchlb.errors import DerivativeError, InputError, first_few, renumbered, warn
-from torchlb.galerkin.absorption import absorbing
-from torchlb.galerkin.bilinear import BilinearForm
 from torchlb.galerkin.boundary import BoundaryCurves, OnCurves, OnSurface
 from torchlb.galerkin.curving import BoundaryNodesPlan, CurvingPlan
 from torchlb.galerkin.elements import subsets
-from torchlb.galerkin.forms import Forms, edge_lengths
+from torchlb.galerkin.forms import BilinearForm, Forms, edge_lengths
+from torchlb.galerkin.matrices import PairMatrices
 from torchlb.galerkin.medium import Medium
 from torchlb.galerkin.nodes import lagrange_nodes
-from torchlb.galerkin.pair import PairPlan, WeakPair
+from torchlb.galerkin.pair import PairPlan
 from torchlb.galerkin.tangent import in_space
-from torchlb.geometry.boundary import BoundaryPlan, boundary_faces
+from torchlb.geometry.boundary import BoundaryPlan
 from torchlb.geometry.local_fits import FitPlan, Neighborhoods
 from torchlb.geometry.numbering import Numbering
 from torchlb.geometry.thresholds import FACTOR
+from torchlb.geometry.vectors import Points
 from torchlb.linalg.csr import Csr, Record
 from torchlb.linalg.threads import threads_for
-from torchlb.operator.options import Options
-from torchlb.operator.parts import FIT_FIELDS, ROW_FIELDS, PairMatrices
+from torchlb.operator.report import FIELDS
 from torchlb.stencils.assemble import Stencils
-from torchlb.stencils.conditions import Condition, condition_of
+from torchlb.stencils.conditions import Condition
 from torchlb.stencils.low_order import MeshLowOrder
+from torchlb.stencils.options import Options
 from torchlb.stencils.rows import Rows, RowsPlan
 from torchlb.stencils.shape import Beside, Placed, Shape, ShapePlan
 from torchlb.version import __version__
@@ -49,39 +49,23 @@ Parts = dict[str, Any]
 
 @dataclass(frozen=True)
 class Plan:
-    """The decisions behind an operator with a weak pair; points and cells are in the order of `numbering`.
+    """The decisions behind an operator; points and cells are in the order of `numbering`, which leads to the user's.
 
-    Attributes
-    ----------
-    numbering
-        Map from the user's order of the points, and back.
-    points
-        (N, n), ℓ, where they were made, float64, by which `check_fit` judges others.
-    shape, rows, pair
-        Plans of frames, normals and boundary; of the stencils, None with a certificate; of the weak pair.
-    flips
-        Edge flips that lead to the Delaunay triangles of the low-order rows.
-    faces, order
-        (F, d + 1), the cells in the user's order and numbering; (G,), the index among these of each cell of the plan.
-    on_mesh
-        Whether the cells are the user's, and not a surface through a cloud.
-    moved
-        Points of a noisy curve that were moved.
-    source, options
-        As of the operator.
-    warned
-        Lines of a program that were warned of points that moved too far.
+    They were made at `points`, (N, n), ℓ, float64. There are plans of frames, normals and boundary, `shape`; of the
+    stencils, `rows`, None with a certificate; and of the weak pair, a `PairPlan`, None without. `flips` lead to the
+    Delaunay triangles of the low-order rows. `faces`, (F, d + 1), are the user's; `order`, (G,), has the index among
+    these of each cell of the plan; `moved` are points of a noisy curve that were moved. `source` and `options` are
+    those of the operator. `warned` are the lines of a program that were told of points that moved too far.
     """
 
     numbering: Numbering
-    points: Float[Tensor, "N n"]
+    points: Points
     shape: ShapePlan
     rows: RowsPlan | None
-    pair: PairPlan
+    pair: Any
     flips: list[Tensor]
     faces: Int[Tensor, "F corners"]
     order: Int[Tensor, " G"]
-    on_mesh: bool
     moved: Int[Tensor, " m"]
     source: str
     options: Options
@@ -92,7 +76,7 @@ class Plan:
         """N."""
         return len(self.numbering.given)
 
-    def forms(self, points: Float[Tensor, "N n"]) -> Forms:
+    def forms(self, points: Points) -> Forms:
         """The elements of the weak pair at the user's points, in the user's numbering."""
         here = self._sorted(points)
         _, fits = self.shape.at(here)
@@ -100,7 +84,7 @@ class Plan:
 
     def bilinear(
         self,
-        points: Float[Tensor, "N n"],
+        points: Points,
         forms: Sequence[BilinearForm],
         medium: Medium,
         *,
@@ -133,7 +117,7 @@ class Plan:
         forms = in_space(forms, placed.frames) if tangent else forms
         return self.pair.bilinear(fits, forms, medium)
 
-    def rows_at(self, points: Float[Tensor, "N n"]) -> list[Tensor]:
+    def rows_at(self, points: Points) -> list[Tensor]:
         """Values of Δ and of the derivatives in the frames, (1 + d, nnz), frames and normals, if there are any.
 
         Differentiable in the points, but for a turn of each frame in its plane; of conditions with a share a of the
@@ -153,19 +137,19 @@ class Plan:
                 "points: an operator with a certificate, which says something of these points alone, has no plan for "
                 "others; build it again"
             )
-        cells, shares = self.shape.cells, self.shape.shares
+        cells, options = self.shape.cells, self.options.taken(self.numbering)
         shape = Shape(
             **vars(placed),
             normal_order=self.shape.fits.order,
             neighborhoods=None,
-            areas=areas,
-            low_order=MeshLowOrder(placed.points, cells, self.flips, shares),
-            condition=self.options.held(self.numbering) or Condition(),
-            on_mesh=self.on_mesh,
+            mass=areas,
+            low_order=MeshLowOrder(placed.points, cells, self.flips, self.shape.shares),
+            condition=options.held or Condition(),
+            on_mesh=self.source == "mesh" and cells.shape[1] == 3,
         )
-        return stencils_of(shape, self.options).evaluated(self.rows), shape
+        return Stencils(shape, options).evaluated(self.rows), shape
 
-    def _sorted(self, points: Float[Tensor, "N n"]) -> Float[Tensor, "N n"]:
+    def _sorted(self, points: Points) -> Points:
         if len(self.moved):
             raise InputError(
                 f"points: {len(self.moved)} of the cloud were put elsewhere when the curve through it was found, since "
@@ -174,65 +158,53 @@ class Plan:
         return self.numbering.sorted(points)
 
 
-def evaluate(plan: Plan, points: Float[Tensor, "N n"]) -> Parts:
+def evaluate(plan: Plan, points: Points) -> Parts:
     """An operator by its plan at points, float64 on the CPU; InputError with a certificate or moved points."""
     here = plan._sorted(points)
     with renumbered(plan.numbering.given), threads_for(len(points)):
         placed, fits = plan.shape.at(here)
-        pair_plan, pair = plan.pair.at(fits, plan.numbering)
-        assert pair.mass is not None
-        rows, shape = plan._rows(placed, pair.mass)
+        pair_plan, pair, mass = plan.pair.at(fits, plan.numbering)
+        rows, shape = plan._rows(placed, mass)
     plan = plan if pair_plan is plan.pair else replace(plan, pair=pair_plan)
-    given = plan.numbering, points, plan.faces, plan.source, plan.options
-    return operator_parts(rows, shape, pair, *given, plan)
+    return operator_parts(plan, points, rows, shape, pair)
 
 
 def operator_parts(
-    rows: Rows,
-    shape: Shape,
-    pair: WeakPair | None,
-    numbering: Numbering,
-    points: Float[Tensor, "N n"],
-    faces: Int[Tensor, "F corners"],
-    source: str,
-    options: Options | None,
-    plan: Plan | None,
-    **others: Any,
+    plan: Plan, points: Points, rows: Rows, shape: Shape, pair: PairMatrices | None, **others: Any
 ) -> Parts:
-    """What an operator stores, from rows and a shape in a numbering; points, faces and pair are the user's."""
+    """What an operator stores, from rows and a shape in the order of the plan; points and pair are in the user's."""
+    numbering, options = plan.numbering, plan.options
     given, rows = numbering.restored, rows.restored(numbering)
     counts = rows.length.new_zeros(4, len(points))
-    counts = counts if plan is None else plan.pair.counts[:, numbering.here]
+    counts = counts if plan.pair is None else plan.pair.counts[:, numbering.here]
     report = {"num_neighbors": rows.length, "normal_order": given(shape.normal_order)}
-    report |= vars(rows) | dict(zip(FIT_FIELDS, counts, strict=True))
+    report |= vars(rows) | dict(zip(FIELDS[-4:], counts, strict=True))
     values = torch.cat([rows.laplacian[None], rows.gradient.T])
     parts = others | {
-        "source": source,
-        "options": {} if options is None else options.plain,
-        "_plans": [plan],
+        "source": plan.source,
+        "options": {} if plan.source == "cotangent" else options.plain,
+        "_plans": [None if plan.pair is None else plan],
         "points": points,
-        "faces": faces,
+        "faces": plan.faces,
         "mass": given(shape.areas),
         "frames": given(shape.frames),
         "normals": points[:0] if shape.normals is None else given(shape.normals),
         "stencil": Csr.with_transpose(rows.crow, rows.col, values),
-        "_record": Record({name: report[name] for name in (*ROW_FIELDS, *FIT_FIELDS)}),
+        "_record": Record({name: report[name] for name in FIELDS}),
     }
     if shape.boundary is not None and shape.boundary.mask.any():
         parts["_on_boundary"] = given(shape.boundary.mask)
     if pair is not None:
-        condition = None if options is None else condition_of(options.condition)
+        condition = options.held
         if condition is not None and condition.share is not None and "_on_boundary" in parts:
-            at_boundary = torch.zeros_like(parts["_on_boundary"])
-            at_boundary[boundary_faces(faces).flatten()] = True
-            share = condition.share * parts["_on_boundary"].to(points)
-            pair = absorbing(pair, share, at_boundary)
-        linear = None if pair.linear is None else Csr(**vars(pair.linear))
-        parts["weak"] = PairMatrices(**vars(pair.matrices), linear=linear)
+            pair = pair.absorbing(
+                points, plan.faces, condition.share * parts["_on_boundary"].to(points)
+            )
+        parts["weak"] = pair
     return parts
 
 
-def check_fit(plan: Plan, after: Float[Tensor, "N n"]) -> None:
+def check_fit(plan: Plan, after: Points) -> None:
     """Warn where edges changed by more than `FACTOR` against all others, as what was decided may not fit there.
 
     It warns once for each line of a program. Raises InputError where triangles of the plane, or tetrahedra of space,
@@ -292,14 +264,3 @@ def unpacked(data: Tensor) -> list[Plan | None]:
             "again"
         )
     return plans
-
-
-def stencils_of(shape: Shape, options: Options) -> Stencils:
-    """The stencils of a shape: they decide rows, and evaluate them."""
-    return Stencils(
-        shape,
-        options.order,
-        projection=options.projection,
-        weights=options.weights,
-        num_neighbors=options.num_neighbors,
-    )

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import torch
 from jaxtyping import Float, Int
@@ -150,3 +150,7 @@ class StencilReport:
         if self.surface is not None:
             lines.append(str(self.surface))
         return "\n".join(lines)
+
+
+FIELDS = tuple(each.name for each in fields(StencilReport))[2:-1]
+"""The figures of each point, the last four of them of the weak pair."""

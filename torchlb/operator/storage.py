@@ -14,17 +14,11 @@ from torch import Tensor
 from torchlb.certified.certificate import Certificate
 from torchlb.cloud.surface import SurfaceSummary
 from torchlb.errors import InputError, first_few, warn
+from torchlb.galerkin.matrices import PairMatrices
 from torchlb.linalg.csr import Csr, Record, Tensors, tensors_of
-from torchlb.operator.parts import (
-    FIT_FIELDS,
-    REAL_FIELDS,
-    ROW_FIELDS,
-    MediumFields,
-    Modes,
-    OperatorCache,
-    PairMatrices,
-)
+from torchlb.operator.parts import MediumFields, Modes, OperatorCache
 from torchlb.operator.plan import packed, unpacked
+from torchlb.operator.report import FIELDS
 from torchlb.spectral.eigenbasis import Eigenbasis
 from torchlb.stencils.conditions import Condition, condition_of, kind_of
 
@@ -71,8 +65,8 @@ class OperatorStorage(Tensors):
         self._cache: OperatorCache | None = None
         self._medium = MediumFields({})
         self.stencil, self.weak, self.modes = Csr(order_t=whole), PairMatrices(), Modes(None, none)
-        fields = {n: none if n in REAL_FIELDS else whole for n in (*ROW_FIELDS, *FIT_FIELDS)}
-        self._record = Record(fields)
+        real = dict.fromkeys(("growth", "condition", "off_diagonal_ratio"), none)
+        self._record = Record(dict.fromkeys(FIELDS, whole) | real)
 
     def __getstate__(self) -> dict[str, Any]:
         """State for copies and files, without the cache."""

@@ -17,14 +17,14 @@ from torch import Tensor
 from torch.nn.functional import pad
 
 from torchlb.errors import DerivativeError, first_few
-from torchlb.galerkin.bilinear import BilinearForm
+from torchlb.galerkin.forms import BilinearForm
+from torchlb.galerkin.matrices import PairMatrices
 from torchlb.galerkin.medium import Field
 from torchlb.linalg.csr import side_by_side, tensors_of
 from torchlb.linalg.once import once_differentiable
 from torchlb.linalg.precision import ROOT_EPS
 from torchlb.operator.batching import shapes_of
 from torchlb.operator.medium import plain
-from torchlb.operator.parts import PairMatrices
 from torchlb.operator.systems import pair_system
 from torchlb.spectral.eigenbasis import Eigenbasis, unstack_eigenbases
 
@@ -35,8 +35,9 @@ Forms = Callable[..., Sequence[BilinearForm]]
 
 
 class _Origin(NamedTuple):
-    """What the weak pair of one shape follows from: points, a medium, and bilinear forms of both."""
+    """What the weak pair of one shape, of this size, follows from: points, a medium, and bilinear forms of both."""
 
+    size: int
     points: Tensor
     medium: dict[str, Field]
     bilinear: Callable[..., Tensor] | None
@@ -87,24 +88,21 @@ def _finite(gradient: Tensor) -> Tensor:
     return gradient
 
 
-class Origins(NamedTuple):
-    """The origins of a shape, or of all shapes of a batch with their numbers of points."""
-
-    parts: list[_Origin]
-    sizes: list[int]
+class Origins(list[_Origin]):
+    """The origins of the shapes of a batch, or of one shape."""
 
     @property
     def variables(self) -> list[Tensor]:
         """All points and fields that require a gradient."""
-        return [v for part in self.parts for v in part.variables]
+        return [v for part in self for v in part.variables]
 
     def gradient(self, forms: Sequence[BilinearForm]) -> list[Tensor]:
         """The derivative of a sum of bilinear forms in the variables."""
-        rows: dict[int, tuple[Tensor, ...]] = {}
-        for f in (f for form in forms for f in (form.w, form.u)):
-            rows[id(f)] = f.detach().cpu().double().split(self.sizes)
+        sizes = [part.size for part in self]
+        functions = {id(f): f for form in forms for f in (form.w, form.u)}
+        rows = {k: f.detach().cpu().double().split(sizes) for k, f in functions.items()}
         found = []
-        for s, part in enumerate(self.parts):
+        for s, part in enumerate(self):
             if part.variables:
                 own = [
                     BilinearForm(f.name, rows[id(f.w)][s], rows[id(f.u)][s], f.c.cpu().double())
@@ -129,11 +127,12 @@ def origins(lb: Any) -> Origins | None:
             "a batch that was copied, cast or moved does not know the shapes whose points or medium require gradients; "
             "move the shapes, and batch them then"
         )
-    parts = []
+    found = Origins()
     for shape in shapes:
-        origin = _Origin(shape.points, shape._medium.fields(len(shape.points)), None, shape.weak)
-        parts.append(origin._replace(bilinear=shape._bilinear()) if origin.variables else origin)
-    return Origins(parts, [shape.num_points for shape in shapes])
+        medium = shape._medium.fields(len(shape.points))
+        origin = _Origin(shape.num_points, shape.points, medium, None, shape.weak)
+        found.append(origin._replace(bilinear=shape._bilinear()) if origin.variables else origin)
+    return found
 
 
 def _root_of_absorption(weak: PairMatrices) -> Tensor | None:

@@ -18,7 +18,7 @@ from jaxtyping import Float, Shaped
 from torch import Tensor
 
 from torchlb.errors import InputError, shown
-from torchlb.galerkin.bilinear import BilinearForm
+from torchlb.galerkin.forms import BilinearForm
 from torchlb.linalg.checks import check_choice, check_tensor, takes_arrays
 from torchlb.linalg.csr import shaped_like, side_by_side
 from torchlb.linalg.exponential import chebyshev_vectors, heat, poles, rational_coefficients

@@ -10,7 +10,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from torchlb.errors import InputError
-from torchlb.galerkin.weak_gradient import WeakGradient
+from torchlb.galerkin.tangent import WeakGradient
 from torchlb.linalg.checks import check_operator, check_tensor
 from torchlb.linalg.csr import Csr
 from torchlb.operator.laplace_beltrami import LaplaceBeltrami

@@ -9,7 +9,7 @@ from jaxtyping import Float, Shaped
 from torch import Tensor
 
 from torchlb.errors import InputError
-from torchlb.galerkin.bilinear import BilinearForm
+from torchlb.galerkin.forms import BilinearForm
 from torchlb.linalg.checks import check_finite, takes_arrays
 from torchlb.linalg.csr import shaped_like, side_by_side
 from torchlb.linalg.once import once_differentiable

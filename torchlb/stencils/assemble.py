@@ -24,14 +24,8 @@ from torchlb.geometry.candidates import Candidate, Search, list_candidates
 from torchlb.geometry.frames import local_heights, local_offsets
 from torchlb.geometry.thresholds import FACTOR
 from torchlb.linalg.precision import AT_ONCE, NEGLIGIBLE, rows_at_once
-from torchlb.stencils.rows import (
-    Reason,
-    Rows,
-    RowsPlan,
-    matrix_rows,
-    stencil_rows,
-    tangent_weights,
-)
+from torchlb.stencils.options import Options
+from torchlb.stencils.rows import Reason, Rows, RowsPlan, matrix_rows, stencil_rows, tangent_weights
 from torchlb.stencils.shape import Shape
 
 RULES = list(WEIGHT_RULES)
@@ -65,24 +59,15 @@ class Stencils:
     """Rows of a shape, each by the first of its candidates that passes.
 
     The first candidates have the order p ≥ 1, and all of them `num_neighbors` points, if that is given, instead of
-    `SIZE_FACTORS`. The projection is one of `PROJECTIONS`, the rule for the weights one of `WEIGHT_RULES`.
+    `SIZE_FACTORS`.
     """
 
-    def __init__(
-        self,
-        shape: Shape,
-        order: int,
-        *,
-        projection: str = "tangent",
-        weights: str = "least_squares",
-        num_neighbors: int | None = None,
-    ) -> None:
-        self.shape, self.order, self.projection = shape, order, projection
-        self.num_neighbors, self.placed = num_neighbors, (shape.points, shape.frames)
+    def __init__(self, shape: Shape, options: Options) -> None:
+        self.shape, self.order, self.projection = shape, options.order, options.projection
+        self.num_neighbors, self.placed = options.num_neighbors, (shape.points, shape.frames)
         self.dim = shape.frames.shape[-1]
-        self.candidates = stencil_candidates(
-            self.dim, order, weights, num_neighbors, on_mesh=shape.on_mesh
-        )
+        given = self.order, options.weights, self.num_neighbors
+        self.candidates = stencil_candidates(self.dim, *given, on_mesh=shape.on_mesh)
         share, boundary = shape.condition.share, shape.boundary
         self.share = None if share is None or boundary is None else share * boundary.folds
 
@@ -141,9 +126,7 @@ class Stencils:
         low = every[plan.candidate == len(self.candidates)]
         if len(low):
             blocks.append((low, self._low_order_rows(low, self._planned_gradients(low, plan))))
-        rows = self._finished(every, blocks)
-        rows = rows.on_pattern(plan) if len(low) else rows
-        return replace(rows, reason=plan.reason)
+        return replace(self._finished(every, blocks), reason=plan.reason)
 
     def _finished(
         self, centers: Int[Tensor, " B"], blocks: list[tuple[Int[Tensor, " _"], Rows]]
@@ -273,11 +256,7 @@ class Stencils:
         return local_heights(*self.placed, index, coords)
 
     def _stencil_rows(
-        self,
-        index: Int[Tensor, "B K"],
-        weights: Weights,
-        number: int,
-        touching: Bool[Tensor, " B"],
+        self, index: Int[Tensor, "B K"], weights: Weights, number: int, touching: Bool[Tensor, " B"]
     ) -> Rows:
         """Rows of stencils of the candidate `number`."""
         candidate = self.candidates[number]

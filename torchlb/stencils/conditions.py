@@ -13,6 +13,7 @@ from torch import Tensor
 
 from torchlb.errors import InputError, first_few
 from torchlb.geometry.boundary import Boundary
+from torchlb.geometry.vectors import Points
 from torchlb.linalg.precision import LOW
 from torchlb.stencils.rows import Rows
 
@@ -74,7 +75,7 @@ class Condition:
 
     def finish(
         self,
-        points: Float[Tensor, "N n"],
+        points: Points,
         areas: Float[Tensor, " N"],
         boundary: Boundary,
         centers: Int[Tensor, " B"],
@@ -111,7 +112,7 @@ class Dirichlet(Condition):
 
     def finish(
         self,
-        points: Float[Tensor, "N n"],
+        points: Points,
         areas: Float[Tensor, " N"],
         boundary: Boundary,
         centers: Int[Tensor, " B"],

@@ -6,15 +6,17 @@ from dataclasses import dataclass
 from functools import cached_property
 from math import factorial
 
+import numpy as np
 import torch
-from jaxtyping import Complex, Float, Int
+from jaxtyping import Float, Int
 from scipy import sparse
 from torch import Tensor
 
 from torchlb.errors import first_few, warn
-from torchlb.galerkin.assembly import linear_blocks, summed
+from torchlb.galerkin.assembly import ElementMatrices, Elements, summed
 from torchlb.galerkin.delaunay import delaunay_cover, sound_lengths
 from torchlb.galerkin.nodes import lagrange_nodes
+from torchlb.geometry.vectors import Points
 from torchlb.linalg.precision import ROUNDING
 from torchlb.linalg.sparse import with_diagonal
 
@@ -29,7 +31,7 @@ class MeshLowOrder:
     integrated.
     """
 
-    points: Float[Tensor, "N n"]
+    points: Points
     cells: Int[Tensor, "F corners"]
     planned: list[Tensor] | None = None
     shares: Float[Tensor, " F"] | None = None
@@ -39,24 +41,21 @@ class MeshLowOrder:
         """Edge flips to the triangulation; none where it was not needed, or for other cells than triangles."""
         return self._elements[2] if "_elements" in vars(self) else []
 
-    def _blocks(
-        self,
-    ) -> tuple[Int[Tensor, "T corners"], Complex[Tensor, "T entries"], list[Tensor]]:
-        """Cells, their element matrices K + iM, differentiable in the points, and flips."""
-        nodes, flips, share = lagrange_nodes(self.cells, len(self.points), 1), [], self.shares
+    def _matrices(self) -> tuple[ElementMatrices, list[Tensor]]:
+        """Element matrices K + iM, differentiable in the points, and flips."""
+        nodes, flips = lagrange_nodes(self.cells, len(self.points), 1), []
+        share = 1.0 if self.shares is None else self.shares
         cells, lengths = nodes.cells, sound_lengths(nodes.lengths(self.points), nodes.cells)
         if nodes.dim == 2:
             free = torch.zeros(len(nodes.edges), dtype=torch.bool)
             cover = delaunay_cover(cells, lengths, nodes.edge, free, self.planned)
-            cells, lengths, flips = cover.faces, cover.lengths, cover.flips
-            share = torch.full((len(cells),), 0.5).to(lengths)
-        blocks = linear_blocks(lengths, cells)
-        return cells, blocks if share is None else share[:, None] * blocks, flips
+            cells, lengths, flips, share = cover.faces, cover.lengths, cover.flips, 0.5
+        return Elements.flat(cells, lengths, share=share).matrices(), flips
 
     @cached_property
     def _elements(self) -> tuple[sparse.csr_array, Float[Tensor, " N"], list[Tensor]]:
         """Rows of Δ, lumped masses, none of them zero, and flips."""
-        cells, blocks, flips = self._blocks()
+        (cells, blocks), flips = self._matrices()
         pair = summed(blocks.detach(), cells, len(self.points))
         mass = torch.from_numpy(pair.imag.sum(axis=1))
         least = ROUNDING * mass.mean()
@@ -67,8 +66,9 @@ class MeshLowOrder:
                 f"{ROUNDING:.0e} of the mean is taken, so that rows stay finite"
             )
         mass = mass.clamp_min(least)
-        strong = -sparse.diags_array(1 / mass.numpy()) @ pair.real
-        return with_diagonal(sparse.csr_array(strong)), mass, flips
+        strong = pair.real  # with entries that are zero: all points have one pattern
+        strong.data /= -mass.numpy().repeat(np.diff(strong.indptr))
+        return with_diagonal(strong), mass, flips
 
     def rows(self, centers: Int[Tensor, " B"]) -> sparse.csr_array:
         """Rows (B, N) of Δ, 1/ℓ²."""
@@ -76,7 +76,7 @@ class MeshLowOrder:
 
     def entries(self, row: Int[Tensor, " e"], col: Int[Tensor, " e"]) -> Float[Tensor, " e"]:
         """Entries of Δ, 1/ℓ², differentiable in the points."""
-        cells, blocks, _ = self._blocks()
+        (cells, blocks), _ = self._matrices()
         count, corners = len(self.points), cells.shape[1]
         first, second = cells.repeat_interleave(corners, 1).flatten(), cells.repeat(1, corners)
         mass = blocks.imag.new_zeros(count).index_add(0, first, blocks.imag.flatten())

@@ -15,7 +15,7 @@ from torchlb.fits.rules import WEIGHT_RULES
 from torchlb.fits.weights import Weights
 from torchlb.geometry.numbering import Numbering
 from torchlb.geometry.thresholds import SLIGHT
-from torchlb.geometry.vectors import at
+from torchlb.geometry.vectors import Frames, Points, at
 from torchlb.linalg.precision import NEGLIGIBLE, ROOT_EPS
 from torchlb.linalg.sparse import from_scipy
 
@@ -44,12 +44,8 @@ class Reason(IntEnum):
 class Pattern:
     """Which columns consecutive rows of a sparse matrix have.
 
-    Attributes
-    ----------
-    length
-        (B,), number of entries of each row.
-    col
-        (nnz,), columns, ascending within a row.
+    `length`, (B,), counts the entries of each row; `col`, (nnz,), are ascending within a row.
+
     """
 
     length: Int[Tensor, " B"]
@@ -70,24 +66,12 @@ class Pattern:
 class Rows(Pattern):
     """Consecutive rows of the operator in CSR, with a record of each stencil.
 
-    Attributes
-    ----------
-    laplacian, gradient
-        (nnz,), 1/ℓ²; (nnz, d), 1/ℓ, in the frame of the row's point.
-    candidate, rule
-        (B,), index into the list of candidates, and into `WEIGHT_RULES`; their lengths for a low-order row.
-    order
-        (B,), order of accuracy p; 0 for a low-order row.
-    growth
-        (B,), ρ² Σ|w|, the factor of the a-priori error bound.
-    condition
-        (B,), condition number of the scaled weighted Vandermonde matrix.
-    off_diagonal_ratio
-        (B,), Σ_{j≠i}|w_ij| / |w_ii|; 1 for an M-matrix row.
-    slope
-        (B,), degree of the gradient's fit where it has one of its own, else 0.
-    reason
-        (B,), a `Reason`.
+    Entries have values `laplacian`, 1/ℓ², and `gradient`, 1/ℓ, in the frame of the row's point. Of each row there are:
+    `candidate` and `rule`, indices into the list of candidates and into `WEIGHT_RULES`, or their lengths for a
+    low-order row; its `order` of accuracy, 0 for a low-order row; its `growth` ρ² Σ|w|, the factor of the a-priori
+    error bound; the `condition` number of the scaled weighted Vandermonde matrix; its `off_diagonal_ratio`
+    Σ_{j≠i}|w_ij| / |w_ii|, 1 for an M-matrix row; `slope`, the degree of the gradient's fit where it has one of its
+    own, else 0; and a `Reason`.
     """
 
     laplacian: Float[Tensor, " nnz"]
@@ -134,22 +118,6 @@ class Rows(Pattern):
         _, col, entry = numbering.restored_pattern(self.crow, self.col)
         return replace(self._taken(entry, numbering.here), col=col)
 
-    def on_pattern(self, other: Pattern) -> Rows:
-        """Rows on the pattern of `other`; entries outside it are added to the diagonal."""
-        span = int(max(self.col.max(), other.col.max())) + 1
-        ours, theirs = (rows.row * span + rows.col for rows in (self, other))
-        place = torch.searchsorted(theirs, ours).clamp_max(len(theirs) - 1)
-        there = theirs[place] == ours
-        values = torch.cat([self.laplacian[:, None], self.gradient], 1)
-        found = values.new_zeros(len(theirs), values.shape[1])
-        found.index_add_(0, place[there], values[there])
-        diagonal = other.row == other.col
-        lost = values.new_zeros(len(self.length), values.shape[1])
-        lost.index_add_(0, self.row[~there], values[~there])
-        found[diagonal] += lost[other.row[diagonal]]
-        entries = {"laplacian": found[:, 0], "gradient": found[:, 1:]}
-        return replace(self, length=other.length, col=other.col.long(), **entries)
-
     @staticmethod
     def stack(blocks: Iterable[Rows]) -> Rows:
         """Concatenate blocks of rows."""
@@ -190,10 +158,7 @@ def to_tangent_vectors(
 
 
 def tangent_weights(
-    points: Float[Tensor, "N n"],
-    frames: Float[Tensor, "N n d"],
-    index: Int[Tensor, "B K"],
-    gradient: Float[Tensor, "B K d"],
+    points: Points, frames: Frames, index: Int[Tensor, "B K"], gradient: Float[Tensor, "B K d"]
 ) -> Float[Tensor, "B K d"]:
     """Weights of ∇ in the frames, from those of derivatives along coordinates; `index` has the centre first."""
     offset = at(points, index) - at(points, index[:, 0])[:, None]
@@ -202,8 +167,8 @@ def tangent_weights(
 
 
 def stencil_rows(
-    points: Float[Tensor, "N n"],
-    frames: Float[Tensor, "N n d"],
+    points: Points,
+    frames: Frames,
     index: Int[Tensor, "B K"],
     weights: Weights,
     candidate: int,
@@ -233,10 +198,7 @@ def stencil_rows(
 
 
 def matrix_rows(
-    matrix: sparse.csr_array,
-    points: Float[Tensor, "N n"],
-    frames: Float[Tensor, "N n d"],
-    centers: Int[Tensor, " B"],
+    matrix: sparse.csr_array, points: Points, frames: Frames, centers: Int[Tensor, " B"]
 ) -> Rows:
     """Rows of a given strong-form matrix (B, N), with the least-squares gradient over the points of each row.
 

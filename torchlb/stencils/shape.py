@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import NamedTuple
 
 import torch
@@ -23,12 +24,11 @@ from torchlb.geometry.frames import complete_frames, mesh_frames, normals_of_fra
 from torchlb.geometry.local_fits import FitPlan, LocalFits
 from torchlb.geometry.neighbors import GraphNeighborhoods, mesh_graph, nearest_neighbors
 from torchlb.geometry.thresholds import NEAREST
-from torchlb.geometry.vectors import dot
+from torchlb.geometry.vectors import Frames, Points, dot
 from torchlb.linalg.precision import AT_ONCE, TINY
-from torchlb.stencils.conditions import Condition, Neumann
+from torchlb.stencils.conditions import Condition
 from torchlb.stencils.low_order import MeshLowOrder
-
-NEUMANN = Neumann()
+from torchlb.stencils.options import Options
 
 
 @dataclass(frozen=True)
@@ -39,9 +39,9 @@ class Placed:
     consistently on a cloud. There is no boundary of a closed shape, nor where no condition holds.
     """
 
-    points: Float[Tensor, "N n"]
-    frames: Float[Tensor, "N n d"]
-    normals: Float[Tensor, "N n"] | None
+    points: Points
+    frames: Frames
+    normals: Points | None
     boundary: Boundary | None
 
 
@@ -49,18 +49,11 @@ class Placed:
 class ShapePlan:
     """Plan of a shape of simplices.
 
-    Attributes
-    ----------
-    cells, shares
-        Simplices whose planes give the initial frames; the fraction of each that is integrated, None for all of it.
-    fits
-        Plan of the fits of heights, and of functions where a weak pair is built.
-    beside
-        Data of the surface through a cloud; None where points stay as given and frames start from the cells.
-    side
-        Sign of each normal along that of the cells around the vertex; None for shapes without sides.
-    boundary
-        Plan of the boundary, as in `Placed`.
+    The planes of the `cells` give the initial frames; `shares` are the fractions of them that are integrated, None for
+    all. `fits` plans the fits of heights, and of functions where a weak pair is built; `beside` has the data of the
+    surface through a cloud, None where points stay as given and frames start from the cells; `side` is the sign of each
+    normal along that of the cells around the vertex, None for shapes without sides; `boundary` is as in `Placed`.
+
     """
 
     cells: Int[Tensor, "F corners"]
@@ -70,7 +63,7 @@ class ShapePlan:
     side: Int[Tensor, " N"] | None
     boundary: BoundaryPlan | None
 
-    def at(self, points: Float[Tensor, "N n"]) -> tuple[Placed, LocalFits]:
+    def at(self, points: Points) -> tuple[Placed, LocalFits]:
         """Frames, normals and boundary at these points, and the fits behind them."""
         if self.beside is None:
             places, initial = points, mesh_frames(points, self.cells)
@@ -106,7 +99,7 @@ class Beside(NamedTuple):
     @classmethod
     def of(
         cls,
-        given: Float[Tensor, "N n"],
+        given: Points,
         places: Float[Tensor, "N 3"],
         triangles: Int[Tensor, "F 3"],
         nearest: Int[Tensor, " N"],
@@ -122,9 +115,7 @@ class Beside(NamedTuple):
         axes, offsets = _axes(places, triangles, neighbor)[0], (axes[moved] @ offset[..., None])
         return cls(neighbor, (axes @ normals[..., None])[..., 0], moved, offsets[..., 0])
 
-    def places(
-        self, points: Float[Tensor, "N n"], triangles: Int[Tensor, "F 3"]
-    ) -> Float[Tensor, "N n"]:
+    def places(self, points: Points, triangles: Int[Tensor, "F 3"]) -> Points:
         """Positions on the surface for given points."""
         if len(self.moved) == 0:
             return points
@@ -133,9 +124,7 @@ class Beside(NamedTuple):
         offset = (self.offsets[:, None] @ axes[self.moved])[:, 0] * size[self.moved, None]
         return space.index_add(0, self.moved, offset)[:, : points.shape[1]]
 
-    def frames(
-        self, places: Float[Tensor, "N n"], triangles: Int[Tensor, "F 3"]
-    ) -> Float[Tensor, "N n 2"]:
+    def frames(self, places: Points, triangles: Int[Tensor, "F 3"]) -> Float[Tensor, "N n 2"]:
         """Initial frames, orthogonal to the initial normals in R³."""
         if places.shape[1] == 2:
             return mesh_frames(places, triangles)
@@ -165,28 +154,24 @@ def _axes(
 class Shape(Placed):
     """A shape ready for stencils.
 
-    Attributes
-    ----------
-    normal_order
-        Degree q of the fit behind each frame; 0 for an initial frame.
-    neighborhoods, plan, fits
-        k-hop neighbourhoods, plan of the shape and fits evaluated from it; None where the rows are planned already.
-    areas
-        Positive shares of the area to first order, ℓ^d.
-    low_order
-        Rows for points without a stencil.
-    on_mesh
-        Whether triangles are given, which follow the surface where its points do not resolve it.
+    `normal_order` is the degree q of the fit behind each frame, 0 for an initial frame; `neighborhoods`, `plan` and
+    `fits` are None where the rows are planned already. `on_mesh` says whether triangles are given, which follow the
+    surface where its points do not resolve it.
     """
 
     normal_order: Int[Tensor, " N"]
     neighborhoods: GraphNeighborhoods | None
-    areas: Float[Tensor, " N"]
     low_order: MeshLowOrder
     condition: Condition
     on_mesh: bool = False
     plan: ShapePlan | None = None
     fits: LocalFits | None = None
+    mass: Float[Tensor, " N"] | None = None
+
+    @cached_property
+    def areas(self) -> Float[Tensor, " N"]:
+        """Positive shares of the area, ℓ^d: the mass where it is known, else to first order."""
+        return self.low_order.areas() if self.mass is None else self.mass
 
     @property
     def held(self) -> Bool[Tensor, " N"] | None:
@@ -195,53 +180,42 @@ class Shape(Placed):
 
 
 def mesh_shape(
-    vertices: Float[Tensor, "N n"],
+    vertices: Points,
     faces: Int[Tensor, "F v"],
-    normal_order: int,
+    options: Options,
     *,
-    num_neighbors: int | None = None,
     boundary: Bool[Tensor, " N"] | None = None,
-    condition: Condition | None = NEUMANN,
-    fit_degrees: tuple[int, ...] = (),
     progress: bool = True,
     shares: Float[Tensor, " F"] | None = None,
     on_mesh: bool = True,
 ) -> Shape:
     """Shape of a mesh of segments, triangles or tetrahedra in Rⁿ, with graph and frames from its cells.
 
-    `condition` holds on the boundary, or on the part of it in the mask `boundary`; None imposes nothing. `fit_degrees`
-    requests `fits` of the first of these degrees that passes. Where faces overlap, `shares` weights each of them, and
-    `boundary` alone marks where the shape ends. Triangles reconstructed from a cloud are not `on_mesh`.
+    A condition holds on the boundary, or on the part of it in the mask `boundary`. Where faces overlap, `shares`
+    weights each of them, and `boundary` alone marks where the shape ends. Triangles through a cloud are not `on_mesh`.
     """
-    sides = None
-    hypersurface = faces.shape[1] == vertices.shape[1] and faces.shape[1] < 4
-    if hypersurface and consistently_wound(faces):
+    sides, degree = None, options.q
+    if faces.shape[1] == vertices.shape[1] < 4 and consistently_wound(faces):
         candidates = nearest_neighbors(vertices, min(NEAREST, len(vertices)))
         sides = thin_sides(vertices, vertex_normals(vertices, faces), candidates)
-    neighborhoods = GraphNeighborhoods(
-        vertices, mesh_graph(faces, len(vertices)), mesh_frames(vertices, faces), sides
-    )
-    plan, fits = _searched(neighborhoods, normal_order, num_neighbors, progress, fit_degrees)
+    graph = mesh_graph(faces, len(vertices))
+    neighborhoods = GraphNeighborhoods(vertices, graph, mesh_frames(vertices, faces), sides)
     edge = None
     if shares is not None and boundary is not None:
-        edge = boundary_of_cloud(vertices, boundary, faces.shape[1] - 1, normal_order)
-    elif shares is None and (condition is not None or boundary is not None):
-        edge = boundary_of_mesh(vertices, faces, normal_order)
+        edge = boundary_of_cloud(vertices, boundary, faces.shape[1] - 1, degree)
+    elif shares is None and (options.held is not None or boundary is not None):
+        edge = boundary_of_mesh(vertices, faces, degree)
         edge = edge if boundary is None else _part(edge, boundary)
-    side = torch.ones(len(vertices), dtype=torch.int8) if hypersurface else None
-    whole = ShapePlan(faces, shares, plan, None, side, None if condition is None else edge)
-    return _shape(whole, fits, neighborhoods, condition, on_mesh and faces.shape[1] == 3)
+    on_mesh = on_mesh and faces.shape[1] == 3
+    return _shape(neighborhoods, faces, edge, options, progress, shares=shares, on_mesh=on_mesh)
 
 
 def surface_shape(
-    given: Float[Tensor, "N n"],
+    given: Points,
     surface: CloudSurface,
-    normal_order: int,
+    options: Options,
     *,
-    num_neighbors: int | None = None,
     boundary: Bool[Tensor, " N"] | None = None,
-    condition: Condition | None = NEUMANN,
-    fit_degrees: tuple[int, ...] = (),
     progress: bool = True,
 ) -> Shape:
     """Shape of a cloud in R² or R³, from the triangles and normals of a surface through it.
@@ -249,9 +223,10 @@ def surface_shape(
     The boundary is that of the surface, except for points of local stars, or the mask `boundary`. Lone points belong to
     no neighbourhood but their own.
     """
-    flat, points = given.shape[1] == 2, surface.points[:, : given.shape[1]]
+    points, degree = surface.points[:, : given.shape[1]], options.q
     triangles = torch.cat([surface.cells, surface.stars])
-    sides = None if flat else thin_sides(points, surface.normals, surface.neighbors)
+    normals = None if given.shape[1] == 2 else surface.normals
+    sides = None if normals is None else thin_sides(points, normals, surface.neighbors)
     graph = mesh_graph(triangles, len(points))
     if surface.lone.any():
         others = sparse.diags_array((~surface.lone).numpy().astype(graph.dtype))
@@ -260,45 +235,63 @@ def surface_shape(
     beside = Beside.of(given, surface.points, triangles, surface.neighbors[:, 1], surface.normals)
     points = beside.places(given, triangles)
     neighborhoods = GraphNeighborhoods(points, graph, beside.frames(points, triangles), sides)
-    plan, fits = _searched(neighborhoods, normal_order, num_neighbors, progress, fit_degrees)
     edge = None
-    if condition is not None:
-        edge = boundary_of_mesh(points, surface.cells, normal_order)
+    if options.held is not None:
+        edge = boundary_of_mesh(points, surface.cells, degree)
         if edge is not None and len(surface.stars):
             edge = _part(edge, edge.mask & ~torch.isin(torch.arange(len(points)), surface.stars))
         found = torch.zeros(len(points), dtype=torch.bool) if edge is None else edge.mask
         if boundary is not None and not torch.equal(boundary, found):
-            edge = boundary_of_cloud(points, boundary, 2, normal_order)
-    side = None
-    if not flat:
-        _, own = righthanded(fits.frames, surface.normals)
-        assert own is not None
-        against = (own * vertex_normals(points, triangles)).sum(1) < 0
-        side = torch.where(against, -1, 1).to(torch.int8)
-    whole = ShapePlan(triangles, None, plan, beside, side, edge)
-    return _shape(whole, fits, neighborhoods, condition)
+            edge = boundary_of_cloud(points, boundary, 2, degree)
+    return _shape(neighborhoods, triangles, edge, options, progress, beside=beside, normals=normals)
 
 
 def _shape(
-    plan: ShapePlan,
-    fits: LocalFits,
     neighborhoods: GraphNeighborhoods,
-    condition: Condition | None,
+    cells: Int[Tensor, "F corners"],
+    edge: BoundaryPlan | None,
+    options: Options,
+    progress: bool,
+    *,
+    shares: Float[Tensor, " F"] | None = None,
+    beside: Beside | None = None,
+    normals: Points | None = None,
     on_mesh: bool = False,
 ) -> Shape:
-    """Shape of a plan at the points that it was made for, with the data that the search for stencils needs."""
-    placed, sides = plan.placed(fits), neighborhoods.sides
+    """Shape with fitted tangent planes, of order q (initial ones if q = 0 or in a flat space), and functions.
+
+    Normals are on the side of the given ones, or of the cells. It has the data that the search for stencils needs.
+    """
+    points, dim, sides = neighborhoods.points, neighborhoods.dim, neighborhoods.sides
+    degree = 0 if dim == points.shape[1] else options.q
+    search = FitSearch(neighborhoods, degree, options.elements[1], options.num_neighbors)
+    if degree == 0:
+        search.order.fill_(options.q)
+    else:
+        parts = torch.arange(len(points)).split(AT_ONCE)
+        for centers in tqdm(parts, "tangent frames", delay=2, disable=not progress, leave=False):
+            search.refine(centers)
+    fit_plan, fits = search.finish()
+    side = None
+    if dim == points.shape[1] - 1 < 3:
+        side = torch.ones(len(points), dtype=torch.int8)
+        if normals is not None:
+            _, own = righthanded(fits.frames, normals)
+            assert own is not None
+            side[(own * vertex_normals(points, cells)).sum(1) < 0] = -1
+    held = options.held
+    plan = ShapePlan(cells, shares, fit_plan, beside, side, None if held is None else edge)
+    placed = plan.placed(fits)
     if sides is not None:  # by the normals of the refined frames
         marked = (sides != 0).any(1, keepdim=True)
         sides = turned(normals_of_frames(placed.frames), sides) * marked
-    low_order = MeshLowOrder(placed.points, plan.cells, shares=plan.shares)
+    low_order = MeshLowOrder(placed.points, cells, shares=shares)
     return Shape(
         **vars(placed),
-        normal_order=plan.fits.order,
+        normal_order=fit_plan.order,
         neighborhoods=replace(neighborhoods, frames=placed.frames, sides=sides),
-        areas=low_order.areas(),
         low_order=low_order,
-        condition=Condition() if condition is None else condition,
+        condition=Condition() if held is None else held,
         on_mesh=on_mesh,
         plan=plan,
         fits=fits,
@@ -316,33 +309,12 @@ def _part(boundary: BoundaryPlan | None, mask: Bool[Tensor, " N"]) -> BoundaryPl
     return None if boundary is None or not mask.any() else replace(boundary, mask=mask)
 
 
-def _searched(
-    neighborhoods: GraphNeighborhoods,
-    degree: int,
-    num_neighbors: int | None,
-    progress: bool,
-    fit_degrees: tuple[int, ...],
-) -> tuple[FitPlan, LocalFits]:
-    """Fit tangent planes of order q (initial ones if q = 0 or in a flat space), and functions."""
-    flat = neighborhoods.dim == neighborhoods.points.shape[1]
-    search = FitSearch(neighborhoods, 0 if flat else degree, fit_degrees, num_neighbors)
-    if flat or degree == 0:
-        search.order.fill_(degree)
-    else:
-        parts = torch.arange(len(neighborhoods.points)).split(AT_ONCE)
-        for centers in tqdm(parts, "tangent frames", delay=2, disable=not progress, leave=False):
-            search.refine(centers)
-    return search.finish()
-
-
 def turned(normals: Tensor, reference: Tensor) -> Tensor:
     """Flip the normals to the side of `reference`."""
     return torch.where(((normals * reference).sum(1) < 0)[:, None], -normals, normals)
 
 
-def righthanded(
-    frames: Float[Tensor, "N n d"], reference: Float[Tensor, "N n"] | None
-) -> tuple[Float[Tensor, "N n d"], Float[Tensor, "N n"] | None]:
+def righthanded(frames: Frames, reference: Points | None) -> tuple[Frames, Points | None]:
     """Frames with [frames, normal] right-handed, and normals of a hypersurface on the side of `reference`."""
     if frames.shape[2] != frames.shape[1] - 1:
         return frames, None

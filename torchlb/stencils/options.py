@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import operator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, get_args
 
 from torchlb.errors import InputError
@@ -20,11 +20,11 @@ class Options:
     """A user's choices, as passed."""
 
     order: int
-    normal_order: int | None
-    projection: Projection
-    weights: WeightsName
-    num_neighbors: int | None
-    condition: ConditionName | Condition | dict[str, Any] | None
+    normal_order: int | None = None
+    projection: Projection = "tangent"
+    weights: WeightsName = "least_squares"
+    num_neighbors: int | None = None
+    condition: ConditionName | Condition | dict[str, Any] | None = "neumann"
     weak_form: bool | None = True
     certify: bool | None = False
 
@@ -36,13 +36,17 @@ class Options:
     @property
     def plain(self) -> dict[str, Any]:
         """The options by name, in plain types."""
-        condition = condition_of(self.condition)
-        return vars(self) | {"condition": condition and condition.plain}
+        return vars(self) | {"condition": self.held and self.held.plain}
 
-    def held(self, numbering: Numbering) -> Condition | None:
-        """The boundary condition, in another numbering of the points; InputError for an invalid one."""
-        condition = condition_of(self.condition)
-        return condition and condition.taken(numbering.given, len(numbering.given))
+    @property
+    def held(self) -> Condition | None:
+        """The boundary condition; InputError for an invalid one."""
+        return condition_of(self.condition)
+
+    def taken(self, numbering: Numbering) -> Options:
+        """The options in another numbering of the points."""
+        given = numbering.given
+        return replace(self, condition=self.held and self.held.taken(given, len(given)))
 
     @property
     def elements(self) -> tuple[int, tuple[int, ...]]:
