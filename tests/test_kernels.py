@@ -27,7 +27,7 @@ def test_without_a_place_for_it_what_is_compiled_is_not_kept(monkeypatch):
         return refused if cache else numba.njit(signature, **options)
 
     monkeypatch.setattr(kernels, "njit", njit)
-    assert kernels._kept("float64(float64)")(lambda x: x + 1)(2.0) == 3.0
+    assert kernels.compiled_for("float64(float64)")(lambda x: x + 1)(2.0) == 3.0
 
 
 @pytest.mark.parametrize(("dim", "degree"), [(1, 3), (2, 1), (2, 4), (2, 8), (3, 2)])

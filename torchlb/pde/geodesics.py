@@ -143,7 +143,7 @@ def _paths(lb: LaplaceBeltrami, starts: Iterable[np.ndarray]) -> Iterator[Polar]
         )
         angle = np.full(len(points), np.nan)
         if on_triangles:
-            from torchlb.linalg.kernels import bend, straighten
+            from torchlb.pde.fronts import bend, straighten
 
             if len(start) == 1:
                 near = graph.indices[graph.indptr[start[0]] : graph.indptr[start[0] + 1]]
@@ -198,7 +198,7 @@ def _distances(points: np.ndarray, a: Any, b: Any) -> np.ndarray:
 
 
 def _triangles(lb: LaplaceBeltrami, points: np.ndarray) -> tuple[np.ndarray, ...]:
-    """The triangles at each point, as `kernels.straighten` takes them."""
+    """The triangles at each point, as `fronts.straighten` takes them."""
     faces = lb.faces.cpu().numpy()
     i, j, k = (np.concatenate([faces[:, (c + shift) % 3] for c in range(3)]) for shift in range(3))
     order = np.argsort(i, kind="stable")
