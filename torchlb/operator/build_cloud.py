@@ -136,7 +136,10 @@ def _on_surface(
     progress: bool,
 ) -> Parts:
     """Build an operator on a cloud in R² or R³ by the surface through it."""
-    warn_of_near_duplicates(points, surface.neighbors, 2)
+    placed = surface.points[:, : points.shape[1]]
+    warn_of_near_duplicates(
+        torch.where(surface.lone[:, None], placed, points), surface.neighbors, 2
+    )
     if points.shape[1] == 3:
         warn_of_layers(points)
     surface = replace(surface, cells=flipped(surface.points, surface.cells))
