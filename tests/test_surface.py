@@ -158,11 +158,44 @@ def test_outliers_change_nothing():
     torch.testing.assert_close(lb.eigenbasis(9).eigenvalues[1:], exact, rtol=0.03, atol=0.0)
 
 
-def test_outliers_that_hold_most_of_the_area_are_named():
-    points, generator = Torus().points(1000), torch.Generator().manual_seed(3)
+def test_outliers_side_by_side_change_nothing():
+    """Each of two in mid-air has the other among its neighbours, which then leave the surface, too."""
+    points = Ellipsoid((1.0, 0.8, 0.15)).points(2000)
+    pair = torch.tensor([[1.2, 0.0, 0.35], [1.2, 0.15, 0.35]]).double()
+    lb = LaplaceBeltrami.from_points(torch.cat([points, pair]))
+    assert lb.surface.lone == 2
+    exact = LaplaceBeltrami.from_points(points).eigenbasis(20).eigenvalues
+    torch.testing.assert_close(lb.eigenbasis(20).eigenvalues, exact, rtol=1e-2, atol=1e-6)
+
+
+@pytest.mark.parametrize("seed", [0, 4])
+def test_a_surface_ends_at_its_outermost_points_where_they_are_sparse(seed):
+    """Of a hemisphere with 50 times as many points at one end, the triangles seen from its axis have the right area."""
+    points = Hemisphere().random_points(24000, seed)
+    along = (points[:, 0] + 1) / 2
+    chance = torch.rand(len(points), generator=torch.Generator().manual_seed(seed))
+    points = points[chance < 50.0**-along][:2000]
+    lb, mesh = (
+        LaplaceBeltrami.from_points(points),
+        LaplaceBeltrami.from_mesh(points, Hemisphere().triangulate(points)),
+    )
+    assert float(lb.mass.sum() / mesh.mass.sum()) == pytest.approx(1, abs=0.01)
+    right, found = mesh.eigenbasis(20).eigenvalues[1:], lb.eigenbasis(20).eigenvalues[1:]
+    torch.testing.assert_close(found, right, rtol=0.05, atol=0.0)
+
+
+@pytest.mark.parametrize("seed", [3, 4])
+def test_outliers_far_away_change_nothing(seed):
+    """A fiftieth of the points in a box ten times as wide as the torus; they held most of the area."""
+    points, generator = Torus().points(1000), torch.Generator().manual_seed(seed)
     far = 20 * (2 * torch.rand(20, 3, generator=generator).double() - 1)
-    with pytest.warns(UserWarning, match=r"of 1020 .* too coarse or noisy .* \(1"):
-        LaplaceBeltrami.from_points(torch.cat([points, far]))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", UserWarning)
+        lb = LaplaceBeltrami.from_points(torch.cat([points, far]), order=2)
+    assert lb.surface.lone == 20
+    assert float(lb.mass.sum()) == pytest.approx(Torus().area, rel=1e-3)
+    exact = LaplaceBeltrami.from_points(points, order=2).eigenbasis(6).eigenvalues
+    torch.testing.assert_close(lb.eigenbasis(6).eigenvalues, exact, rtol=1e-2, atol=1e-6)
 
 
 def depth_image(share):
@@ -252,6 +285,22 @@ def test_random_clouds_of_smooth_shapes_are_not_warned_of(shape):
             warnings.simplefilter("error", UserWarning)
             moved = points + noise * spacing * torch.from_numpy(rng.normal(size=points.shape))
             LaplaceBeltrami.from_points(moved, order=1)
+
+
+@pytest.mark.parametrize("rows", [20, 24])
+def test_a_grid_wider_one_way_than_the_other_is_not_warned_of(rows):
+    """The vertices of a torus, two to six times as far apart around its axis as around its tube; λ_1 within 1 %."""
+    u, v = (2 * np.pi * torch.arange(n).double() / n for n in (rows, 48))
+    u, v = torch.cartesian_prod(u, v).unbind(1)
+    across = 1 + 0.5 * v.cos()
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", UserWarning)
+        lb = LaplaceBeltrami.from_points(
+            torch.stack([across * u.cos(), across * u.sin(), 0.5 * v.sin()], 1)
+        )
+    fine = LaplaceBeltrami.from_points(Torus().points(2000))
+    found, right = (float(operator.eigenbasis(2).eigenvalues[1]) for operator in (lb, fine))
+    assert found == pytest.approx(right, rel=1e-2)
 
 
 @pytest.mark.parametrize("size", [20, 24, 30])

@@ -54,16 +54,15 @@ class Cloud:
         return one * two * three / (2 * twice), normal / twice[:, None]
 
     def limits(self, faces: Faces) -> Float[np.ndarray, " F"]:
-        """Largest circumradii of triangles, ℓ: the least reach of the corners, or the largest where the density jumps.
+        """Largest circumradii of triangles, ℓ: the least reach of the corners, or their mean if these are level.
 
-        All neighbours of a point on the dense side of a jump lie on that side. Triangles across it have to be level.
+        All neighbours of a point on the dense side of a jump in density lie on that side. Level triangles across it
+        have the largest reach of their corners.
         """
         reach = self.reach.take(faces)
-        limit, widest = smallest(reach), largest(reach)
-        across = np.flatnonzero(widest > WIDER * smallest(self.around.take(faces)))
-        level = self.alignment(self.circles(faces[across])[1], faces[across]) > LEVEL
-        across = across[level]
-        limit[across] = widest[across]
+        widest, level = largest(reach), self.alignment(self.circles(faces)[1], faces) > LEVEL
+        across = widest > WIDER * smallest(self.around.take(faces))
+        limit = np.where(level, np.where(across, widest, reach.mean(1)), smallest(reach))
         return limit / np.where(smallest(self.boundary.take(faces)), 2, 1)
 
     def alignment(self, normal: Float[np.ndarray, "F 3"], faces: Faces) -> Float[np.ndarray, " F"]:

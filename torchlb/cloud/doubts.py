@@ -173,7 +173,10 @@ def _surrounded(
 
 
 def in_doubt(surface: CloudSurface, faces: Faces) -> Bool[np.ndarray, " F"]:
-    """Triangles with an edge that crosses between sheets, or is far longer than the spacing."""
+    """Triangles with an edge that crosses between sheets, or is far longer than the spacing.
+
+    Edges between points that are among the nearest of each other, as along the wide side of a grid, are not long.
+    """
     points, normals = surface.points.numpy(), surface.normals.numpy()
     near, count = surface.neighbors.numpy(), len(points)
     edges = edges_of(faces, count)
@@ -182,8 +185,10 @@ def in_doubt(surface: CloudSurface, faces: Faces) -> Bool[np.ndarray, " F"]:
     length = lengths(edge)
     spacing = spacing_at(points, near)
     small, large = np.minimum(spacing[i], spacing[j]), np.maximum(spacing[i], spacing[j])
+    beyond = spacing_at(points, near, NEAREST)
     # long against the larger spacing of their ends, or against the smaller one
     found = length > np.minimum(REACH * large, FACTOR * small)
+    found &= length > np.minimum(beyond[i], beyond[j])
     steep_i, steep_j = (np.abs(inner(edge, normals[k])) > LEVEL * length for k in (i, j))
     steep = steep_i | steep_j
     if steep.any():

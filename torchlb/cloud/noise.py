@@ -69,17 +69,20 @@ def spacing_at(
 def lone_points(points: Vectors, near: Int[np.ndarray, "N K"]) -> Mask:
     """Points with a far larger spacing than their neighbours, off the plane of these, and in none with their like.
 
+    Others such as they do not tilt the plane, as the second of two that hang beside each other would.
     At a jump in density half a disc of twice the spacing holds twelve other points of a like spacing.
     """
     lone = np.zeros(len(points), dtype=bool)
     spacing = spacing_at(points, near)
     usual = np.partition(spacing[near[:, 1:]], near.shape[1] // 4, axis=1)[:, near.shape[1] // 4]
-    far = np.flatnonzero(spacing > LONE * usual)
+    apart = spacing > LONE * usual
+    far = np.flatnonzero(apart)
     if len(far) == 0:
         return lone
-    around = points[near[far, 1:]]
-    middle = around.mean(1)
-    normal = np.linalg.svd(around - middle[:, None], full_matrices=False)[2][:, 2]
+    around, kept = points[near[far, 1:]], ~apart[near[far, 1:], None]
+    middle = (kept * around).sum(1) / np.maximum(kept.sum(1), 1)
+    offset = kept * (around - middle[:, None])
+    normal = np.linalg.svd(offset, full_matrices=False)[2][:, 2]
     above = points[far] - middle
     lone[far] = np.abs(inner(above, normal)) > HIGH * lengths(above)
     octave = np.floor(np.log2(spacing[far]))

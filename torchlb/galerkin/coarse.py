@@ -45,6 +45,19 @@ def coarse_triangles(
     return lying_triangles(points, nodes, free) | _without_inside(points, nodes, fits)
 
 
+def reaching_out(nodes: Nodes, fits: FitPlan, coarse: Bool[Tensor, " F"]) -> Bool[Tensor, " N"]:
+    """Vertices whose fit of functions uses a vertex of coarse triangles only.
+
+    Such a vertex may hang on by slivers, and has almost no energy of its own; a fit that uses it would add far more.
+    """
+    beyond, result = (torch.zeros_like(fits.degree, dtype=torch.bool) for _ in range(2))
+    beyond[nodes.cells[coarse].flatten()] = True
+    beyond[nodes.cells[~coarse].flatten()] = False
+    for block in fits.functions:
+        result[block.vertices[beyond[block.points].any(1)]] = True
+    return result
+
+
 def lying_triangles(points: Points, nodes: Nodes, free: Bool[Tensor, " E"]) -> Bool[Tensor, " F"]:
     """Triangles with an obtuse angle opposite a free boundary edge, or opposite an edge of another such triangle.
 

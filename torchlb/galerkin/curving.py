@@ -15,7 +15,7 @@ from torch import Tensor
 
 from torchlb.fits.polynomials import monomials
 from torchlb.galerkin.assembly import area_element, flat_metric, metric
-from torchlb.galerkin.coarse import coarse_triangles
+from torchlb.galerkin.coarse import coarse_triangles, reaching_out
 from torchlb.galerkin.delaunay import Cover, delaunay_cover, sound_lengths
 from torchlb.galerkin.elements import simplex
 from torchlb.galerkin.nodes import Nodes
@@ -165,6 +165,7 @@ def curve(
             free &= ~held[nodes.edges].all(1)
         coarse = coarse_triangles(points, nodes, plan, free)
         curved[nodes.edge[coarse].flatten()] = False
+        curved &= ~reaching_out(nodes, plan, coarse)[nodes.edges].any(1)
         fixed &= ~free
         fixed[nodes.edge[~coarse].flatten()] = True
     places, curved, bent, g, lengths = _flattened(points, nodes, (flat, standing), curved, whole)

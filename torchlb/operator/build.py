@@ -178,7 +178,8 @@ def _on_surface(
     progress: bool,
 ) -> Parts:
     """Build an operator on a cloud in R² or R³, sorted `here`, by the surface through it."""
-    warn_of_near_duplicates(here, surface.neighbors, 2)
+    placed = torch.where(surface.lone[:, None], surface.points[:, : here.shape[1]], here)
+    warn_of_near_duplicates(placed, surface.neighbors, 2)
     if here.shape[1] == 3:
         warn_of_layers(here)
     surface = replace(surface, cells=flipped(surface.points, surface.cells))
