@@ -46,7 +46,7 @@ def test_transport_and_logarithm_on_the_sphere(build):
     both = logarithmic_map(lb, [3, 7])
     torch.testing.assert_close(both[..., 0], coordinates, rtol=0, atol=0)
     with pytest.raises(InputError, match="surface with triangles"):
-        logarithmic_map(LaplaceBeltrami.from_mesh(*Circle().mesh(40)), 0)
+        logarithmic_map(LaplaceBeltrami.from_points(Circle().points(40)), 0)
 
 
 def test_the_nearest_source_decides(sphere):
