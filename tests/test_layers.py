@@ -319,20 +319,38 @@ def compiled_and_not(name, batched):
     return results
 
 
+def operators_of_sizes(count):
+    """Operators of as many sizes, with eigenpairs."""
+    meshes = [Sphere().mesh(60 + 12 * i) for i in range(count)]
+    operators = [LaplaceBeltrami.from_mesh(v.float(), f, order=1) for v, f in meshes]
+    for lb in operators:
+        lb.eigenbasis(K)
+    return operators
+
+
 def graphs_of_sizes(name, batched):
     """Number of graphs compiled for ten shapes, or batches of two, of ten sizes; all outputs are the layer's own."""
     torch._dynamo.reset()
     layer, backend = layer_of(name), torch._dynamo.testing.CompileCounterWithBackend("aot_eager")
-    compiled = torch.compile(layer, backend=backend, fullgraph=True)
-    meshes = [Sphere().mesh(n) for n in range(60, 180, 12)]
-    clouds = [LaplaceBeltrami.from_mesh(v.float(), f, order=1) for v, f in meshes]
-    for lb in clouds:
-        lb.eigenbasis(K)
-    for i, alone in enumerate(clouds):
-        lb = LaplaceBeltrami.batch([alone, clouds[i - 1]]) if batched else alone
+    compiled, operators = (
+        torch.compile(layer, backend=backend, fullgraph=True),
+        operators_of_sizes(10),
+    )
+    for i, alone in enumerate(operators):
+        lb = LaplaceBeltrami.batch([alone, operators[i - 1]]) if batched else alone
         x = features(lb)
         torch.testing.assert_close(compiled(x, lb), layer(x, lb), rtol=1e-3, atol=1e-4)
     return backend.frame_count
+
+
+def graphs_of_steps():
+    """Number of graphs compiled for training steps on five sizes, with dropout, by the options of docs/training.md."""
+    net = layer_of("original net").train()
+    compiled = torch.compile(net, backend="aot_eager", fullgraph=True, dynamic=True)
+    for lb in operators_of_sizes(5):
+        compiled(features(lb), lb).square().mean().backward()
+        assert all(p.grad is not None and p.grad.any() for p in net.parameters())
+    return torch._dynamo.utils.counters["stats"]["unique_graphs"]
 
 
 def run_apart(*arguments):
@@ -356,6 +374,11 @@ def test_compiled_for_two_sizes_it_takes_all():
     graphs = json.loads(run_apart("sizes"))
     assert len(graphs) == 5
     assert max(graphs.values()) <= 4, graphs
+
+
+@pytest.mark.slow
+def test_one_graph_with_dynamic_sizes_takes_all_steps():
+    assert json.loads(run_apart("steps")) == 1
 
 
 @pytest.mark.slow
@@ -578,6 +601,8 @@ if __name__ == "__main__" and sys.argv[1] == "sizes":
         ("classifier", True),
     ]
     print(json.dumps({name: graphs_of_sizes(name, batched) for name, batched in kinds}))
+elif __name__ == "__main__" and sys.argv[1] == "steps":
+    print(graphs_of_steps())
 elif __name__ == "__main__" and sys.argv[1] == "one graph":
     compiled_as_one_graph()
 elif __name__ == "__main__":
