@@ -28,6 +28,7 @@ from torchlb import (
     spectral_wavelets,
     wave_kernel_signature,
 )
+from torchlb.linalg.csr import Csr
 from torchlb.nn.diffusion import LearnedTimes, raw_of_time
 from torchlb.operator import systems
 from torchlb.pde.solves import implicit_step, potential
@@ -111,6 +112,7 @@ def test_a_batch_of_eight_shapes_gives_what_they_give_one_by_one(eight, name):
 
 SOLVING = {
     "implicit": lambda: ImplicitDiffusion(2, tolerance=1e-13),
+    "implicit, linear": lambda: ImplicitDiffusion(2),
     "poisson": lambda: PoissonBlock(2, tolerance=1e-13),
     "poisson, linear": lambda: PoissonBlock(2),
     "poisson, fields": lambda: PoissonBlock(2, fields=True),
@@ -129,7 +131,7 @@ def test_layers_that_solve_pass_gradcheck(name, kind):
     }[kind]()
     torch.manual_seed(0)
     layer = SOLVING[name]().double().eval()
-    if name == "implicit":
+    if name.startswith("implicit"):
         torch.nn.init.uniform_(layer.raw_time, 0.05, 0.3)
     x = torch.randn(len(vertices), 2, dtype=torch.float64, requires_grad=True)
     names, values = zip(*layer.named_parameters(), strict=True)
@@ -169,6 +171,28 @@ def test_implicit_diffusion_is_the_step_of_every_channel():
     y = layer(x, lb)
     expected = torch.cat([implicit_step(lb, x[:, c : c + 1], float(times[c])) for c in range(9)], 1)
     torch.testing.assert_close(y, expected, rtol=1e-7, atol=1e-8)
+
+
+@pytest.mark.parametrize("shape", ["torus", "disk", "Dirichlet disk"])
+def test_implicit_diffusion_by_elements_is_the_step_of_their_pair(shape):
+    """(M₁ + tK₁)⁻¹M₁x to 1e-3 of |x| for rough x and times over four decades, and constants exactly."""
+    surface = Torus() if shape == "torus" else UnitDisk()
+    condition = "dirichlet" if shape == "Dirichlet disk" else "neumann"
+    lb = LaplaceBeltrami.from_mesh(*surface.mesh(300), condition=condition)
+    times = torch.logspace(-3.5, 0.5, 9, dtype=torch.float64)
+    layer, x = ImplicitDiffusion(9).double(), features(lb, 9)
+    layer.raw_time.data = raw_of_time(times)
+    stiffness, mass = (Csr(*lb.weak.linear_pair).tensor(i).to_dense() for i in (0, 1))
+    free = torch.ones(lb.num_points).bool() if lb.fixed is None else ~lb.fixed
+    y = layer(x, lb)
+    assert not y[~free].any()
+    for c, t in enumerate(times):
+        left = (mass + t * stiffness)[free][:, free]
+        expected = torch.linalg.solve(left, (mass @ x[:, c])[free])
+        assert (y[free, c] - expected).norm() <= 1e-3 * x[:, c].norm()
+    if condition == "neumann":
+        one = torch.ones_like(x)
+        torch.testing.assert_close(layer(one, lb), one, rtol=1e-9, atol=0)
 
 
 @pytest.mark.parametrize("kind", ["mesh", "cotangent", "points"])

@@ -16,7 +16,7 @@ from torchlb.nn.pointwise import check_features
 from torchlb.operator.pair_methods import PairMethods
 from torchlb.pde.checks import check_choice
 from torchlb.pde.heat import Method, flow
-from torchlb.pde.solves import TOLERANCE, implicit_step
+from torchlb.pde.solves import implicit_by_elements, implicit_step
 
 SHARPNESS = 100.0
 """β of the softplus that keeps learned times positive: above 0.05 ℓ² it is the identity to 1 %."""
@@ -108,8 +108,7 @@ class ImplicitDiffusion(LearnedTimes):
     """One implicit step of each channel for a learned time: y_c = (1 − t_c Δ)⁻¹x_c.
 
     It decays as 1/(1 + tλ) where `Diffusion` does as e^{−tλ}: as far, and less sharply. It needs no eigenbasis and
-    drops nothing. Conjugate gradients use the factors of a few times that all channels share, kept with the operator
-    (`method.md`, section 10).
+    drops nothing. All channels share the factors of a few times, kept with the operator (`method.md`, section 10).
 
     Parameters
     ----------
@@ -118,7 +117,8 @@ class ImplicitDiffusion(LearnedTimes):
     init_time
         Initial time, ℓ². Shapes of radius about one are expected.
     tolerance
-        Relative tolerance of the solves; None for 1e-5 in float32, 1e-10 in float64. 1e-3 is enough for training.
+        Relative tolerance of solves with the weak pair, by conjugate gradients. None for four solves by P1 elements, to
+        1e-3 of |x|, which is accurate enough for learning and has no derivative in points and medium.
 
     Attributes
     ----------
@@ -142,10 +142,9 @@ class ImplicitDiffusion(LearnedTimes):
         self.tolerance = tolerance
 
     def _diffused(self, x: Tensor, lb: PairMethods, time: Tensor) -> Tensor:
-        tolerance = self.tolerance
-        if tolerance is None:
-            tolerance = TOLERANCE if x.dtype == torch.float64 else SINGLE
-        return implicit_step(lb, x, time, tolerance=tolerance)
+        if self.tolerance is None:
+            return implicit_by_elements(lb, x, time)
+        return implicit_step(lb, x, time, tolerance=self.tolerance)
 
     def extra_repr(self) -> str:
         """Channels, tolerance."""

@@ -41,7 +41,7 @@ class TangentDiffusion(nn.Module):
     >>> from torchlb.surfaces import Sphere
     >>> lb = LaplaceBeltrami.from_mesh(*Sphere().mesh(300)).float()
     >>> u = lb.local_gradient(lb.points)  # λ = 1
-    >>> bool((TangentDiffusion(3)(u, lb) - u / 1.01).abs().max() < 1e-3)
+    >>> bool((TangentDiffusion(3)(u, lb) - u / 1.01).abs().max() < 1e-2)
     True
     """
 
