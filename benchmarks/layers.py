@@ -2,8 +2,8 @@
 
 The sparse product forward and backward, beside torch's own on the same matrix and a copy of as many bytes; gradients
 and a training step of DiffusionNet, beside the same on DiffusionNet's own operators and sparse format
-(benchmarks/learning.py); an epoch on eight shapes, one by one and in a batch. The rows of a table are timed in turns,
-so that a busy machine slows all of them, and the median is printed.
+(benchmarks/learning.py); the same step compiled, on shapes of five sizes; an epoch on eight shapes, one by one and in a
+batch. The rows of a table are timed in turns, so that a busy machine slows all of them, and the median is printed.
 """
 
 from __future__ import annotations
@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 import torch
+import torch._dynamo
 from _common import versions
 from learning import Original
 from torch.nn.functional import cross_entropy
@@ -40,17 +41,18 @@ def medians(
     seconds: dict[str, list[float]] = {name: [] for name in steps}
     for _ in range(repeats + 2):
         for name, step in steps.items():
-            wait(device)
-            start = time.perf_counter()
+            start = now(device)
             step()
-            wait(device)
-            seconds[name].append(time.perf_counter() - start)
+            seconds[name].append(now(device) - start)
     return {name: column[2:] for name, column in seconds.items()}
 
 
-def wait(device: str) -> None:
-    if device.startswith("cuda"):
-        torch.cuda.synchronize()
+def now(device: str) -> float:
+    """Seconds, once a GPU has done what it was given; on the CPU those of the processor."""
+    if not device.startswith("cuda"):
+        return time.process_time()
+    torch.cuda.synchronize()
+    return time.perf_counter()
 
 
 def table(title: str, seconds: dict[str, list[float]], baseline: str) -> None:
@@ -110,9 +112,12 @@ def training_step(shape: dict[str, object], width: int, k: int, repeats: int, de
     table(title, medians(steps, repeats, device), "original, spectral")
 
 
-def step_of(lb: object, name: str, width: int, k: int, device: str) -> Callable[[], None]:
-    torch.manual_seed(0)
-    net = DiffusionNet(3, 8, width=width, k=k, **COMMUNICATION[name]).to(device)
+def step_of(
+    lb: object, name: str, width: int, k: int, device: str, net: Any = None
+) -> Callable[[], None]:
+    if net is None:
+        torch.manual_seed(0)
+        net = DiffusionNet(3, 8, width=width, k=k, **COMMUNICATION[name]).to(device)
     optimizer = torch.optim.Adam(net.parameters())
     points = lb.points.to(device)  # type: ignore[attr-defined]
     labels = (points[:, 0] > 0).long()
@@ -123,6 +128,38 @@ def step_of(lb: object, name: str, width: int, k: int, device: str) -> Callable[
         optimizer.step()
 
     return step
+
+
+def compiled(points: int, width: int, k: int, repeats: int, device: str) -> None:
+    """Steps of one network on five sizes, spectral; with CUDA graphs, too, where there are any."""
+    options: dict[str, dict[str, Any]] = {"dynamic=True": {"dynamic": True}}
+    if device.startswith("cuda"):
+        options["reduce-overhead"] = {"dynamic": True, "mode": "reduce-overhead"}
+    print(f"\n### Compiled training step of 4 blocks, width = {width}, k = {k}\n")
+    print(
+        "| points | options | eager, ms | compiled, ms | of eager | first step, s | graphs so far |"
+    )
+    print("|--:|:--|" + "--:|" * 5)
+    meshes = [StarShaped().mesh(round(share * points)) for share in (0.1, 0.2, 0.3, 0.5, 1.0)]
+    shapes = [LaplaceBeltrami.from_mesh(*mesh) for mesh in meshes]
+    for lb in shapes:
+        lb.eigenbasis(k)
+        lb.float().to(device)
+    for name, chosen in options.items():
+        torch._dynamo.reset()
+        torch._dynamo.utils.counters.clear()
+        net = torch.compile(DiffusionNet(3, 8, width=width, k=k).to(device), **chosen)
+        for lb in shapes:
+            eager = step_of(lb, "spectral", width, k, device)
+            step, start = step_of(lb, "spectral", width, k, device, net), time.perf_counter()
+            step()
+            first = time.perf_counter() - start
+            columns = medians({"eager": eager, name: step}, repeats, device).values()
+            before, after = (1e3 * np.median(column) for column in columns)
+            cells = [f"{lb.num_points:,}", name, f"{before:.1f}", f"{after:.1f}"]
+            cells += [f"{after / before:.2f}", f"{first:.0f}"]
+            cells += [str(torch._dynamo.utils.counters["stats"]["unique_graphs"])]
+            print("| " + " | ".join(cells) + " |", flush=True)
 
 
 def epoch(shapes: list[LaplaceBeltrami], width: int, k: int, repeats: int, device: str) -> None:
@@ -156,7 +193,7 @@ def main() -> None:
     where = options.device
     if where.startswith("cuda"):
         where = torch.cuda.get_device_name(where)
-    print(f"\nOn {where}, one thread; float32.")
+    print(f"\nOn {where}, one thread; float32; on the CPU processor time.")
     vertices, faces = StarShaped().mesh(options.points)
     stencil = LaplaceBeltrami.from_mesh(vertices, faces)
     cotangent = LaplaceBeltrami.from_cotangent(vertices, faces)
@@ -173,6 +210,7 @@ def main() -> None:
     shape = {"torchlb": stencil, "cotangent": cotangent, "original": original}
     gradients(shape, options.channels, options.repeats, options.device)
     training_step(shape, options.channels, options.k, options.repeats, options.device)
+    compiled(options.points, options.channels, options.k, options.repeats, options.device)
     for smallest, largest in ((700, 2000), (3000, 6000)):
         scale = options.points / 10000
         shapes = [

@@ -11,7 +11,8 @@ torchlb: `from_mesh`, and `from_points` on clouds. cotangent: `from_cotangent`; 
 torchlb's. original: what DiffusionNet's own code computes, written from its description: potpourri3d's cotangent
 matrix and lumped mass on meshes, robust_laplacian on clouds, `eigsh` at 1e-8, gradients by least squares over the one
 ring or 30 neighbours; its diffusion is the spectral one. Gradients are not rotated (`rotations=False`),
-which a cloud without oriented normals asks for in either code. Implicit blocks solve to `--tolerance`.
+which a cloud without oriented normals asks for in either code. Implicit blocks solve by P1 elements, or with the weak
+pair to `--tolerance`.
 """
 
 from __future__ import annotations
@@ -265,7 +266,7 @@ def main() -> None:
     parser.add_argument("--k", type=int, default=64)
     parser.add_argument("--width", type=int, default=32)
     parser.add_argument("--blocks", type=int, default=3)
-    parser.add_argument("--tolerance", type=float, default=1e-3, help="of implicit blocks")
+    parser.add_argument("--tolerance", type=float, help="of implicit blocks (default: P1 elements)")
     parser.add_argument("--operators", nargs="+", default=["torchlb", "cotangent", "original"])
     parser.add_argument(
         "--layers",

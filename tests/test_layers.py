@@ -28,6 +28,7 @@ from torchlb import (
     spectral_wavelets,
     wave_kernel_signature,
 )
+from torchlb.linalg.csr import Csr
 from torchlb.nn.diffusion import LearnedTimes, raw_of_time
 from torchlb.operator import systems
 from torchlb.pde.solves import implicit_step, potential
@@ -110,6 +111,7 @@ def test_a_batch_of_eight_shapes_gives_what_they_give_one_by_one(eight, name):
 
 SOLVING = {
     "implicit": lambda: ImplicitDiffusion(2, tolerance=1e-13),
+    "implicit, linear": lambda: ImplicitDiffusion(2),
     "poisson": lambda: PoissonBlock(2, tolerance=1e-13),
     "poisson, linear": lambda: PoissonBlock(2),
     "poisson, fields": lambda: PoissonBlock(2, fields=True),
@@ -128,7 +130,7 @@ def test_layers_that_solve_pass_gradcheck(name, kind):
     }[kind]()
     torch.manual_seed(0)
     layer = SOLVING[name]().double().eval()
-    if name == "implicit":
+    if name.startswith("implicit"):
         torch.nn.init.uniform_(layer.raw_time, 0.05, 0.3)
     x = torch.randn(len(vertices), 2, dtype=torch.float64, requires_grad=True)
     names, values = zip(*layer.named_parameters(), strict=True)
@@ -168,6 +170,28 @@ def test_implicit_diffusion_is_the_step_of_every_channel():
     y = layer(x, lb)
     expected = torch.cat([implicit_step(lb, x[:, c : c + 1], float(times[c])) for c in range(9)], 1)
     torch.testing.assert_close(y, expected, rtol=1e-7, atol=1e-8)
+
+
+@pytest.mark.parametrize("shape", ["torus", "disk", "Dirichlet disk"])
+def test_implicit_diffusion_by_elements_is_the_step_of_their_pair(shape):
+    """(M₁ + tK₁)⁻¹M₁x to 1e-3 of |x| for rough x and times over four decades, and constants exactly."""
+    surface = Torus() if shape == "torus" else UnitDisk()
+    condition = "dirichlet" if shape == "Dirichlet disk" else "neumann"
+    lb = LaplaceBeltrami.from_mesh(*surface.mesh(300), condition=condition)
+    times = torch.logspace(-3.5, 0.5, 9, dtype=torch.float64)
+    layer, x = ImplicitDiffusion(9).double(), features(lb, 9)
+    layer.raw_time.data = raw_of_time(times)
+    stiffness, mass = (Csr(*lb.weak.linear_pair).tensor(i).to_dense() for i in (0, 1))
+    free = torch.ones(lb.num_points).bool() if lb.fixed is None else ~lb.fixed
+    y = layer(x, lb)
+    assert not y[~free].any()
+    for c, t in enumerate(times):
+        left = (mass + t * stiffness)[free][:, free]
+        expected = torch.linalg.solve(left, (mass @ x[:, c])[free])
+        assert (y[free, c] - expected).norm() <= 1e-3 * x[:, c].norm()
+    if condition == "neumann":
+        one = torch.ones_like(x)
+        torch.testing.assert_close(layer(one, lb), one, rtol=1e-9, atol=0)
 
 
 @pytest.mark.parametrize("kind", ["mesh", "cotangent", "points"])
@@ -318,20 +342,38 @@ def compiled_and_not(name, batched):
     return results
 
 
+def operators_of_sizes(count):
+    """Operators of as many sizes, with eigenpairs."""
+    meshes = [Sphere().mesh(60 + 12 * i) for i in range(count)]
+    operators = [LaplaceBeltrami.from_mesh(v.float(), f, order=1) for v, f in meshes]
+    for lb in operators:
+        lb.eigenbasis(K)
+    return operators
+
+
 def graphs_of_sizes(name, batched):
     """Number of graphs compiled for ten shapes, or batches of two, of ten sizes; all outputs are the layer's own."""
     torch._dynamo.reset()
     layer, backend = layer_of(name), torch._dynamo.testing.CompileCounterWithBackend("aot_eager")
-    compiled = torch.compile(layer, backend=backend, fullgraph=True)
-    meshes = [Sphere().mesh(n) for n in range(60, 180, 12)]
-    clouds = [LaplaceBeltrami.from_mesh(v.float(), f, order=1) for v, f in meshes]
-    for lb in clouds:
-        lb.eigenbasis(K)
-    for i, alone in enumerate(clouds):
-        lb = LaplaceBeltrami.batch([alone, clouds[i - 1]]) if batched else alone
+    compiled, operators = (
+        torch.compile(layer, backend=backend, fullgraph=True),
+        operators_of_sizes(10),
+    )
+    for i, alone in enumerate(operators):
+        lb = LaplaceBeltrami.batch([alone, operators[i - 1]]) if batched else alone
         x = features(lb)
         torch.testing.assert_close(compiled(x, lb), layer(x, lb), rtol=1e-3, atol=1e-4)
     return backend.frame_count
+
+
+def graphs_of_steps():
+    """Number of graphs compiled for training steps on five sizes, with dropout, by the options of docs/training.md."""
+    net = layer_of("original net").train()
+    compiled = torch.compile(net, backend="aot_eager", fullgraph=True, dynamic=True)
+    for lb in operators_of_sizes(5):
+        compiled(features(lb), lb).square().mean().backward()
+        assert all(p.grad is not None and p.grad.any() for p in net.parameters())
+    return torch._dynamo.utils.counters["stats"]["unique_graphs"]
 
 
 def run_apart(*arguments):
@@ -355,6 +397,11 @@ def test_compiled_for_two_sizes_it_takes_all():
     graphs = json.loads(run_apart("sizes"))
     assert len(graphs) == 5
     assert max(graphs.values()) <= 4, graphs
+
+
+@pytest.mark.slow
+def test_one_graph_with_dynamic_sizes_takes_all_steps():
+    assert json.loads(run_apart("steps")) == 1
 
 
 @pytest.mark.slow
@@ -577,6 +624,8 @@ if __name__ == "__main__" and sys.argv[1] == "sizes":
         ("classifier", True),
     ]
     print(json.dumps({name: graphs_of_sizes(name, batched) for name, batched in kinds}))
+elif __name__ == "__main__" and sys.argv[1] == "steps":
+    print(graphs_of_steps())
 elif __name__ == "__main__" and sys.argv[1] == "one graph":
     compiled_as_one_graph()
 elif __name__ == "__main__":

@@ -47,7 +47,7 @@ LAYERS = {
     "DiffusionNet": lambda: torchlb.DiffusionNet(2, 3, width=4, num_blocks=1, k=8),
     "DiffusionNetBlock": lambda: torchlb.DiffusionNetBlock(2, k=8),
     "GradientFeatures": lambda: torchlb.GradientFeatures(2),
-    "ImplicitDiffusion": lambda: torchlb.ImplicitDiffusion(2),
+    "ImplicitDiffusion": lambda: torchlb.ImplicitDiffusion(2, tolerance=1e-10),
     "PoissonBlock": lambda: torchlb.PoissonBlock(2),
     "PoissonFeatures": lambda: torchlb.PoissonFeatures(2),
     "TangentBlock": lambda: OnFields(torchlb.TangentBlock(2, k=8)),

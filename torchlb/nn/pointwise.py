@@ -62,9 +62,10 @@ class Dropout(nn.Dropout):
         """Half of the values doubled, the others zero, in training."""
         if not self.training or self.p != 0.5 or input.device.type != "cpu":
             return super().forward(input)
-        count, place = input.numel(), torch.arange(8, dtype=torch.uint8)
-        bits = torch.randint(256, (-(-count // 8),), dtype=torch.uint8) >> place[:, None] & 1
-        return input * (2 * bits.flatten()[:count].view(input.shape))
+        rows, place = input.shape[:-1].numel(), torch.arange(8, dtype=torch.uint8)
+        empty = torch.empty(-(-rows // 8), input.shape[-1], dtype=torch.uint8)
+        bits = torch.ops.aten.random(empty) >> place[:, None, None] & 1
+        return input * (2 * bits.flatten(0, 1)[:rows].view(input.shape))
 
 
 def mlp(inputs: int, hidden: Widths, width: int, dropout: bool) -> nn.Sequential:

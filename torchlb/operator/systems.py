@@ -140,7 +140,7 @@ class PairSystem:
         b = self.inside(b.double())
         mean = self.mean(b)
         right = torch.addcmul(b, self.ones_mass, mean, value=-1)
-        near = partial(self._near, self._levels(time, b.shape[1]))
+        near = partial(self.near, self.levels(time, b.shape[1]))
         x = near(right) if tolerance == "P1" else self._solved(right, time, tolerance, near)
         shift = -self._mean(self.ones_mass, x)
         return x.add_(shift if time is None else shift + mean)
@@ -161,7 +161,7 @@ class PairSystem:
         parts = [v.double() / of for v, of in zip(self.parts, self.units, strict=True)]
         shares_of = shares[0], -values * time * shares[1]
         terms = [(share, (*self.pattern, v)) for share, v in zip(shares_of, parts, strict=True)]
-        near = partial(self._near, self._levels(time, b.shape[1]))
+        near = partial(self.near, self.levels(time, b.shape[1]))
         inverse = self._inverse(shares, unit, near)
 
         def precondition(r: Tensor) -> Tensor:
@@ -247,7 +247,7 @@ class PairSystem:
         parts = [share * multiply(*matrix, x) for share, matrix in terms]
         return self.inside(sum(parts[1:], parts[0]))
 
-    def _levels(self, time: Tensor | None, columns: int) -> list[tuple[float | None, int]]:
+    def levels(self, time: Tensor | None, columns: int) -> list[tuple[float | None, int]]:
         """Times of factors and the number of columns for each: for several times, the nearest powers of four.
 
         Times so short that tK is small beside M share one factor; of too many powers every second or third is taken.
@@ -260,7 +260,7 @@ class PairSystem:
         level, count = level.unique_consecutive(return_counts=True)
         return list(zip(level.tolist(), count.tolist(), strict=True))
 
-    def _near(self, levels: list[tuple[float | None, int]], r: Tensor) -> Tensor:
+    def near(self, levels: list[tuple[float | None, int]], r: Tensor) -> Tensor:
         """The solution by P1 elements."""
         blocks = r.split([count for _, count in levels], dim=1)
         solved = [self.factor(t).solve(block) for (t, _), block in zip(levels, blocks, strict=True)]
