@@ -173,3 +173,14 @@ def test_distance_from_a_region():
     distance = geodesic_distance(LaplaceBeltrami.from_cotangent(vertices, faces), inside)
     assert (distance[inside] == 0).all()
     assert np.abs(distance.numpy() - exact).mean() < 0.01 * exact.mean()
+
+
+def test_every_point_has_normal_coordinates():
+    """On a rough sheet, where paths cross edges between vertices that are both farther from the source."""
+    points, faces = _disk_of_random_points(300)
+    rough = np.random.default_rng(1).normal(scale=0.15, size=len(points))
+    lb = LaplaceBeltrami.from_cotangent(np.column_stack([points, rough]), faces)
+    x = torch.as_tensor(logarithmic_map(lb, range(0, 300, 3)))
+    assert x.isfinite().all()
+    distance = torch.as_tensor(geodesic_distance(lb, range(0, 300, 3), each=True))
+    torch.testing.assert_close(x.norm(dim=1), distance, rtol=0, atol=1e-9)

@@ -113,12 +113,13 @@ def bend(
         for triangle in range(first[i], first[i + 1]):
             j, k = ends[triangle, 0], ends[triangle, 1]
             by_j, by_k = distance[j] + sides[triangle, 0], distance[k] + sides[triangle, 1]
-            if distance[j] < distance[i] and by_j < best:
+            j_known = distance[j] < distance[i] or (again and distance[i] > 0)
+            k_known = distance[k] < distance[i] or (again and distance[i] > 0)
+            if j_known and by_j < best:
                 best, t, side = by_j, triangle, 0
-            if distance[k] < distance[i] and by_k < best:
+            if k_known and by_k < best:
                 best, t, side = by_k, triangle, 1
-            nearer = max(distance[j], distance[k]) < distance[i]
-            if (nearer or (again and t >= 0)) and foot[j] == foot[k]:
+            if j_known and k_known and foot[j] == foot[k]:
                 base, height, along = sides[triangle, 2], sides[triangle, 3], sides[triangle, 4]
                 across = _across(distance[j], distance[k], along, height, base)
                 if across <= best:
@@ -141,8 +142,10 @@ def bend(
             b = (1 - share) * slope[j] + share * slope[k]
             bent = (1 - share) * curvature[j] + share * curvature[k]
             path, part = _from_front(result[j], result[k], foot_point, here, a / b, sides[t])
-            between = (angle[k] - angle[j] + np.pi) % (2 * np.pi) - np.pi
-            turned = angle[j] + (part if part >= 0 else share) * between
+            turned = angle[k] if np.isnan(angle[j]) else angle[j]
+            between = (angle[k] - turned + np.pi) % (2 * np.pi) - np.pi
+            if not np.isnan(between):
+                turned += (part if part >= 0 else share) * between
         angle[i] = turned if np.isnan(given[i]) else given[i]
         bent = (bent + curvature[i]) / 4
         after = a + b * length - bent * length**2 * (a + b * length / 3)
