@@ -39,7 +39,7 @@ LONGEST = 24
 """Maximal number of conjugate-gradient steps in a sweep."""
 ASTRAY = 0.5
 """Estimated error above which a sweep takes one step only, and the first one keeps the old vectors beside the new."""
-CHUNK = 16 * BLOCK
+CHUNK = 10 * BLOCK
 """Columns that are corrected together: more take memory, and no less time."""
 SAFETY = 4.0
 """Factor on the estimated errors, which are too small where K is softer than its preconditioner."""
@@ -141,10 +141,11 @@ def _residuals(maps: _Maps, known: Blocks, values: Tensor) -> tuple[Tensor, ...]
     r, z = torch.empty(2, len(known[0]), len(values), device=values.device)
     size, energy = torch.empty_like(values), torch.empty(len(values), device=values.device)
     for some in torch.arange(len(values), device=values.device).split(CHUNK):
-        ku, mu = (x.index_select(1, some) for x in known[1:])
-        residual = torch.addcmul(ku, mu, values[some].to(ku), value=-1)
+        residual, mu = (x.index_select(1, some) for x in known[1:])
+        residual.addcmul_(mu, values[some].to(mu), value=-1)
         size[some] = residual.norm(dim=0).clamp_min(TINY).to(size)
-        r[:, some] = (residual / size[some]).float()
+        r[:, some] = residual.div_(size[some].to(residual)).float()
+        del residual, mu
         z[:, some] = maps.cycle(r[:, some])
         energy[some] = _dots(r[:, some], z[:, some])
     return size, energy, r, z
