@@ -185,7 +185,7 @@ GALLERY = {  # options of a small run, and what it prints
         ["--points", "400", "--k", "10"],
         "heat later, κ = 9 up and down: ",
     ),
-    "diffusion_distances": (["--points", "400", "--k", "40"], "on a sphere of 400 points: 1"),
+    "diffusion_distances": (["--points", "400", "--k", "40"], "on a sphere of 400 points: 0.3%"),
     "signatures_matching": (["--points", "300", "--k", "40"], "wave kernel signature: "),
     "wavelets": (["--points", "400", "--k", "40"], "low-pass: "),
     "learn_conductivity": (

@@ -368,7 +368,7 @@ def graphs_of_sizes(name, batched):
 
 def graphs_of_steps():
     """Number of graphs compiled for training steps on five sizes, with dropout, by the options of docs/training.md."""
-    net = layer_of("original net").train()
+    net = layer_of("net").train()
     compiled = torch.compile(net, backend="aot_eager", fullgraph=True, dynamic=True)
     for lb in operators_of_sizes(5):
         compiled(features(lb), lb).square().mean().backward()

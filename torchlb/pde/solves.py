@@ -74,7 +74,7 @@ def implicit_step(
     >>> bool((u - vertices[:, 2] / 2).abs().max() < 1e-4)
     True
     """
-    return _solution(lb, f, t, boundary_values, flux, conductivity, tolerance)
+    return _solution(lb, f, [t], boundary_values, flux, conductivity, tolerance)
 
 
 @takes_arrays
@@ -102,24 +102,24 @@ def poisson_solve(
     >>> bool((u - vertices[:, 2] / 2).abs().max() < 1e-4)
     True
     """
-    return _solution(lb, f, None, boundary_values, flux, conductivity, tolerance)
+    return _solution(lb, f, [], boundary_values, flux, conductivity, tolerance)
 
 
 def _solution(
     lb: PairMethods,
     f: Tensor,
-    t: float | Tensor | None,
+    times: list[float | Tensor],
     boundary_values: Tensor | float | None,
     flux: Tensor | float | None,
     conductivity: Tensor | None,
     tolerance: float,
 ) -> Tensor:
-    """The implicit step for the times t, or the solution of the Poisson problem for t = None."""
+    """The implicit step, or without `times` the solution of the Poisson problem."""
     check_tolerance(tolerance)
     x = as_columns(f, lb)
     time, dtype = None, torch.float64
-    if t is not None:
-        time = as_times(t, x, dtype).repeat(len(x) if x.ndim == 3 else 1)
+    if times:
+        time = as_times(times[0], x, dtype).repeat(len(x) if x.ndim == 3 else 1)
         dtype = dtype if tolerance < SINGLE else compute_dtype(x, lb.mass)
     columns = side_by_side(x.to(dtype))
     lb = _with_conductivity(lb, conductivity)
