@@ -91,7 +91,7 @@ def _from_front(d_j, d_k, foot_point, here, radius, side):
 
 
 @compiled_for(
-    "void(float64[::1], int64[::1], int64[::1], int64[::1], int64[:, ::1], float64[:, ::1], float64[::1], boolean, "
+    "float64(float64[::1], int64[::1], int64[::1], int64[::1], int64[:, ::1], float64[:, ::1], float64[::1], boolean, "
     "float64[::1], float64[::1], float64[::1], float64[::1], float64[::1])"
 )
 @no_type_check
@@ -104,10 +104,12 @@ def bend(
     front, which is the distance if K = 0. So the source behind a triangle is put at this radius, and the delay makes up
     for the difference. `spread` is J over the distance, `slope` is J'. Where K is not a number, or J not positive, they
     are 1, as if K had been 0. `angle` is the direction in which the path leaves its source, which is `given` for the
-    neighbours of the source and else not a number. Corners that are farther than i are used `again`, in a second
-    sweep. The other arguments are those of `straighten`.
+    neighbours of the source and else not a number. Corners that are farther than i are used `again`, in further
+    sweeps. The other arguments are those of `straighten`. Return the largest change of a place, by angle or distance.
     """
+    most = 0.0
     for i in order:
+        before, direction = result[i], angle[i]
         result[i], spread[i], slope[i] = distance[i], 1.0, 1.0
         best, t, side = np.inf, -1, 0
         for triangle in range(first[i], first[i + 1]):
@@ -153,3 +155,8 @@ def bend(
             result[i] += path - best
             if after > 0:
                 spread[i], slope[i] = after / path, b - bent * length * (2 * a + b * length)
+        turn = np.sin((angle[i] - direction) / 2)
+        most = max(most, abs(result[i] - before))
+        if not np.isnan(turn):
+            most = max(most, 2 * distance[i] * abs(turn))
+    return most

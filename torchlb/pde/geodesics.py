@@ -23,7 +23,7 @@ from torchlb.errors import InputError
 from torchlb.geometry.neighbors import mesh_graph
 from torchlb.geometry.thresholds import SLIGHT
 from torchlb.linalg.checks import check_operator, check_sources, takes_arrays
-from torchlb.linalg.precision import NEGLIGIBLE, TINY
+from torchlb.linalg.precision import NEGLIGIBLE, ROUNDS, TINY
 from torchlb.operator.laplace_beltrami import LaplaceBeltrami
 from torchlb.operator.through import without
 
@@ -153,16 +153,12 @@ def _paths(lb: LaplaceBeltrami, starts: Iterable[np.ndarray]) -> Iterator[Polar]
             foot = np.maximum(nearest, 0).astype(np.int64)  # arbitrary out of reach
             order, fell = np.argsort(distance), np.ones(len(points), dtype=np.int64)
             straighten(distance, foot, order, points, *triangles, fell, enough)
-            order, given, (result, *room) = (
-                np.argsort(distance),
-                angle.copy(),
-                np.empty((3, len(points))),
-            )
-            for again in (False, True):
-                bend(
-                    distance, foot, order, *triangles, curvature, again, given, angle, result, *room
-                )
-            distance = np.maximum(result, _distances(points, foot, slice(None)))
+            order, given, room = np.argsort(distance), angle.copy(), np.zeros((3, len(points)))
+            shape = distance, foot, order, *triangles, curvature
+            for sweep in range(ROUNDS):
+                if bend(*shape, sweep > 0, given, angle, *room) <= enough and sweep > 0:
+                    break
+            distance = np.maximum(room[0], _distances(points, foot, slice(None)))
         yield distance, angle
 
 
