@@ -23,7 +23,7 @@ from torchlb.errors import InputError
 from torchlb.geometry.neighbors import mesh_graph
 from torchlb.geometry.thresholds import SLIGHT
 from torchlb.linalg.checks import check_operator, check_sources, takes_arrays
-from torchlb.linalg.precision import NEGLIGIBLE, ROUNDS, TINY
+from torchlb.linalg.precision import NEGLIGIBLE, ROUNDS, SMALL, TINY
 from torchlb.operator.laplace_beltrami import LaplaceBeltrami
 from torchlb.operator.through import without
 
@@ -133,7 +133,7 @@ def _paths(lb: LaplaceBeltrami, starts: Iterable[np.ndarray]) -> Iterator[Polar]
     row, col = _edges(lb)
     length = _distances(points, row, col)
     graph = sparse.csr_array((length, (row, col)), shape=lb.shape)
-    enough = NEGLIGIBLE * float(length.mean()) if len(row) else 0.0
+    spacing = float(length.mean()) if len(row) else 0.0
     on_triangles = lb.dim == 2 and len(row) > 0
     triangles = _triangles(lb, points) if on_triangles else ()
     curvature = _curvature(*triangles) if on_triangles else points[:0, 0]
@@ -152,11 +152,11 @@ def _paths(lb: LaplaceBeltrami, starts: Iterable[np.ndarray]) -> Iterator[Polar]
                 angle[near] = np.arctan2(y, x)
             foot = np.maximum(nearest, 0).astype(np.int64)  # arbitrary out of reach
             order, fell = np.argsort(distance), np.ones(len(points), dtype=np.int64)
-            straighten(distance, foot, order, points, *triangles, fell, enough)
+            straighten(distance, foot, order, points, *triangles, fell, NEGLIGIBLE * spacing)
             order, given, room = np.argsort(distance), angle.copy(), np.zeros((3, len(points)))
             shape = distance, foot, order, *triangles, curvature
             for sweep in range(ROUNDS):
-                if bend(*shape, sweep > 0, given, angle, *room) <= enough and sweep > 0:
+                if bend(*shape, sweep > 0, given, angle, *room) <= SMALL * spacing and sweep > 0:
                     break
             distance = np.maximum(room[0], _distances(points, foot, slice(None)))
         yield distance, angle
