@@ -90,6 +90,31 @@ def _from_front(d_j, d_k, foot_point, here, radius, side):
     return path, part
 
 
+@njit(error_model="numpy")
+@no_type_check
+def _way(i, distance, foot, first, ends, sides, anywhere):
+    """Length of the shortest path to i, its triangle, or −1, and whether it is along ij (0), ik (1) or across jk (2).
+
+    Corners are nearer than i, or `anywhere`.
+    """
+    best, t, side = np.inf, -1, 0
+    for triangle in range(first[i], first[i + 1]):
+        j, k = ends[triangle, 0], ends[triangle, 1]
+        by_j, by_k = distance[j] + sides[triangle, 0], distance[k] + sides[triangle, 1]
+        j_known = anywhere or distance[j] < distance[i]
+        k_known = anywhere or distance[k] < distance[i]
+        if j_known and by_j < best:
+            best, t, side = by_j, triangle, 0
+        if k_known and by_k < best:
+            best, t, side = by_k, triangle, 1
+        if j_known and k_known and foot[j] == foot[k]:
+            base, height, along = sides[triangle, 2], sides[triangle, 3], sides[triangle, 4]
+            across = _across(distance[j], distance[k], along, height, base)
+            if across <= best:
+                best, t, side = across, triangle, 2
+    return best, t, side
+
+
 @compiled_for(
     "float64(float64[::1], int64[::1], int64[::1], int64[::1], int64[:, ::1], float64[:, ::1], float64[::1], boolean, "
     "float64[::1], float64[::1], float64[::1], float64[::1], float64[::1])"
@@ -111,21 +136,7 @@ def bend(
     for i in order:
         before, direction = result[i], angle[i]
         result[i], spread[i], slope[i] = distance[i], 1.0, 1.0
-        best, t, side = np.inf, -1, 0
-        for triangle in range(first[i], first[i + 1]):
-            j, k = ends[triangle, 0], ends[triangle, 1]
-            by_j, by_k = distance[j] + sides[triangle, 0], distance[k] + sides[triangle, 1]
-            j_known = distance[j] < distance[i] or (again and distance[i] > 0)
-            k_known = distance[k] < distance[i] or (again and distance[i] > 0)
-            if j_known and by_j < best:
-                best, t, side = by_j, triangle, 0
-            if k_known and by_k < best:
-                best, t, side = by_k, triangle, 1
-            if j_known and k_known and foot[j] == foot[k]:
-                base, height, along = sides[triangle, 2], sides[triangle, 3], sides[triangle, 4]
-                across = _across(distance[j], distance[k], along, height, base)
-                if across <= best:
-                    best, t, side = across, triangle, 2
+        best, t, side = _way(i, distance, foot, first, ends, sides, again and distance[i] > 0)
         if t < 0:  # a source, or out of reach
             continue
         j, k = ends[t, 0], ends[t, 1]
