@@ -80,7 +80,8 @@ def lone_points(points: Vectors, near: Int[np.ndarray, "N K"]) -> Mask:
     if len(far) == 0:
         return lone
     around, kept = points[near[far, 1:]], ~apart[near[far, 1:], None]
-    middle = (kept * around).sum(1) / np.maximum(kept.sum(1), 1)
+    kept |= ~kept.any(1, keepdims=True)
+    middle = (kept * around).sum(1) / kept.sum(1)
     offset = kept * (around - middle[:, None])
     normal = np.linalg.svd(offset, full_matrices=False)[2][:, 2]
     above = points[far] - middle

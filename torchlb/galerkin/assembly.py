@@ -202,7 +202,6 @@ class Elements:
     each element the fraction `share` is integrated, a number or (T,). `mix`, (T, F), has the share of each face of the
     mesh in an element, None where elements are beside the faces. With factors `lumped` for the points, the mass is in
     equal shares at the corners, times these.
-
     """
 
     nodes: Int[Tensor, "T n"]

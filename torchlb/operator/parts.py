@@ -84,7 +84,6 @@ class OperatorCache:
     They belong to `values` of the weak pair: an operator with other values gets a new cache. `system` is the linear
     system with its factors, `elements` are those of the weak pair, made for the first medium, `connection` the tangent
     fields; the `shapes` of a batch, each with the values that it had, serve it by their caches.
-
     """
 
     def __init__(self, values: Tensor) -> None:
