@@ -13,6 +13,9 @@ from typing import Any, no_type_check
 import numpy as np
 from numba import njit
 
+INNER = {"error_model": "numpy", "no_cfunc_wrapper": True, "no_cpython_wrapper": True}
+"""Options of functions that only compiled code calls; each wrapper takes a twentieth of a second to compile."""
+
 LANES = 64
 """Left inverses computed together; 16 to 128 take about as long."""
 
@@ -23,7 +26,7 @@ def compiled_for(signature: str) -> Callable[[Any], Any]:
     def deferred(function: Any) -> Any:
         @cache
         def compiled() -> Any:
-            options = {"error_model": "numpy", "nogil": True}
+            options = {"error_model": "numpy", "nogil": True, "no_cfunc_wrapper": True}
             try:
                 return njit(signature, cache=True, **options)(function)
             except RuntimeError:  # numba finds no place to write to
@@ -34,7 +37,7 @@ def compiled_for(signature: str) -> Callable[[Any], Any]:
     return deferred
 
 
-@njit(error_model="numpy")
+@njit(**INNER)
 @no_type_check
 def _product(x: np.ndarray, y: np.ndarray, total: np.ndarray) -> None:
     """Inner products of columns."""
@@ -46,7 +49,7 @@ def _product(x: np.ndarray, y: np.ndarray, total: np.ndarray) -> None:
             total[a] += x[k, a] * y[k, a]
 
 
-@njit(error_model="numpy")
+@njit(**INNER)
 @no_type_check
 def _subtract(factor: np.ndarray, x: np.ndarray, y: np.ndarray) -> None:
     """Subtract multiples of columns from others."""
@@ -56,7 +59,7 @@ def _subtract(factor: np.ndarray, x: np.ndarray, y: np.ndarray) -> None:
             y[k, a] -= factor[a] * x[k, a]
 
 
-@njit(error_model="numpy")
+@njit(**INNER)
 @no_type_check
 def _scale(x: np.ndarray, factor: np.ndarray) -> None:
     size, lanes = x.shape
@@ -130,7 +133,7 @@ def _left_inverse(
                     found[first + b, j, k] = a[j, k, b] * root[first + b, k]
 
 
-@njit
+@njit(**INNER)
 @no_type_check
 def _distance(
     points: np.ndarray,
@@ -155,7 +158,7 @@ def _distance(
     return square if square - flat <= slope**2 * square and abs(cosine) >= alignment else -1.0
 
 
-@njit
+@njit(**INNER)
 @no_type_check
 def _nearest_first(square: np.ndarray, ball: np.ndarray, total: int, size: int) -> int:
     """Insertion sort of the `size` nearest, ties by their number; return how many these are."""

@@ -7,11 +7,11 @@ from typing import no_type_check
 import numpy as np
 from numba import njit
 
-from torchlb.linalg.kernels import compiled_for
+from torchlb.linalg.kernels import INNER, compiled_for
 from torchlb.linalg.precision import SMALL
 
 
-@njit(error_model="numpy")
+@njit(**INNER)
 @no_type_check
 def _source(d_j: float, d_k: float, base: float) -> tuple[float, float]:
     """The point at d_j and d_k from j and k: its place along jk, and how far it is below."""
@@ -19,7 +19,7 @@ def _source(d_j: float, d_k: float, base: float) -> tuple[float, float]:
     return source, np.sqrt(max(d_j**2 - source**2, 0.0))
 
 
-@njit(error_model="numpy")
+@njit(**INNER)
 @no_type_check
 def _across(d_j: float, d_k: float, along: float, height: float, base: float) -> float:
     """Distance from i, `height` over jk at `along`, to the point below at d_j and d_k; infinite if it misses jk."""
@@ -70,7 +70,7 @@ def straighten(distance, foot, order, points, first, ends, sides, fell, enough):
                 distance[i], foot[i] = best, source
 
 
-@njit(error_model="numpy")
+@njit(**INNER)
 @no_type_check
 def _from_front(d_j, d_k, foot_point, here, radius, side):
     """Distance of i behind a front of this radius at the point `foot_point` of jk, itself `here`, and the part of jk.
@@ -90,7 +90,7 @@ def _from_front(d_j, d_k, foot_point, here, radius, side):
     return path, part
 
 
-@njit(error_model="numpy")
+@njit(**INNER)
 @no_type_check
 def _way(i, distance, foot, first, ends, sides, anywhere):
     """Length of the shortest path to i, its triangle, or −1, and whether it is along ij (0), ik (1) or across jk (2).
