@@ -180,18 +180,20 @@ def _framed(
     crow, col, order = pattern.crow, pattern.col, torch.from_numpy(pattern.order).long()
     turned = given[starts][order] != torch.arange(count).repeat_interleave(crow.diff())
     whole, inner = (at(torch.cat([x, x.mT]), order + len(x) * turned) for x in (whole, inner))
-    place = crow.numpy(), col.numpy()
-    parts = [whole]
-    for channel in range(1, len(others.values)):
-        value = torch.from_numpy(values_on(*place, others.to_scipy(channel)))
-        parts.append(value[:, None, None] * inner)
-    found: Any = [
-        sparse.bsr_array((part.numpy(), *place[::-1]), shape=2 * (dim * count,)).tocsr()
-        for part in parts
-    ]
-    values = torch.from_numpy(np.stack([each.data for each in found]))
-    rows, columns = (torch.from_numpy(x).long() for x in (found[0].indptr, found[0].indices))
-    return Csr(rows, columns, values)
+    length, place = crow.diff(), torch.arange(len(col))
+    starts, length = (x.repeat_interleave(length) for x in (crow[:-1], length))
+    place = dim * starts + place - starts  # rows of a block row follow each other
+    place = (place[:, None] + torch.arange(dim) * length[:, None]).view(-1)
+    values = inner.new_empty(len(others.values), len(place), dim)
+    for channel in range(len(values)):
+        if channel:
+            value = values_on(crow.numpy(), col.numpy(), others.to_scipy(channel))
+            whole = torch.from_numpy(value)[:, None, None] * inner
+        values[channel, place] = whole.view(-1, dim)
+    columns = col.new_empty(len(place), dim)
+    columns[place] = (dim * col[:, None] + torch.arange(dim)).repeat_interleave(dim, 0)
+    rows = torch.cat([crow[:1], (dim * crow.diff()).repeat_interleave(dim).cumsum(0)])
+    return Csr(rows, columns.view(-1), values.flatten(1))
 
 
 class WeakGradient(NamedTuple):
