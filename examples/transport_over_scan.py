@@ -2,8 +2,8 @@
 
 Usage: python examples/transport_over_scan.py [--output gallery_output] [--points 1200] [--level 2]
 An inflated cortical surface, which nilearn brings, is made smooth by subdivision, so that coarse and fine meshes lie on
-one surface. Both libraries transport a vector by the vector heat method, on two meshes, and are compared with both on
-the finest mesh. potpourri3d's elements are linear; it takes a small part of the time (needs potpourri3d).
+one surface. torchlb transports a vector along shortest paths, potpourri3d by the vector heat method with linear
+elements, on two meshes, and they are compared with both on the finest mesh (needs potpourri3d).
 """
 
 import sys

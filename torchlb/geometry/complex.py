@@ -76,6 +76,12 @@ class Edges:
         return self.order[first], self.order[first + 1]
 
     @cached_property
+    def against(self) -> Bool[np.ndarray, " T"]:
+        """Whether the two faces at such an edge run along it in one direction: they are wound against each other."""
+        one, two = self.twins
+        return self.ends[0][one] == self.ends[0][two]
+
+    @cached_property
     def outer(self) -> Mask:
         """Points on the boundary or in no face."""
         result = np.ones(self.count, dtype=bool)

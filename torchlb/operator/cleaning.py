@@ -270,8 +270,7 @@ def turned_faces(faces: Int[Tensor, "F v"]) -> Bool[Tensor, " F"]:
         return torch.zeros(count, dtype=torch.bool)
     edges = edges_of(faces.numpy(), int(faces.max()) + 1)
     one, two = edges.twins
-    against = edges.ends[0][one] == edges.ends[0][two]
-    own, other = two_orientations(one // 3, two // 3, against, count)
+    own, other = two_orientations(one // 3, two // 3, edges.against, count)
     turned, component = own > other, np.minimum(own, other)
     share = np.bincount(component, turned) / np.maximum(np.bincount(component), 1)
     return torch.from_numpy(turned ^ (share > 0.5)[component])

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, Literal
 
 import torch
 from jaxtyping import Float, Int
@@ -12,12 +12,21 @@ from torch import Tensor
 from torch.nn.functional import normalize
 
 from torchlb.errors import InputError
-from torchlb.linalg.checks import check_operator, check_sources, check_tensor, takes_arrays
+from torchlb.geometry.complex import edges_of
+from torchlb.linalg.checks import (
+    check_choice,
+    check_operator,
+    check_sources,
+    check_tensor,
+    takes_arrays,
+)
 from torchlb.linalg.precision import LOW, ROOT_EPS, ROUNDING, TINY
 from torchlb.operator.laplace_beltrami import LaplaceBeltrami
-from torchlb.pde.geodesics import geodesic_distance
+from torchlb.pde.geodesics import geodesic_distance, logarithmic_map
 from torchlb.pde.heat import heat_flow
 from torchlb.pde.solves import solved
+
+Transport = Literal["paths", "heat"]
 
 SHORT = 2.0
 """Time of transport over the square of the mean spacing: at half of it the source is hardly resolved."""
@@ -62,11 +71,10 @@ def parallel_transport(
     lb: LaplaceBeltrami,
     sources: int | Sequence[int] | Int[Tensor, " S"],
     vectors: Float[Tensor, " n"] | Float[Tensor, "S n"] | Float[Tensor, "S n C"],
+    *,
+    method: Transport | None = None,
 ) -> Float[Tensor, "N n"] | Float[Tensor, "N n C"]:
     """Vectors at the sources, transported to all points along shortest paths from the nearest source.
-
-    By the vector heat method (Sharp, Soliman, Crane 2019): the direction is that of an implicit step of the connection
-    Laplacian, extrapolated from two short times to none; the length is the ratio of two steps of functions.
 
     Parameters
     ----------
@@ -76,9 +84,16 @@ def parallel_transport(
         Index of a point, or indices of several.
     vectors
         Their space vectors, of which the tangential part counts; with C channels so many fields.
+    method
+        "paths": a vector keeps its angle with a path, which leaves the source in the direction of `logarithmic_map` and
+        arrives in that of the gradient of `geodesic_distance`. On smooth surfaces it is of second order. It is for
+        oriented surfaces in space with triangles. "heat": the vector heat method (Sharp, Soliman, Crane 2019), for all
+        shapes. The direction is that of an implicit step of the connection Laplacian, the length the ratio of two
+        steps of functions. It mixes paths, and is of first order, but differentiable in points and medium. By default
+        "paths" for such surfaces without a medium or points that require gradients, else "heat".
 
-    Differentiable in the vectors, points and medium. Zero where no path leads to a source. Raises InputError for
-    indices out of range and vectors of other shapes.
+    Differentiable in the vectors. Zero where no path leads to a source. Raises InputError for indices out of range,
+    vectors of other shapes, and a method that is not for this shape.
 
     >>> from torchlb.surfaces import Sphere
     >>> lb = LaplaceBeltrami.from_mesh(*Sphere().mesh(500))
@@ -97,10 +112,47 @@ def parallel_transport(
         )
     columns = given[..., None] if given.ndim == 2 else given
     local = torch.einsum("snd,snc->sdc", lb.frames[index].double(), columns.double())
-    count, width = lb.num_points, columns.shape[2]
-    start = local.new_zeros(count, lb.dim, width).index_add(0, index, local)
+    moved = _transport(lb, method)(lb, index, local)
+    moved = torch.einsum("ind,idc->inc", lb.frames.double(), moved).to(vectors)
+    return moved if given.ndim == 3 else moved[..., 0]
+
+
+def _transport(lb: Any, method: Transport | None) -> Any:
+    """The transport of components by a method, or the default one."""
+    with_paths = lb.dim == 2 and len(lb.normals) > 0 and len(lb.faces) > 0
+    with_paths = with_paths and not edges_of(lb.faces.cpu().numpy(), lb.num_points).against.any()
+    if method is None:
+        varies = lb._in_medium or lb._carries or lb.points.requires_grad
+        method = "paths" if with_paths and not varies else "heat"
+    check_choice("method", method, Transport)
+    if method == "paths" and not with_paths:
+        raise InputError(
+            'method: "paths" is for oriented surfaces in space with triangles; "heat" is for all shapes'
+        )
+    return _by_paths if method == "paths" else _by_heat
+
+
+def _by_paths(lb: Any, index: Tensor, local: Float[Tensor, "S 2 C"]) -> Float[Tensor, "N 2 C"]:
+    """Turn the components by the angle from the direction of a path at its source to that at its end."""
+    leaving = logarithmic_map(lb, index).double()
+    distance = leaving.norm(dim=1)
+    nearest = distance.nan_to_num(torch.inf).argmin(1)
+    arriving = lb.local_gradient(distance.nan_to_num().square())
+    leaving, arriving = (
+        torch.complex(*x[torch.arange(len(x)), :, nearest].double().unbind(1))
+        for x in (leaving.nan_to_num(), arriving)
+    )
+    turn = (leaving.conj() * arriving).sgn().index_fill(0, index, 1.0)
+    found = turn[:, None] * torch.complex(*local.unbind(1))[nearest]
+    return torch.stack([found.real, found.imag], 1)
+
+
+def _by_heat(lb: Any, index: Tensor, local: Float[Tensor, "S d C"]) -> Float[Tensor, "N d C"]:
+    """Components by steps of heat, one of the fields and, for several sources, one of the lengths."""
+    count, dim, width = lb.num_points, *local.shape[1:]
+    start = local.new_zeros(count, dim, width).index_add(0, index, local)
     t = _time(lb, geodesic_distance(lb, index))
-    direction = _directions(lb, start, t)
+    moved = _step(lb.connection, start.flatten(0, 1), t).unflatten(0, (count, dim))
     size = local.norm(dim=1)
     lengths = size.amin(0).expand(count, -1)
     if len(index) > 1:
@@ -109,33 +161,15 @@ def parallel_transport(
         reached = _step(lb, spread, t)
         lengths = reached[:, 1:] / reached[:, :1].clamp_min(TINY)
         lengths = lengths.clamp(size.amin(0), size.amax(0))
-    moved = (direction * lengths[:, None]).to(vectors)
-    return moved if given.ndim == 3 else moved[..., 0]
+    return normalize(moved, dim=1, eps=TINY) * lengths[:, None]
 
 
 def _time(lb: LaplaceBeltrami, distance: Tensor) -> Float[Tensor, ""]:
-    """Time of the shorter step, ℓ², by the spacing, or by the largest distance from a source where that is far."""
+    """Time of the step, ℓ², by the spacing, or by the largest distance from a source where that is far."""
     short = SHORT * lb.mass.double().mean() ** (2 / lb.dim)
     longest = distance[distance.isfinite()].max().double()
     far = (longest / (1 - LOW) / FARTHEST).square()
     return far if bool(far > short) else short
-
-
-def _directions(
-    lb: LaplaceBeltrami, start: Float[Tensor, "N d C"], t: Float[Tensor, ""]
-) -> Float[Tensor, "N n C"]:
-    """Unit space vectors of the transport of each column from the points where it is not zero.
-
-    An implicit step mixes paths within a width of (r²t)^{1/4} at the distance r, so that its direction is off in
-    proportion to √t; that of four times the time cancels this.
-    """
-    one, two = (
-        normalize(
-            lb.connection.vectors(_step(lb.connection, start.flatten(0, 1), time)), dim=1, eps=TINY
-        )
-        for time in (t, 4 * t)
-    )
-    return normalize(2 * one - two, dim=1, eps=TINY)
 
 
 def _step(fields: Any, b: Float[Tensor, "rows C"], t: Float[Tensor, ""]) -> Float[Tensor, "rows C"]:
