@@ -139,6 +139,11 @@ def _vtk(path: Path) -> Contents:
         mesh = pyvista.read(path)
     if heard.events:  # of a damaged file VTK makes up the rest
         raise InputError(f"VTK says: {heard.events[0]}")
+    head, _, rest = path.read_bytes().partition(b"POINTS")
+    if path.suffix == ".vtk" and b"ASCII" in head:  # of points that are cut off it says nothing
+        numbers = rest.split()[2:]
+        if len(numbers) < 3 * mesh.n_points:
+            raise InputError(f"{mesh.n_points} points, and {len(numbers)} numbers follow")
     if isinstance(mesh, pyvista.PolyData):
         mesh = mesh.triangulate(pass_lines=True)
     grid = mesh.cast_to_unstructured_grid()
