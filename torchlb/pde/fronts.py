@@ -8,7 +8,7 @@ import numpy as np
 from numba import njit
 
 from torchlb.linalg.kernels import INNER, compiled_for
-from torchlb.linalg.precision import SMALL
+from torchlb.linalg.precision import LOW, SMALL
 
 
 @njit(**INNER)
@@ -127,10 +127,12 @@ def bend(
 
     Jacobi's equation J'' = −KJ along a path, with J = 0 and J' = 1 at its source, has the radius J/J' of the wave
     front, which is the distance if K = 0. So the source behind a triangle is put at this radius, and the delay makes up
-    for the difference. `spread` is J over the distance, `slope` is J'. Where K is not a number, or J not positive, they
-    are 1, as if K had been 0. `angle` is the direction in which the path leaves its source, which is `given` for the
-    neighbours of the source and else not a number. Corners that are farther than i are used `again`, in further
-    sweeps. The other arguments are those of `straighten`. Return the largest change of a place, by angle or distance.
+    for the difference. `spread` is J over the distance, `slope` is J'. Where K is not a number, or J below `LOW` times
+    the distance, near a focus, they are 1, as if K had been 0. A path behind a focus, of a length that those to j and k
+    exclude, takes over their corrections. `angle` is the direction in which the path leaves its source, which is
+    `given` for the neighbours of the source and else not a number. Corners that are farther than i are used `again`, in
+    further sweeps. The other arguments are those of `straighten`. Return the largest change of a place, by angle or
+    distance.
     """
     most = 0.0
     for i in order:
@@ -155,6 +157,11 @@ def bend(
             b = (1 - share) * slope[j] + share * slope[k]
             bent = (1 - share) * curvature[j] + share * curvature[k]
             path, part = _from_front(result[j], result[k], foot_point, here, a / b, sides[t])
+            low = max(result[j] - sides[t, 0], result[k] - sides[t, 1])
+            high = min(result[j] + sides[t, 0], result[k] + sides[t, 1])
+            if not low - SMALL * base <= path <= high + SMALL * base:
+                more_j, more_k = result[j] - distance[j], result[k] - distance[k]
+                path, part, b = best + (1 - share) * more_j + share * more_k, -1.0, np.nan
             turned = angle[k] if np.isnan(angle[j]) else angle[j]
             between = (angle[k] - turned + np.pi) % (2 * np.pi) - np.pi
             if not np.isnan(between):
@@ -164,7 +171,7 @@ def bend(
         after = a + b * length - bent * length**2 * (a + b * length / 3)
         if path > 0:
             result[i] += path - best
-            if after > 0:
+            if after > LOW * path:
                 spread[i], slope[i] = after / path, b - bent * length * (2 * a + b * length)
         turn = np.sin((angle[i] - direction) / 2)
         most = max(most, abs(result[i] - before))
