@@ -7,7 +7,13 @@ import torch
 import trimesh
 from scipy.spatial import Delaunay
 
-from torchlb import InputError, LaplaceBeltrami, geodesic_distance, logarithmic_map
+from torchlb import (
+    InputError,
+    LaplaceBeltrami,
+    geodesic_distance,
+    logarithmic_map,
+    parallel_transport,
+)
 from torchlb.surfaces import Sphere, Torus, UnitDisk, limit_surface
 
 
@@ -189,12 +195,25 @@ def test_distance_from_a_region():
     assert np.abs(distance.numpy() - exact).mean() < 0.01 * exact.mean()
 
 
-def test_every_point_has_normal_coordinates():
-    """On a rough sheet, where paths cross edges between vertices that are both farther from the source."""
-    points, faces = _disk_of_random_points(300)
-    rough = np.random.default_rng(1).normal(scale=0.15, size=len(points))
-    lb = LaplaceBeltrami.from_cotangent(np.column_stack([points, rough]), faces)
-    x = torch.as_tensor(logarithmic_map(lb, range(0, 300, 3)))
+@pytest.mark.parametrize("build", ["mesh", "cloud"])
+def test_every_point_has_normal_coordinates(build):
+    """On a rough sheet, where paths cross edges between vertices that are both farther from the source.
+
+    Some noisy points are joined to the surface by edges alone.
+    """
+    if build == "mesh":
+        points, faces = _disk_of_random_points(300)
+        rough = np.random.default_rng(1).normal(scale=0.15, size=len(points))
+        lb = LaplaceBeltrami.from_cotangent(np.column_stack([points, rough]), faces)
+    else:
+        points = Torus().random_points(300, 1)
+        noise = torch.randn(points.shape, generator=torch.Generator().manual_seed(1)).double()
+        lb = LaplaceBeltrami.from_points(points + 0.04 * noise)
+        assert len(lb.faces.unique()) < 300
+    sources = list(range(0, 300, 3))
+    x = torch.as_tensor(logarithmic_map(lb, sources))
     assert x.isfinite().all()
-    distance = torch.as_tensor(geodesic_distance(lb, range(0, 300, 3), each=True))
+    distance = torch.as_tensor(geodesic_distance(lb, sources, each=True))
     torch.testing.assert_close(x.norm(dim=1), distance, rtol=0, atol=1e-9)
+    moved = parallel_transport(lb, 0, torch.as_tensor(lb.frames)[0, :, 0])
+    assert (moved.norm(dim=1) - 1).abs().max() < 1e-9

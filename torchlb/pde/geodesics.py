@@ -23,7 +23,7 @@ from torchlb.errors import InputError
 from torchlb.geometry.neighbors import mesh_graph
 from torchlb.geometry.thresholds import SLIGHT
 from torchlb.linalg.checks import check_operator, check_sources, takes_arrays
-from torchlb.linalg.precision import NEGLIGIBLE, ROUNDS, SMALL, TINY
+from torchlb.linalg.precision import NEGLIGIBLE, ROUNDS, SMALL
 from torchlb.operator.laplace_beltrami import LaplaceBeltrami
 from torchlb.operator.through import without
 
@@ -138,7 +138,7 @@ def _paths(lb: LaplaceBeltrami, starts: Iterable[np.ndarray]) -> Iterator[Polar]
     triangles = _triangles(lb, points) if on_triangles else ()
     curvature = _curvature(*triangles) if on_triangles else points[:0, 0]
     for start in starts:
-        distance, _, nearest = csgraph.dijkstra(
+        distance, before, nearest = csgraph.dijkstra(
             graph, indices=start, min_only=True, return_predecessors=True
         )
         angle = np.full(len(points), np.nan)
@@ -152,6 +152,7 @@ def _paths(lb: LaplaceBeltrami, starts: Iterable[np.ndarray]) -> Iterator[Polar]
                 angle[near] = np.arctan2(y, x)
             foot = np.maximum(nearest, 0).astype(np.int64)  # arbitrary out of reach
             order, fell = np.argsort(distance), np.ones(len(points), dtype=np.int64)
+            tree = order[before[order] >= 0]
             straighten(distance, foot, order, points, *triangles, fell, NEGLIGIBLE * spacing)
             order, given, room = np.argsort(distance), angle.copy(), np.zeros((3, len(points)))
             shape = distance, foot, order, *triangles, curvature
@@ -159,6 +160,8 @@ def _paths(lb: LaplaceBeltrami, starts: Iterable[np.ndarray]) -> Iterator[Polar]
                 if bend(*shape, sweep > 0, given, angle, *room) <= SMALL * spacing and sweep > 0:
                     break
             distance = np.maximum(room[0], _distances(points, foot, slice(None)))
+            for i in tree[np.isnan(angle[tree])] if len(start) == 1 else ():
+                angle[i] = angle[before[i]]  # edges alone lead there
         yield distance, angle
 
 
@@ -172,7 +175,8 @@ def _curvature(first: np.ndarray, _: np.ndarray, sides: np.ndarray) -> Float[np.
     of = np.repeat(np.arange(len(first) - 1), np.diff(first))
     total, area = (np.bincount(of, x, len(first) - 1) for x in (angle, base * height / 6))
     defect = 2 * np.pi - total
-    return np.where((abs(defect) <= SLIGHT) & (area > 0), defect / np.maximum(area, TINY), np.nan)
+    resolved = (abs(defect) <= SLIGHT) & (area > 0)
+    return np.divide(defect, area, out=np.full_like(area, np.nan), where=resolved)
 
 
 def _edges(lb: LaplaceBeltrami) -> tuple[np.ndarray, np.ndarray]:
