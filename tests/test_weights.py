@@ -14,6 +14,7 @@ from torchlb.fits.weights import (
     least_squares_weights,
     window,
 )
+from torchlb.geometry.fit_search import is_regular
 from torchlb.linalg.precision import NEGLIGIBLE
 
 CASES = [(1, 2), (1, 5), (2, 2), (2, 3), (2, 6), (3, 2), (3, 4), (4, 3)]
@@ -132,6 +133,14 @@ def test_a_cross_without_corners_is_reported():
     """y₁y₂ vanishes on all its eight points."""
     unit = torch.tensor([[1.0, 0], [-1, 0], [0, 1], [0, -1]], dtype=torch.float64)
     assert refused(least_squares_weights(torch.cat([unit, 2 * unit])[None], 2))
+
+
+@pytest.mark.parametrize(("off", "passes"), [(0.0, False), (1e-17, False), (1e-2, True)])
+def test_a_cross_but_for_rounding_is_refused(off, passes):
+    """The fit's derivatives are those of a quotient of roundings, whatever its values between the points are."""
+    unit = torch.tensor([[1.0, off], [-1, off], [off, 1], [off, -1]], dtype=torch.float64)
+    fit = centered_fit(torch.cat([unit, 2 * unit])[None], 2)
+    assert is_regular(fit, unit[None] / 2, 2).item() == passes
 
 
 @pytest.mark.parametrize("rule", WEIGHT_RULES)

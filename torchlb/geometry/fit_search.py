@@ -202,6 +202,10 @@ def _joined(
 
 
 def is_regular(fit: CenteredFit, middles: Tensor, degree: int) -> Bool[Tensor, " B"]:
-    """Whether a fit's slope is exact, and its Lebesgue constant up to `degree` small at edge midpoints (B, E, d), ℓ."""
+    """Whether a fit's slope is exact, and its Lebesgue constant up to `degree` small at edge midpoints (B, E, d), ℓ.
+
+    Points on two lines, but for rounding, leave a term free that vanishes at all of them: its coefficients are large.
+    """
     exact = fit.residual(middles.shape[2]) <= NEGLIGIBLE
+    exact &= fit.coefficients.abs().amax((1, 2)) <= 1 / NEGLIGIBLE
     return exact & (fit.lebesgue(middles, degree) <= MAX_LEBESGUE)

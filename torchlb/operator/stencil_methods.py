@@ -10,6 +10,7 @@ from torch import Tensor
 
 from torchlb.errors import InputError
 from torchlb.geometry.boundary import boundary_faces
+from torchlb.geometry.thresholds import CREASE
 from torchlb.linalg.checks import check_tensor, takes_arrays
 from torchlb.linalg.csr import tensors_of
 from torchlb.linalg.sparse import csr_product
@@ -213,7 +214,7 @@ class StencilMethods(OperatorStorage):
         check_surface(self, "curvatures")
         stencil, normals = self.stencil, self.normals
         # a neighbour's normal on the side of that of the row: surfaces without sides have curvatures, too
-        opposed = (normals[stencil.row] * normals[stencil.col]).sum(1) < 0
+        opposed = (normals[stencil.row] * normals[stencil.col]).sum(1) < -CREASE
         sign = torch.where(opposed, -1.0, 1.0).to(normals.dtype)
         slopes = [
             csr_product(stencil.pattern, v * sign, normals, False) for v in stencil.values[1:]
