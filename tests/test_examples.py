@@ -210,7 +210,7 @@ GALLERY = {  # options of a small run, and what it prints
         "torus, κ = 9 along parallels: 7 eigenvalues off by 2.",
     ),
     "scan_curvature": (["--points", "500"], "libigl, radius 5, as scanned: 0.2"),
-    "transport_over_scan": (["--points", "150"], "transport by torchlb, 594 vertices: 2."),
+    "transport_over_scan": (["--points", "150"], "transport by torchlb, 594 vertices: 1."),
     "hodge_parts": (["--level", "2"], "798 vertices, the first eigenvalues of Hodge's Laplacian:"),
     "isospectralization": (
         ["--points", "150", "--steps", "3", "--k", "8"],
