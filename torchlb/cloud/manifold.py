@@ -53,8 +53,7 @@ def wound_alike(points: Vectors, faces: Faces) -> tuple[Faces, Bool[np.ndarray, 
     """
     edges = edges_of(faces, len(points))
     one, two = edges.twins
-    against = edges.ends[0][one] == edges.ends[0][two]
-    normals = unit(face_vectors(points, faces))
+    against, normals = edges.against, unit(face_vectors(points, faces))
     i, j, size = one // 3, two // 3, len(faces)
     bend = 1.001 - inner(normals.take(i, 0), normals.take(j, 0)) * np.where(against, -1, 1)
     order = np.argsort(bend, kind="stable")

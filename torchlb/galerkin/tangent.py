@@ -180,10 +180,7 @@ def _framed(
     crow, col, order = pattern.crow, pattern.col, torch.from_numpy(pattern.order).long()
     turned = given[starts][order] != torch.arange(count).repeat_interleave(crow.diff())
     whole, inner = (at(torch.cat([x, x.mT]), order + len(x) * turned) for x in (whole, inner))
-    length, place = crow.diff(), torch.arange(len(col))
-    starts, length = (x.repeat_interleave(length) for x in (crow[:-1], length))
-    place = dim * starts + place - starts  # rows of a block row follow each other
-    place = (place[:, None] + torch.arange(dim) * length[:, None]).view(-1)
+    place = _rows_of_blocks(crow, dim)
     values = inner.new_empty(len(others.values), len(place), dim)
     for channel in range(len(values)):
         if channel:
@@ -194,6 +191,14 @@ def _framed(
     columns[place] = (dim * col[:, None] + torch.arange(dim)).repeat_interleave(dim, 0)
     rows = torch.cat([crow[:1], (dim * crow.diff()).repeat_interleave(dim).cumsum(0)])
     return Csr(rows, columns.view(-1), values.flatten(1))
+
+
+def _rows_of_blocks(crow: Int[Tensor, " N_plus_1"], dim: int) -> Int[Tensor, " d_nnz"]:
+    """Where the d rows of each block stand when the rows of a block row are written one after the other."""
+    length, number = crow.diff(), torch.arange(int(crow[-1]))
+    start, length = (x.repeat_interleave(length) for x in (crow[:-1], length))
+    first = dim * start + number - start
+    return (first[:, None] + torch.arange(dim) * length[:, None]).view(-1)
 
 
 class WeakGradient(NamedTuple):

@@ -139,9 +139,9 @@ def _vtk(path: Path) -> Contents:
         mesh = pyvista.read(path)
     if heard.events:  # of a damaged file VTK makes up the rest
         raise InputError(f"VTK says: {heard.events[0]}")
-    head, _, rest = path.read_bytes().partition(b"POINTS")
-    if path.suffix == ".vtk" and b"ASCII" in head:  # of points that are cut off it says nothing
-        numbers = rest.split()[2:]
+    body = path.read_bytes().split(b"\n", 2)[-1].lstrip() if path.suffix == ".vtk" else b""
+    if body[:5].upper() == b"ASCII":  # of points that are cut off it says nothing
+        numbers = body.partition(b"POINTS")[2].split()[2:]
         if len(numbers) < 3 * mesh.n_points:
             raise InputError(f"{mesh.n_points} points, and {len(numbers)} numbers follow")
     if isinstance(mesh, pyvista.PolyData):

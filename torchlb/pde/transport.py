@@ -119,17 +119,20 @@ def parallel_transport(
 
 def _transport(lb: Any, method: Transport | None) -> Any:
     """The transport of components by a method, or the default one."""
-    with_paths = lb.dim == 2 and len(lb.normals) > 0 and len(lb.faces) > 0
-    with_paths = with_paths and not edges_of(lb.faces.cpu().numpy(), lb.num_points).against.any()
-    if method is None:
-        varies = lb._in_medium or lb._carries or lb.points.requires_grad
-        method = "paths" if with_paths and not varies else "heat"
-    check_choice("method", method, Transport)
-    if method == "paths" and not with_paths:
+    if method is not None:
+        check_choice("method", method, Transport)
+    elif lb._in_medium or lb._carries or lb.points.requires_grad:
+        method = "heat"
+    if method == "heat":
+        return _by_heat
+    in_space = lb.dim == 2 and len(lb.normals) > 0 and len(lb.faces) > 0
+    if in_space and not edges_of(lb.faces.cpu().numpy(), lb.num_points).against.any():
+        return _by_paths
+    if method == "paths":
         raise InputError(
             'method: "paths" is for oriented surfaces in space with triangles; "heat" is for all shapes'
         )
-    return _by_paths if method == "paths" else _by_heat
+    return _by_heat
 
 
 def _by_paths(lb: Any, index: Tensor, local: Float[Tensor, "S 2 C"]) -> Float[Tensor, "N 2 C"]:
