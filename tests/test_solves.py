@@ -188,12 +188,13 @@ def test_data_of_a_boundary_enter_with_the_order(condition, data):
     assert (fine < coarse / 8).all()
 
 
-def test_second_derivatives_of_flows_and_media_are_an_error():
+def test_second_derivatives_of_deflated_flows_and_media_are_an_error():
     """And not half of what they should be."""
     lb = BUILDERS["cotangent"]()
+    deflated = functools.partial(heat_flow, method="deflated", k=6)
     t = torch.tensor(0.1, dtype=torch.float64, requires_grad=True)
     x, kappa = (lb.points[:, 0].exp().clone().requires_grad_() for _ in range(2))
-    flow = heat_flow(lb, x, t).pow(2).sum()
+    flow = deflated(lb, x, t).pow(2).sum()
     step = implicit_step(lb, x, t, conductivity=kappa).pow(2).sum()
     for slopes in (
         torch.autograd.grad(flow, (x, t), create_graph=True),
@@ -204,14 +205,14 @@ def test_second_derivatives_of_flows_and_media_are_an_error():
                 slope.sum().backward(retain_graph=True)
     with pytest.raises(RuntimeError, match="differentiable once"):
         torch.autograd.functional.hessian(
-            lambda s: heat_flow(lb, s * x.detach(), 0.1).pow(2).sum(), t
+            lambda s: deflated(lb, s * x.detach(), 0.1).pow(2).sum(), t
         )
     with pytest.raises(RuntimeError, match="linear: the derivative in a direction"):
-        torch.autograd.functional.jvp(lambda f: heat_flow(lb, f, 0.1), x.detach(), x.detach())
+        torch.autograd.functional.jvp(lambda f: deflated(lb, f, 0.1), x.detach(), x.detach())
 
 
 @pytest.mark.parametrize("condition", ["neumann", "dirichlet"])
-def test_second_derivatives_of_solves(condition):
+def test_second_derivatives_of_solves_and_flows(condition):
     """In f and t, with boundary data; the derivative in a direction is the solution for it."""
     lb = disk(40, condition)
     data = {"boundary_values": 0.5} if condition == "dirichlet" else {"flux": 0.3}
@@ -225,12 +226,42 @@ def test_second_derivatives_of_solves(condition):
         return poisson_solve(lb, f, tolerance=1e-13, **data).square()
 
     assert torch.autograd.gradgradcheck(step, (f, t), fast_mode=True)
+
+    def flow(f, t):
+        return heat_flow(lb, f, t, tolerance=1e-13)
+
     assert torch.autograd.gradgradcheck(squared, (f,), fast_mode=True)
+    assert torch.autograd.gradgradcheck(flow, (f, t), fast_mode=True)
     way = torch.randn(40, dtype=torch.float64)
     _, along = torch.autograd.functional.jvp(
         lambda g: implicit_step(lb, g, 0.1), lb.points[:, 0].clone(), way
     )
     torch.testing.assert_close(along, implicit_step(lb, way, 0.1), rtol=1e-6, atol=1e-8)
+
+
+@pytest.mark.parametrize("transposed", [False, True])
+def test_derivatives_of_a_flow_where_it_starts(transposed):
+    """∂_t e^{tL}x = Lx and ∂²_t e^{tL}x = L²x at t = 0, L = −M⁻¹K, and of its adjoint."""
+    lb = disk(40, "neumann")
+    k, m = (lb.to_scipy(name).toarray() for name in ("stiffness", "mass"))
+    operator = -torch.from_numpy(np.linalg.solve(m, k))
+    x = torch.randn(40, dtype=torch.float64)
+    zero = torch.zeros((), dtype=torch.float64, requires_grad=True)
+    if transposed:
+        value = (heat_flow(lb, x.requires_grad_(), zero, tolerance=1e-13) * x.detach()).sum()
+        value = torch.autograd.grad(value, x, create_graph=True)[0] @ lb.points[:, 0]
+        once, twice = (
+            x.detach() @ operator @ lb.points[:, 0] for operator in (operator, operator @ operator)
+        )
+    else:
+        value = lb.points[:, 0] @ heat_flow(lb, x, zero, tolerance=1e-13)
+        once, twice = (
+            lb.points[:, 0] @ operator @ x for operator in (operator, operator @ operator)
+        )
+    (first,) = torch.autograd.grad(value, zero, create_graph=True)
+    (second,) = torch.autograd.grad(first, zero)
+    torch.testing.assert_close(first.detach(), once, rtol=1e-8, atol=0)
+    torch.testing.assert_close(second, twice, rtol=1e-8, atol=0)
 
 
 @pytest.mark.parametrize("solve", [implicit_step, heat_flow])

@@ -26,7 +26,9 @@ from scipy.fft import dct
 from scipy.special import ive
 from torch import Tensor
 
+from torchlb.errors import DerivativeError
 from torchlb.linalg.factor import Factor
+from torchlb.linalg.once import DIFFERENTIABLE_ONCE
 from torchlb.linalg.precision import AT_ONCE, NEGLIGIBLE, ROUNDS, TINY
 from torchlb.linalg.sparse import multiply
 
@@ -115,7 +117,12 @@ def _backward(ctx: Any, grad: Tensor) -> tuple[Any, ...]:
     return [None] * len(pattern), None, *gradients, None, None, None
 
 
+def _refuse(ctx: Any, *grads: Tensor) -> Any:
+    raise DerivativeError(DIFFERENTIABLE_ONCE)
+
+
 heat.register_autograd(_backward, setup_context=_save)
+_heat_backward.register_autograd(_refuse)
 
 
 def _add_scaled(
@@ -255,28 +262,32 @@ def poles(times: np.ndarray) -> Iterator[tuple[float, np.ndarray]]:
         yield 10.0**exponent, np.flatnonzero((level == exponent) & (times > 0))
 
 
-def rational_coefficients(ratios: np.ndarray, tolerance: float) -> tuple[np.ndarray, np.ndarray]:
-    """Coefficients c_k of T_k(2Z − 1) for several t/γ, and their derivatives, (K, C); exact for constants, z = 1.
+def rational_coefficients(
+    ratios: np.ndarray, tolerance: float, order: int = 0
+) -> tuple[np.ndarray, np.ndarray]:
+    """Coefficients of T_k(2Z − 1) for several t/γ, (K, C): of e^{tL}'s derivative of an order in t/γ, and of the next.
+
+    Exact for constants, z = 1.
 
     >>> c, slope = rational_coefficients(np.array([10.0]), 1e-7)
     >>> bool(abs(np.polynomial.chebyshev.chebval(2 / (1 + 0.3) - 1, c[:, 0]) - np.exp(-10 * 0.3)) < 1e-7)
     True
     """
-    parts = zip(*(_coefficients(ratio, tolerance) for ratio in ratios.tolist()), strict=True)
+    parts = zip(*(_coefficients(ratio, tolerance, order) for ratio in ratios.tolist()), strict=True)
     c, slope = (np.stack(part, 1) for part in parts)
     count = int(c.any(1).sum())
     return c[:count], slope[:count]
 
 
 @lru_cache(maxsize=4096)
-def _coefficients(ratio: float, tolerance: float) -> tuple[np.ndarray, np.ndarray]:
+def _coefficients(ratio: float, tolerance: float, order: int = 0) -> tuple[np.ndarray, np.ndarray]:
     """Coefficients for one ratio, with a negligible tail set to zero."""
     decay = 2 / (1 + np.cos(np.pi * (np.arange(POINTS) + 0.5) / POINTS)) - 1
-    flow = np.exp(-ratio * decay)
+    flow = (-decay) ** order * np.exp(-ratio * decay)
     c, slope = np.asarray(dct(np.stack([flow, -decay * flow]))) / POINTS
     c[0], slope[0] = c[0] / 2, slope[0] / 2
     count = int((np.cumsum(np.abs(c[::-1]))[::-1] > tolerance / 2).sum())
     c[count:] = slope[count:] = 0
-    c[0] += 1 - c.sum()
+    c[0] += (order == 0) - c.sum()
     slope[0] -= slope.sum()
     return c, slope

@@ -12,6 +12,13 @@ from torch.utils.checkpoint import checkpoint
 
 from torchlb.errors import DerivativeError
 
+DIFFERENTIABLE_ONCE = (
+    "second derivatives in points or medium, or of the deflated heat flow: they are differentiable once, by "
+    "backward(); torch.autograd.functional.jvp goes back twice, too. In f they are linear: the derivative in a "
+    "direction is what they make of that direction; in other data take vjp, or a difference quotient"
+)
+"""Message of the error for second derivatives."""
+
 
 def once_differentiable(backward: Callable[..., Any]) -> Callable[..., Any]:
     """Like torch's decorator of that name, but second derivatives raise an error however they are requested.
@@ -41,11 +48,7 @@ class _Last(torch.autograd.Function):
 
     @staticmethod
     def backward(ctx: Any, *grads: Any) -> Any:
-        raise DerivativeError(
-            "second derivatives of heat flow, or in points or medium: they are differentiable once, by "
-            "backward(); torch.autograd.functional.jvp goes back twice, too. In f they are linear: the derivative in a "
-            "direction is what they make of that direction; in other data take vjp, or a difference quotient"
-        )
+        raise DerivativeError(DIFFERENTIABLE_ONCE)
 
 
 _last: Any = _Last.apply

@@ -117,14 +117,13 @@ class Plan:
         forms = in_space(forms, placed.frames) if tangent else forms
         return self.pair.bilinear(fits, forms, medium)
 
-    def rows_at(self, points: Points) -> list[Tensor]:
+    def rows_at(self, points: Points, mass: Float[Tensor, " N"]) -> list[Tensor]:
         """Values of Δ and of the derivatives in the frames, (1 + d, nnz), frames and normals, if there are any.
 
-        Differentiable in the points, but for a turn of each frame in its plane; of conditions with a share a of the
-        boundary the areas are not those at the points.
+        Differentiable in points and mass, but for a turn of each frame in its plane.
         """
         placed, _ = self.shape.at(self._sorted(points))
-        rows, _ = self._rows(placed, torch.ones_like(points[:, 0]))
+        rows, _ = self._rows(placed, self.numbering.sorted(mass))
         rows = rows.restored(self.numbering)
         found = [placed.frames, *([] if placed.normals is None else [placed.normals])]
         values = torch.cat([rows.laplacian[None], rows.gradient.T])

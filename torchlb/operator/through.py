@@ -215,19 +215,20 @@ def carrying(lb: Any, points: Any) -> Any:
 
     def of_rows(*grads: Tensor) -> list[Tensor]:
         with torch.enable_grad():
-            x = own.detach().cpu().double().requires_grad_()
-            found = plan.rows_at(x)
+            leaves = [v.detach().cpu().double().requires_grad_() for v in variables]
+            found = plan.rows_at(leaves[0], (leaves[1:] or [mass])[0])
             scaled = [g.to(f) for g, f in zip(grads, found, strict=True)]
-            (gradient,) = torch.autograd.grad(found, x, scaled)
-        return [_finite(gradient).to(own)]
+            gradients = torch.autograd.grad(found, leaves, scaled, materialize_grads=True)
+        return [_finite(g).to(v) for g, v in zip(gradients, variables, strict=True)]
 
     (lb.mass,) = known(lb, [lb.mass], of_mass)
+    mass = lb.mass.detach().cpu().double()
+    variables = (
+        [own, lb.mass] if lb.weak.near.values[3:4].any() else [own]
+    )  # Robin's low-order rows
     rows = [lb.stencil.values, lb.frames, *([lb.normals] if len(lb.normals) else [])]
-    lb.stencil.values, lb.frames, *normals = _following(rows, of_rows, own)
+    lb.stencil.values, lb.frames, *normals = _following(rows, of_rows, *variables)
     lb.normals = normals[0] if normals else lb.normals
-    if lb.weak.near.values[3:4].any():
-        what = "rows of Δ and ∇ with a Robin condition"
-        lb.stencil.values = refused(lb.stencil.values, what, points)
     return lb
 
 

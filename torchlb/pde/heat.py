@@ -47,7 +47,7 @@ def heat_flow(
     k: int = 128,
     tolerance: float = ROOT_EPS,
 ) -> Tensor:
-    """e^{tΔ}f: f after diffusion over the surface for a time t; differentiable in f and t.
+    """e^{tΔ}f: f after diffusion over the surface for a time t; differentiable in f and t, any number of times but for "deflated", once.
 
     Computed in the wider of the types of f and the operator, at least float32; only a half-precision f gets its own
     type back.
@@ -184,17 +184,20 @@ def _linear_flow(lb: PairMethods) -> tuple[list[Tensor], Tensor, Tensor]:
 def pair_flow(
     lb: PairMethods, x: Float[Tensor, "N C"], time: Float[Tensor, " C"], tolerance: float
 ) -> Float[Tensor, "N C"]:
-    """The flow of each column for its own time, differentiable once in x, the times, points and medium.
+    """The flow of each column for its own time, differentiable in x and times, and once in points and medium.
 
     Zero at Dirichlet points. The error is at most `tolerance` in the norm of M, relative to x.
     """
     found = origins(lb)
     variables = () if found is None else found.variables
-    return _flow(x.double(), time.double(), lb, found, tolerance, *variables)
+    return _flow(x.double(), time.double(), lb, found, tolerance, 0, False, *variables)[0]
 
 
 class _Flow(torch.autograd.Function):
-    """Σ_k c_k(t) T_k(2Z − 1)x; its adjoint is the same series of Zᵀ = M(M + γK)⁻¹."""
+    """Derivatives of Σ_k c_k(t) T_k(2Z − 1)x in t, of an order and of the next.
+
+    The adjoint is the same series of Zᵀ = M(M + γK)⁻¹, so that their own derivatives are such flows again.
+    """
 
     @staticmethod
     def forward(  # pyright: ignore[reportIncompatibleMethodOverride]
@@ -204,39 +207,68 @@ class _Flow(torch.autograd.Function):
         lb: Any,
         found: Origins | None,
         tolerance: float,
+        order: int,
+        transposed: bool,
         *variables: Tensor,
-    ) -> Tensor:
+    ) -> tuple[Tensor, Tensor]:
         ctx.save_for_backward(x, time, *variables)
-        ctx.rest = lb, found, tolerance
-        return _summed(lb, x, time, tolerance, False)[0]  # pyright: ignore[reportCallIssue]
+        ctx.set_materialize_grads(False)
+        ctx.rest = lb, found, tolerance, order, transposed
+        return _summed(lb, x, time, tolerance, order, transposed)  # pyright: ignore[reportCallIssue]
 
     @staticmethod
-    @once_differentiable
-    def backward(ctx: Any, g: Tensor) -> tuple[Any, ...]:  # pyright: ignore[reportIncompatibleMethodOverride]
-        x, time, *_ = ctx.saved_tensors
-        lb, found, tolerance = ctx.rest
-        grad_x, slope = _summed(lb, g, time, tolerance, True)  # pyright: ignore[reportCallIssue]
-        gradients = [] if found is None else found.gradient(_forms(lb, x, g, time, tolerance))
-        return grad_x, (slope * x).sum(0), None, None, None, *gradients
+    def backward(ctx: Any, *grads: Tensor | None) -> tuple[Any, ...]:  # pyright: ignore[reportIncompatibleMethodOverride]
+        if all(g is None for g in grads):
+            return (None,) * len(ctx.needs_input_grad)
+        return _in_data(ctx, *grads) if ctx.rest[1] is None else _in_all(ctx, grads[0])
 
 
 _flow: Any = uncompiled(_Flow.apply)
 
 
+def _in_data(ctx: Any, *grads: Tensor | None) -> tuple[Any, ...]:
+    """The gradients in x and in the times."""
+    x, time, *_ = ctx.saved_tensors
+    lb, _, tolerance, order, transposed = ctx.rest
+    flows = [
+        _flow(g, time, lb, None, tolerance, number, not transposed)
+        for number, g in enumerate(grads, order)
+        if g is not None
+    ]
+    grad_x, slope = (sum(parts[1:], parts[0]) for parts in zip(*flows, strict=True))
+    return grad_x, (slope * x).sum(0), *(None,) * 5
+
+
+@once_differentiable
+def _in_all(ctx: Any, g: Tensor) -> tuple[Any, ...]:
+    """The gradients in x, times, points and medium, of which there are no second ones."""
+    x, time, *_ = ctx.saved_tensors
+    lb, found, tolerance, *_ = ctx.rest
+    return *_in_data(ctx, g), *found.gradient(_forms(lb, x, g, time, tolerance))
+
+
 def _summed(
-    lb: PairMethods, x: Tensor, time: Tensor, tolerance: float, transposed: bool
+    lb: PairMethods, x: Tensor, time: Tensor, tolerance: float, order: int, transposed: bool
 ) -> tuple[Tensor, Tensor]:
-    """Σ c_k v_k and Σ c_k' v_k; at t = 0, for the transposed flow, x and −KM⁻¹x."""
+    """Derivatives of the flow, or of the transposed flow, of an order in t and of the next; at t = 0, (−M⁻¹K)^j x."""
     result, slope = torch.zeros_like(x), torch.zeros_like(x)
     times = time.detach().cpu().numpy()
     at_zero = torch.from_numpy(times == 0).to(x.device)
     solver = pair_system(lb)
     x = solver.inside(x)
+
+    def inverse_mass(v: Tensor) -> Tensor:
+        return solver.solve(v, torch.zeros_like(v[0]), tolerance)
+
     if bool(at_zero.any()):
-        result[:, at_zero] = start = x[:, at_zero]
-        if transposed:
-            still = solver.solve(start, torch.zeros_like(start[0]), tolerance)
-            slope[:, at_zero] = -solver.stiffness_product(still)
+        start = x[:, at_zero]
+        for j in range(order + 2):
+            if j >= order:
+                (result, slope)[j - order][:, at_zero] = start
+            if transposed:
+                start = -solver.stiffness_product(inverse_mass(start))
+            else:
+                start = -inverse_mass(solver.stiffness_product(start))
     for pole, chosen in poles(times):
         columns = torch.from_numpy(chosen).to(x.device)
         at_pole = x.new_full((len(chosen),), pole)
@@ -246,10 +278,11 @@ def _summed(
                 return 2 * solver.mass_product(solver.solve(v, at_pole, tolerance / 10)) - v
             return 2 * solver.solve(solver.mass_product(v), at_pole, tolerance / 10) - v
 
-        c, derivative = rational_coefficients(times[chosen] / pole, tolerance)
+        scale = pole ** -float(order)
+        c, derivative = rational_coefficients(times[chosen] / pole, tolerance, order)
         for k, v in enumerate(chebyshev_vectors(doubled, x[:, columns], len(c))):
-            result[:, columns] += torch.from_numpy(c[k]).to(x) * v
-            slope[:, columns] += torch.from_numpy(derivative[k]).to(x) / pole * v
+            result[:, columns] += scale * torch.from_numpy(c[k]).to(x) * v
+            slope[:, columns] += scale / pole * torch.from_numpy(derivative[k]).to(x) * v
     return solver.inside(result), solver.inside(slope)  # Zᵀ is nonzero at Dirichlet points
 
 
