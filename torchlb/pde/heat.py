@@ -47,7 +47,7 @@ def heat_flow(
     k: int = 128,
     tolerance: float = ROOT_EPS,
 ) -> Tensor:
-    """e^{tΔ}f: f after diffusion over the surface for a time t; differentiable in f and t, any number of times but for "deflated", once.
+    """e^{tΔ}f: f after diffusion over the surface for a time t; differentiable in f and t ("deflated" once).
 
     Computed in the wider of the types of f and the operator, at least float32; only a half-precision f gets its own
     type back.
