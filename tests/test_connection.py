@@ -5,6 +5,7 @@ import warnings
 import numpy as np
 import pytest
 import torch
+import trimesh
 
 from torchlb import (
     DerivativeError,
@@ -13,6 +14,7 @@ from torchlb import (
     Robin,
     heat_flow,
     implicit_step,
+    parallel_transport,
     vector_heat_flow,
 )
 from torchlb.surfaces import CliffordTorus, Ellipsoid, Hemisphere, Sphere, Torus, UnitDisk
@@ -151,10 +153,25 @@ def test_float32_operators_have_float32_fields(sphere):
     ).abs().max() < 2e-3
 
 
+def strip(count, fold):
+    """A strip of length 2 and width 1, folded in the middle by an angle in degrees, and the field along it."""
+    x, y = torch.linspace(-1, 1, 2 * count + 1).double(), torch.linspace(0, 1, count + 1).double()
+    x, y = (z.flatten() for z in torch.meshgrid(x, y, indexing="ij"))
+    angle = torch.tensor(fold).double().deg2rad()
+    up = x.clamp_min(0) * angle.sin()
+    points = torch.stack([torch.where(x > 0, x * angle.cos(), x), y, up], 1)
+    first = (torch.arange(2 * count)[:, None] * (count + 1) + torch.arange(count)).flatten()
+    faces = torch.stack([first, first + count + 1, first + 1], 1)
+    others = torch.stack([first + 1, first + count + 1, first + count + 2], 1)
+    beyond = torch.stack([angle.cos(), 0 * angle, angle.sin()])
+    return points, torch.cat([faces, others]), x, beyond
+
+
 SHAPES = {
     "closed": lambda: LaplaceBeltrami.from_mesh(*Ellipsoid().mesh(60)),
     "held": lambda: LaplaceBeltrami.from_mesh(*Hemisphere().mesh(70), condition="dirichlet"),
     "cloud": lambda: LaplaceBeltrami.from_points(Sphere().mesh(80)[0]),
+    "folded": lambda: LaplaceBeltrami.from_mesh(*strip(4, 80.0)[:2]),
 }
 
 
@@ -211,3 +228,29 @@ def test_bad_input_is_refused(bumpy):
         _ = LaplaceBeltrami.from_mesh(*Sphere().mesh(60), weak_form=False).connection
     with pytest.raises(InputError, match="with_medium"):
         implicit_step(fields, fields.mass, 0.1, conductivity=fields.mass)
+
+
+@pytest.mark.parametrize("fold", [45.0, 60.0, 90.0, 120.0, 160.0])
+def test_a_fold_is_no_wall(fold):
+    """A folded strip is isometric to a flat one: heat takes a vector along it across the fold, to five degrees."""
+    points, faces, x, beyond = strip(16, fold)
+    lb = LaplaceBeltrami.from_mesh(points, faces)
+    source = int((points - torch.tensor([-0.5, 0.5, 0.0])).norm(dim=1).argmin())
+    v = torch.tensor([1.0, 0.0, 0.0], dtype=torch.float64)
+    found = parallel_transport(lb, source, v, method="heat")[x > 0.2]
+    cosine = found @ beyond / found.norm(dim=1)
+    assert cosine.min() > torch.tensor(5.0).deg2rad().cos()
+
+
+@pytest.mark.parametrize("cotangent", [False, True])
+def test_fields_of_a_cube_come_in_pairs(cotangent):
+    """As a quarter turn commutes with both Laplacians; Hodge's are those of functions."""
+    cube = trimesh.creation.box().subdivide().subdivide().subdivide()
+    vertices, faces = torch.tensor(cube.vertices), torch.tensor(cube.faces)
+    build = LaplaceBeltrami.from_cotangent if cotangent else LaplaceBeltrami.from_mesh
+    lb = build(vertices, faces)
+    for fields in (lb.connection, lb.connection.hodge):
+        pairs = fields.eigenbasis(6).eigenvalues[:6].view(3, 2)
+        assert (pairs.diff(dim=1).abs() < 0.15 * pairs[:, 1:]).all()
+    functions = lb.eigenbasis(4).eigenvalues[1:4]
+    assert (pairs.mean(1) / functions - 1).abs().max() < 0.15

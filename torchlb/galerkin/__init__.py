@@ -7,5 +7,6 @@ fits; `delaunay`: the intrinsic Delaunay tufted cover that replaces them. `prolo
 nodes. `boundary`: nodes on curves along the boundary of a surface, or on the boundary surface of a solid. `flips`:
 edge flips that remove folded triangles and slivers. `medium`: conductivity, density and potential. `forms`: PᵀK_FE P
 and PᵀM_FE P, in any medium, and bilinear forms; `matrices`: K, M and what is added to them. `tangent`: matrices of
-tangent fields, and between these and functions. `pair`: an operator's matrices and positive lumped mass.
+tangent fields, and between these and functions; `creases`: these fields where triangles fold. `pair`: an operator's
+matrices and positive lumped mass.
 """

@@ -201,7 +201,8 @@ class Elements:
     A field of a medium has values at their Gauss points, (T, Q, …), of flat elements all equal; one left out is 1. Of
     each element the fraction `share` is integrated, a number or (T,). `mix`, (T, F), has the share of each face of the
     mesh in an element, None where elements are beside the faces. With factors `lumped` for the points, the mass is in
-    equal shares at the corners, times these.
+    equal shares at the corners, times these. Of tangent fields `turns` take the vector at each corner into the plane of
+    the cell, see `torchlb.galerkin.creases`; None where fields are prolonged as vectors of space.
     """
 
     nodes: Int[Tensor, "T n"]
@@ -210,6 +211,7 @@ class Elements:
     share: Any = 1.0
     mix: Any = None
     lumped: Float[Tensor, " N"] | None = None
+    turns: Float[Tensor, "T corners d n"] | None = None
 
     @classmethod
     def flat(

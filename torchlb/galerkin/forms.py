@@ -224,8 +224,11 @@ class Forms:
             if lot.lumped is not None and not stiffness:
                 corners = lot.lumped[lot.nodes] * blocks[:, :: lot.nodes.shape[1] + 1]
                 blocks = corners.mean(1, keepdim=True).expand_as(blocks)
+            if form.along is not None and lot.turns is not None:
+                one, two = (lot.turns[..., k] for k in form.along)
+                blocks = blocks * (one @ two.mT).flatten(1)
             own = computed_again(density, lot.metric, lot.element, blocks, a)
-            if form.along is not None:
+            if form.along is not None and lot.turns is None:
                 own = medium["projectors"][number][(..., *form.along)] * own
             total.append(lot.shared(own).sum())
         return torch.stack(total).sum()

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from typing import Any
@@ -131,16 +131,27 @@ class PairPlan:
         return plan, pair, mass
 
     def bilinear(
-        self, fits: LocalFits, forms: Sequence[BilinearForm], medium: Medium
+        self,
+        fits: LocalFits,
+        forms: Sequence[BilinearForm],
+        medium: Medium,
+        for_fields: Callable[[Forms], Forms] = lambda elements: elements,
     ) -> Float[Tensor, ""]:
         """Σ of bilinear forms, differentiable in the points of the fits and in the medium: no matrix is made.
 
         "lumped" is "mass" with the rows of P that the mass of the vertices is found by: with w = 1 it is Σ_i m_i u_i.
+        `for_fields` gives the elements of forms `along` components of tangent fields.
         """
         mesh = self.curving.at(fits.points, self.fits, fits)
         elements = self.forms(fits, mesh, prolong=False)
         prolong = partial(prolonged, self.fits, fits, self.curving, mesh)
-        values = elements.factors(forms, medium, prolong)
+        kinds = {False: elements}
+        if any(form.along for form in forms):
+            kinds[True] = for_fields(elements)
+        values = {
+            kind: own.factors([f for f in forms if bool(f.along) == kind], medium, prolong)
+            for kind, own in kinds.items()
+        }
         flat = self.curving.bent.index_fill(0, self.lowered, False)
         total = []
         for lumped, curving in ((False, self.curving), (True, replace(self.curving, bent=flat))):
@@ -156,7 +167,8 @@ class PairPlan:
                     if form.name == "boundary":
                         total.append(self._on_boundary(form, both, fits.points, mesh))
                     else:
-                        total.append(elements.form(form, both, values))
+                        kind = bool(form.along)
+                        total.append(kinds[kind].form(form, both, values[kind]))
         return torch.stack(total).sum()
 
     def _on_boundary(

@@ -6,7 +6,8 @@ component by component. With the projector Π onto the tangent plane its covaria
     ∫κ|Π∇ũ|² = Σ_kl ∫κΠ_kl ∇ũ_k·∇ũ_l
 
 is made of stiffness matrices of functions, with the conductivities κΠ_kl. It is symmetric and positive whatever the
-fits are, in any codimension. All else (mass, boundary, potential) is that of functions, for every component in space.
+fits are, in any codimension. At creases vectors are turned instead (`creases`). All else (mass, boundary, potential) is
+that of functions, for every component in space.
 """
 
 from __future__ import annotations
@@ -99,7 +100,12 @@ def tangent_matrices(
             for lot, a, e in zip(lots, kappa or [None] * len(lots), tangents, strict=True)
         ]
         upper, values = _assembled(forms, p, elements, parts)
-        found.append(_framed(upper, values, forms.given, frames, other))
+        matrix = _framed(upper, values, forms.given, frames, other)
+        turned = [x for x in elements if x.lot.turns is not None]
+        for x in turned:
+            own = values_on(matrix.crow.numpy(), matrix.col.numpy(), x.turned(frames, hodge=hodge))
+            matrix.values[0] += torch.from_numpy(own)
+        found.append(matrix)
     return found
 
 
@@ -128,13 +134,37 @@ class _Elements:
         return slopes, (cross - cross.mT).flatten(1)[:, None]
 
     def blocks(self, part: _Part) -> Float[Tensor, "T n_times_n"]:
-        """Element matrices of a part."""
+        """Element matrices of a part; zero for elements with turned vectors, see `turned`."""
+        if self.lot.turns is not None:
+            return self.lot.metric.new_zeros(len(self.lot.nodes), self.lot.nodes.shape[1] ** 2)
         one, two = self.tangents[..., part.k, :], self.tangents[..., part.m, :]
         direction, (slopes, products) = dot(one, two), self.covariant
         if part.turning:
             direction = one[..., 0] * two[..., 1] - one[..., 1] * two[..., 0]
             slopes, products = self.turning
         return (direction[..., None] * slopes).flatten(1) @ products.flatten(0, 1)
+
+    def turned(self, frames: Frames, *, hodge: bool) -> sparse.csr_array:
+        """The stiffness (N d, N d) of elements at whose corners vectors are turned into their plane."""
+        nodes, turns = self.lot.nodes, self.lot.turns
+        assert turns is not None
+        q = turns @ at(frames, nodes)
+        slopes, products = self.covariant
+        inner = torch.einsum("tika,tjkb->tijab", q, q)
+        size = nodes.shape[1]
+        total = (slopes.flatten(1) @ products.flatten(0, 1)).view(-1, size, size, 1, 1) * inner
+        if hodge:
+            slopes, products = self.turning
+            cross = torch.stack([q[..., 1, :], -q[..., 0, :]], -2)  # the quarter turn of ω
+            inner = torch.einsum("tika,tjkb->tijab", q, cross)
+            total += (slopes.flatten(1) @ products.flatten(0, 1)).view(-1, size, size, 1, 1) * inner
+        rows = frames.shape[2] * nodes[..., None] + torch.arange(frames.shape[2])
+        row, col = (
+            x.expand(total.shape) for x in (rows[:, :, None, :, None], rows[:, None, :, None, :])
+        )
+        entries = total.flatten().numpy(), (row.flatten().numpy(), col.flatten().numpy())
+        whole = sparse.csr_array(entries, shape=(frames.shape[2] * len(frames),) * 2)
+        return (whole + whole.T) / 2  # symmetric but for rounding
 
 
 def _assembled(

@@ -27,6 +27,11 @@ def mesh_frames(vertices: Points, faces: Int[Tensor, "F v"]) -> Frames:
     The frame spans the leading eigenvectors of the area-weighted mean of the projectors onto the faces' planes,
     whatever their orientation and the codimension. The error is O(h) on a smooth surface.
     """
+    return _Leading.apply(summed_projectors(vertices, faces), faces.shape[1] - 1)  # pyright: ignore[reportReturnType]
+
+
+def summed_projectors(vertices: Points, faces: Int[Tensor, "F v"]) -> Float[Tensor, "N n n"]:
+    """Sums at each vertex of the projectors onto the planes of its faces, weighted by d! times their areas."""
     dim = faces.shape[1] - 1
     edges = _edges(vertices, faces)
     if vertices.requires_grad:  # simplices without volume have no weight, and no derivative
@@ -36,8 +41,7 @@ def mesh_frames(vertices: Points, faces: Int[Tensor, "F v"]) -> Frames:
     area = torch.diagonal(triangle, dim1=-2, dim2=-1).prod(-1).abs()
     projector = (area[:, None, None] * (basis @ basis.mT)).repeat_interleave(dim + 1, dim=0)
     total = vertices.new_zeros(len(vertices), *projector.shape[1:])
-    total.index_add_(0, faces.reshape(-1), projector)
-    return _Leading.apply(total, dim)  # pyright: ignore[reportReturnType]
+    return total.index_add_(0, faces.reshape(-1), projector)
 
 
 class _Leading(torch.autograd.Function):

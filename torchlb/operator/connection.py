@@ -10,6 +10,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from torchlb.errors import DerivativeError, InputError
+from torchlb.galerkin.creases import across_creases, creased_cells
 from torchlb.galerkin.matrices import PairMatrices
 from torchlb.galerkin.tangent import in_space, tangent_matrices
 from torchlb.geometry.vectors import Points
@@ -26,7 +27,8 @@ class Connection(PairMethods):
 
     A field v has the components c = Eᵀv in ``lb.frames``, row d·i + c of a matrix. The stiffness is ∫κ∇u:∇v of
     covariant derivatives, without the term of the curvature that Hodge's Laplacian has beside it; conditions, media and
-    derivatives in points and medium are as for functions. All that takes an operator's weak pair takes this one:
+    derivatives in points and medium are as for functions. At creases the triangles are linear elements with vectors
+    that are turned into their planes. All that takes an operator's weak pair takes this one:
     `implicit_step`, `heat_flow`, and `eigenbasis`, whose relative errors are those of λ + area^{−2/d}, since fields may
     be parallel (λ = 0) in no, one or more ways.
     """
@@ -46,7 +48,10 @@ class Connection(PairMethods):
                 return lb.plan.bilinear(*given, tangent=True)
             forms, medium = given
             forms = in_space(forms, lb.frames.detach().cpu().double())
-            return elements_of(lb).bilinear(forms, medium)
+            slopes = [form for form in forms if form.along]
+            others = [form for form in forms if not form.along]
+            total = _field_elements(lb).bilinear(slopes, medium)
+            return total + elements_of(lb).bilinear(others, medium)
 
         return bilinear
 
@@ -55,8 +60,10 @@ class Connection(PairMethods):
         """The same with Hodge's Laplacian of a surface, ∫κ(div u)² + κ(curl u)², made where it is asked for first.
 
         On fields it is Bochner's plus the Gaussian curvature. Those in its kernel are harmonic: 2g of them on a closed
-        surface of genus g. Without derivatives in points and medium. Raises InputError in other dimensions, for a
-        conductivity that is a tensor, and for a batch, whose shapes have their own.
+        surface of genus g; with a boundary all fields without divergence and curl, infinitely many. Where the surface
+        bends within one or two triangles eigenvalues converge slowly, from above. Without derivatives in points and
+        medium. Raises InputError in other dimensions, for a conductivity that is a tensor, and for a batch, whose
+        shapes have their own.
         """
         if self.cache.connection is None:
             tensors = self._medium.fields(len(self.points)).get("conductivity")
@@ -117,9 +124,20 @@ def connection_of(lb: Any) -> Connection:
     return lb.cache.connection
 
 
+def _field_elements(lb: Any) -> Any:
+    """The elements for derivatives of fields, in the user's numbering."""
+    cells, frames = lb.faces.cpu(), lb.frames.detach().cpu().double()
+    if lb.source == "cotangent":
+        creased = creased_cells(lb.points.detach().cpu().double(), cells)
+    else:
+        creased = torch.zeros(len(cells), dtype=torch.bool)
+        creased[lb.plan.order] = lb.plan.creased()
+    return across_creases(elements_of(lb), cells, creased, frames)
+
+
 def _of_shape(lb: Any, *, hodge: bool = False) -> Connection:
     frames, medium = lb.frames.detach().cpu().double(), lb._known_medium.fields(len(lb.points))
-    elements, medium = elements_of(lb), plain(medium)
+    elements, medium = _field_elements(lb), plain(medium)
     with torch.no_grad():
         kappa = medium.get("conductivity")
         kappa = None if kappa is None else elements.values(kappa)

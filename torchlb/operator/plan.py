@@ -14,11 +14,12 @@ from io import BytesIO
 from typing import Any
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from torchlb.errors import DerivativeError, InputError, first_few, renumbered, warn
 from torchlb.galerkin.boundary import BoundaryCurves, OnCurves, OnSurface
+from torchlb.galerkin.creases import across_creases, creased_cells
 from torchlb.galerkin.curving import BoundaryNodesPlan, CurvingPlan
 from torchlb.galerkin.elements import subsets
 from torchlb.galerkin.forms import BilinearForm, Forms, edge_lengths
@@ -114,8 +115,18 @@ class Plan:
             for name, f in medium.items()
         }
         placed, fits = self.shape.at(self._sorted(points))
-        forms = in_space(forms, placed.frames) if tangent else forms
-        return self.pair.bilinear(fits, forms, medium)
+        if not tangent:
+            return self.pair.bilinear(fits, forms, medium)
+        own = self.pair.curving.nodes.faces, self.creased(), placed.frames
+        forms = in_space(forms, placed.frames)
+        return self.pair.bilinear(
+            fits, forms, medium, lambda elements: across_creases(elements, *own)
+        )
+
+    def creased(self) -> Bool[Tensor, " G"]:
+        """Cells at a crease of the shape that the plan was made of, for the derivatives of tangent fields."""
+        points = self.numbering.sorted(self.points)
+        return creased_cells(points, self.pair.curving.nodes.faces, self.pair.fits.functions)
 
     def rows_at(self, points: Points, mass: Float[Tensor, " N"]) -> list[Tensor]:
         """Values of Δ and of the derivatives in the frames, (1 + d, nnz), frames and normals, if there are any.

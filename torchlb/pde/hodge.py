@@ -5,14 +5,17 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
+import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
 
-from torchlb.errors import InputError
+from torchlb.errors import InputError, first_few, warn
 from torchlb.galerkin.tangent import WeakGradient
+from torchlb.geometry.complex import edges_of
 from torchlb.linalg.checks import check_operator, check_tensor
 from torchlb.linalg.csr import Csr
+from torchlb.operator.cleaning import turned_faces
 from torchlb.operator.laplace_beltrami import LaplaceBeltrami
 from torchlb.operator.medium import elements_of
 from torchlb.operator.stencil_methods import check_surface
@@ -48,7 +51,9 @@ def hodge_decomposition(
     ∇u is closest to v, and so is ν × ∇w, in the mean square of the prolonged fields: two Poisson solves. At the
     vertices they are the fields whose prolongation is closest to theirs, so that in ``lb.connection.mass_matrix`` the
     parts are orthogonal up to the square of its error. With a boundary, whatever the condition of the operator is, u is
-    free and w zero along it; h is then tangent to it. On spheres and disks h is the error of the other two.
+    free and w zero along it; h is then tangent to it. On spheres and disks h is the error of the other two. A surface
+    needs two sides, and at most two triangles at an edge: a warning names the points where it is otherwise, as the
+    rotated part is wrong there, and on a one-sided surface everywhere.
 
     Differentiable in v. Raises InputError for another shape, for operators in a medium, of batches, and for those that
     are not of surfaces in R³.
@@ -66,6 +71,7 @@ def hodge_decomposition(
         raise InputError(
             "hodge_decomposition: expected one shape without a medium; lb.unbatch() has those of a batch"
         )
+    _warn_of_seams(lb.faces.cpu(), lb.num_points)
     columns = v[..., None] if v.ndim == 2 else v
     fields, boundary, found = _constant(lb.connection), lb._boundary_points(), []
     c = fields.components(columns.double())
@@ -85,6 +91,19 @@ def hodge_decomposition(
     parts = [fields.vectors(x) for x in (gradient, rotated, c - gradient - rotated)]
     results = [without(lb, x, "Hodge parts").to(v) for x in (*parts, u, w)]
     return HodgeParts(*(x if v.ndim == 3 else x[..., 0] for x in results))
+
+
+def _warn_of_seams(faces: Int[Tensor, "F 3"], count: int) -> None:
+    """Warn of edges across which a surface has no sides, or at which more than two triangles meet."""
+    faces = torch.where(turned_faces(faces)[:, None], faces.flip(1), faces)
+    edges = edges_of(faces.numpy(), count)
+    seam = np.concatenate([edges.twins[0][edges.against], np.flatnonzero(edges.uses[edges.of] > 2)])
+    points = np.unique([end[seam] for end in edges.ends])
+    if len(points):
+        warn(
+            f"hodge_decomposition: at {len(points)} points ({first_few(points)}) the surface has no two sides, or more "
+            "than two triangles meet; the rotated part is wrong there, and on a one-sided surface everywhere"
+        )
 
 
 def _constant(lb: Any, held: Tensor | None = None) -> Any:
