@@ -310,3 +310,14 @@ def test_derivatives_where_a_dirichlet_condition_holds_and_f_does_not_vanish():
 def test_learned_times_start_above_zero(time):
     with pytest.raises(InputError, match="init_time"):
         Diffusion(3, init_time=time)
+
+
+@pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16])
+def test_deflated_flows_of_half_precision_are_refused(dtype):
+    """Rounded to half, K₁1 is not 0: a constant grew to 1e25 on a body; f may have half precision."""
+    lb = LaplaceBeltrami.from_mesh(*Sphere().mesh(60))
+    ones = torch.ones(60, dtype=dtype)
+    kept = heat_flow(lb, ones, 0.1, method="deflated", k=6)
+    torch.testing.assert_close(kept, ones, rtol=1e-2, atol=0)
+    with pytest.raises(InputError, match=r"pass lb\.float\(\)"):
+        heat_flow(lb.to(dtype), ones, 0.1, method="deflated", k=6)

@@ -222,6 +222,16 @@ PCD += "WIDTH 5\nHEIGHT 1\nVIEWPOINT 0 0 0 1 0 0 0\nPOINTS 5\nDATA "
             '"Z","Y","X"\n'
             + "".join(",".join(row.split()[::-1]) + "\n" for row in ROWS.splitlines()),
         ),
+        (
+            "d.csv",
+            ",x [mm],y [mm],z [mm]\n"
+            + "".join(f"{i},{row.replace(' ', ',')}\n" for i, row in enumerate(ROWS.splitlines())),
+        ),
+        (
+            "e.csv",
+            "id,name,x,y,z,\n"
+            + "".join(f"9,,{row.replace(' ', ',')},\n" for row in ROWS.splitlines()),
+        ),
     ],
 )
 def test_clouds(name, content, tmp_path):
@@ -235,6 +245,7 @@ def test_clouds(name, content, tmp_path):
         ("a.pcd", PCD + "binary_compressed\n123", "data are binary_compressed; write them as"),
         ("a.txt", "Read me first.\n", "no rows of two or more numbers"),
         ("b.txt", "0 0 0\n1 0 0\n1 1\n", "rows of 3 numbers and of others"),
+        ("b.csv", "id,x,y,z\n1,2,3\n", r"4 names of columns \(id, x, y, z\) and rows of 3 numbers"),
         ("a.csv", "1,2,3\n1,2,car\n", "line 2: '1,2,car' has no numbers"),
         ("a.obj", OBJ + "f 1 2 9\n", "a corner 8, and there are 4 vertices"),
         ("b.obj", OBJ + "f 0 1 2\n", "they count from 1"),

@@ -18,7 +18,7 @@ from typing import Any, get_args
 import click
 from click.core import ParameterSource
 
-from torchlb.errors import OperatorFileError, TorchlbWarning
+from torchlb.errors import InputError, OperatorFileError, TorchlbWarning
 from torchlb.fits.rules import WeightsName
 from torchlb.geometry.frames import Projection
 from torchlb.io.cache import load_with_header
@@ -209,7 +209,13 @@ def _to_file(compute: Callable[..., dict[str, Any]]) -> Callable[..., None]:
     @wraps(compute)
     def run(shape: Path, out: Path, **settings: Any) -> None:
         lb, faces = _built(shape, settings)
-        write_shape(out, lb.points, lb.faces, **compute(lb, **settings))
+        found = compute(lb, **settings)
+        taken = found.keys() & {"path", "points", "cells"}
+        if taken:
+            raise InputError(
+                f"{', '.join(taken)}: rename these data, a shape has parts of that name"
+            )
+        write_shape(out, lb.points, lb.faces, **found)
         click.echo(f"{out}: {_size(lb.points, faces)}")
 
     return run
@@ -232,8 +238,13 @@ def smooth(lb: LaplaceBeltrami, data: Path, fwhm: float, missing: float) -> dict
     """Write maps on SHAPE smoothed by a Gaussian; points without data count nothing and become NaN."""
     smoothed = {}
     for name, f in read_point_data(data).items():
-        known = (f.isfinite() & (f != missing)).view(len(f), -1).all(1)
-        smoothed[name] = heat.smooth(lb, f.double(), fwhm, mask=known)
+        columns = f.double().reshape(len(f), -1)
+        known = columns.isfinite() & (columns != missing)
+        masks, which = known.unique(dim=1, return_inverse=True)
+        for number, mask in enumerate(masks.unbind(1)):  # columns with the same gaps at once
+            here = which == number
+            columns[:, here] = heat.smooth(lb, columns[:, here], fwhm, mask=mask)
+        smoothed[name] = columns.view_as(f)
     return smoothed
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import sys
 import warnings
 from collections.abc import Iterator
@@ -97,11 +98,12 @@ def shown(value: object, longest: int = 80) -> str:
 def warn(
     message: str, category: type[Warning] = TorchlbWarning, *, once: set[Any] | None = None
 ) -> None:
-    """Issue a warning at the line outside torchlb from which the call came, not again for a line that is in `once`."""
+    """Issue a warning at the line outside torchlb from which the call came; with `once` one kind once for each line."""
     frame, level = sys._getframe(), 1
     while frame.f_back is not None and frame.f_code.co_filename.startswith(HERE):
         frame, level = frame.f_back, level + 1
-    place = frame.f_code.co_filename, frame.f_lineno
+    kind = re.sub(r"\(.*?\)|\d", "", message)  # whatever the points and numbers
+    place = frame.f_code.co_filename, frame.f_lineno, kind
     if once is not None:
         if place in once:
             return

@@ -97,9 +97,10 @@ class CurvingPlan:
         """Evaluate the curved cells at these points."""
         nodes, boundary = self.nodes, self.boundary.at(points)
         ends, flat = node_ends(nodes, len(points)), flat_places(points, nodes)
-        standing, _ = _moved(
-            points, plan, fits, nodes, ends, flat + boundary.displacement, boundary
-        )
+        start = flat + boundary.displacement
+        standing, _ = _moved(points, plan, fits, nodes, ends, start, boundary)
+        near = (standing - start).norm(dim=1) <= FACTOR * ROUGH * _sizes(points, nodes)
+        standing = torch.where(near[:, None], standing, start)
         places = torch.cat([points, torch.where(self.bent[:, None], standing, flat)])
         lengths, some = (
             sound_lengths(nodes.lengths(points), nodes.cells),
@@ -110,7 +111,8 @@ class CurvingPlan:
         for part in some.nonzero()[:, 0].split(AT_ONCE):
             g[part] = metric(places, nodes.elements[part], shape)
         cover = self.cover(lengths, self.flips)
-        return CurvedMesh(places, g, lengths, cover, boundary, ends)
+        astray = nodes.corners[self.bent & ~near].unique()
+        return CurvedMesh(places, g, lengths, cover, boundary, ends, astray)
 
     def cover(self, lengths: Float[Tensor, "F e"], flips: list[Tensor] | None) -> Cover | None:
         """Intrinsic Delaunay tufted cover of the coarse triangles, glued along the free boundary; None without any."""
@@ -126,7 +128,8 @@ class CurvedMesh:
     """Curved cells at given points: positions of the nodes, ℓ, metric at the Gauss points, ℓ², and edge lengths, ℓ.
 
     Lengths are mollified, and so are metrics of flat triangles. `cover` replaces coarse triangles, None without any;
-    `ends` are the vertices whose fits the nodes use.
+    `ends` are the vertices whose fits the nodes use. At the vertices `astray` fits that were decided elsewhere put
+    nodes far from the surface, which are on flat cells instead.
     """
 
     places: Float[Tensor, "NX n"]
@@ -135,6 +138,7 @@ class CurvedMesh:
     cover: Cover | None
     boundary: BoundaryNodes
     ends: Ends
+    astray: Int[Tensor, " A"]
 
 
 def curve(
@@ -173,7 +177,7 @@ def curve(
     cover = decided.cover(lengths, None)
     if cover is not None:
         decided.flips.extend(cover.flips)
-    return decided, CurvedMesh(places, g, lengths, cover, boundary, ends)
+    return decided, CurvedMesh(places, g, lengths, cover, boundary, ends, nodes.corners[:0, 0])
 
 
 def flat_places(points: Float[Tensor, "N n"], nodes: Nodes) -> Float[Tensor, "X n"]:

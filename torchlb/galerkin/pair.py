@@ -13,6 +13,7 @@ from jaxtyping import Bool, Float, Int
 from scipy import sparse
 from torch import Tensor
 
+from torchlb.errors import first_few, warn
 from torchlb.galerkin.assembly import (
     Elements,
     area_element,
@@ -119,13 +120,21 @@ class PairPlan:
         return Forms.curved(self.fits, fits, self.curving, *rest, prolong=prolong)
 
     def at(
-        self, fits: LocalFits, numbering: Numbering
+        self, fits: LocalFits, numbering: Numbering, warned: set[Any]
     ) -> tuple[PairPlan, PairMatrices, Float[Tensor, " N"]]:
         """Weak pair and lumped mass from the fits at given points, in the user's numbers and in those of the plan.
 
         The plan returned with them also has the rows of P that a positive lumped mass wants lowered at these points.
+        Warns once for a line of a program, in `warned`, of nodes that are flat since the points moved too far.
         """
         mesh = self.curving.at(fits.points, self.fits, fits)
+        if len(mesh.astray):
+            warn(
+                f"at: {len(mesh.astray)} points ({first_few(mesh.astray)}) moved too far from where degrees and "
+                "neighbours were decided: the surface fitted there leaves the triangles, which are flat there instead; "
+                "build the operator of these points anew",
+                once=warned,
+            )
         pair, mass, lowered = assembled_pair(self, fits, mesh, numbering, self.patterns)
         plan = self if len(lowered) == len(self.lowered) else replace(self, lowered=lowered)
         return plan, pair, mass

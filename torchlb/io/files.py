@@ -197,9 +197,10 @@ def write_shape(
     """Write a mesh or cloud, with data of its points, in the format that the ending of `path` names.
 
     .npz holds every shape; .vtk and .vtu, through pyvista, those of R² and R³; .gii, through nibabel, triangles, in
-    single precision, and .func.gii and .shape.gii the data alone; .ply, .obj, .off, .stl and .glb, through trimesh,
-    triangles and points of R³ without data. `points` are (N, n), `cells` (F, 3) triangles, (F, 2) segments, (F, 4)
-    tetrahedra or None, `point_data` (N,) or (N, C), by name: ``write_shape("a.vtu", points, faces, thickness=f)``.
+    single precision, and .func.gii and .shape.gii the data alone; .obj and .off triangles and points of R³ without
+    data, as .ply and .glb do through trimesh in single precision, and .stl triangles. `points` are (N, n), `cells`
+    (F, 3) triangles, (F, 2) segments, (F, 4) tetrahedra or None, `point_data` (N,) or (N, C), by name:
+    ``write_shape("a.vtu", points, faces, thickness=f)``.
 
     Raises ValueError for data of another length, a format that does not hold them, and where its library is missing.
     """
@@ -219,7 +220,9 @@ def write_shape(
         np.savez(path, **{"vertices": places, "faces": corners, **data})
     elif (suffix in (".vtk", ".vtu") and places.shape[1] < 4) or (suffix == ".gii" and flat):
         _write(path, places, corners, data)
-    elif suffix in (".ply", ".obj", ".off", ".stl", ".glb") and flat and not data:
+    elif suffix in (".obj", ".off") and flat and not data:
+        _write_text(path, places, corners)
+    elif suffix in (".ply", ".glb", *([".stl"] if len(corners) else [])) and flat and not data:
         import trimesh
 
         mesh = trimesh.Trimesh(places, corners, process=False)
@@ -230,8 +233,18 @@ def write_shape(
         )
         raise InputError(
             f"{path}: this format does not hold {what}; .npz holds all, .vtk and .vtu all in R² and R³, .gii triangles "
-            "and data in R³, .ply, .obj, .off, .stl and .glb triangles and points of R³ without data"
+            "and data in R³, .ply, .obj, .off and .glb triangles and points of R³ without data, .stl triangles"
         )
+
+
+def _write_text(path: Path, points: np.ndarray, cells: np.ndarray) -> None:
+    """An .obj or .off, in all digits."""
+    is_obj = path.suffix.lower() == ".obj"
+    with open(path, "w", encoding="ascii") as file:
+        if not is_obj:
+            file.write(f"OFF\n{len(points)} {len(cells)} 0\n")
+        np.savetxt(file, points, "v %.17g %.17g %.17g" if is_obj else "%.17g %.17g %.17g")
+        np.savetxt(file, cells + is_obj, "f %d %d %d" if is_obj else "3 %d %d %d")
 
 
 def _write(path: Path, points: np.ndarray, cells: np.ndarray, data: dict[str, np.ndarray]) -> None:

@@ -179,7 +179,7 @@ def read_table(path: Path) -> Polygons:
     """Points from the columns x, y and z of a table of numbers, or its first three (two, if it has no more).
 
     Columns are separated by commas, semicolons or blanks. Lines before the numbers, such as names of the columns or the
-    number of points, and comments by # or // are left out.
+    number of points, and comments by # or // are left out. Units may follow the names, and empty cells are NaN.
     """
     lines = numbers_of(path)
     names, first = next(lines, ([], []))
@@ -187,7 +187,12 @@ def read_table(path: Path) -> Polygons:
     if width < 2:
         raise InputError("no rows of two or more numbers")
     chosen = [names.index(axis) for axis in "xyz" if axis in names]
-    chosen = chosen if len(names) == width and len(chosen) > 1 else list(range(min(3, width)))
+    if len(chosen) < 2:
+        chosen = list(range(min(3, width)))
+    elif len(names) != width and chosen != list(range(len(chosen))):
+        raise InputError(
+            f"{len(names)} names of columns ({', '.join(names)}) and rows of {width} numbers"
+        )
     rows = [first, *(row for _, row in lines)]
     if any(len(row) != width for row in rows):
         raise InputError(f"rows of {width} numbers and of others")
@@ -197,13 +202,17 @@ def read_table(path: Path) -> Polygons:
 def numbers_of(path: Path) -> Iterator[tuple[list[str], list[float]]]:
     """Rows of a table, each with the lower-case words of the line before the first row."""
     names: list[str] = []
-    begun = False
+    begun = said = False
     with open(path, encoding="utf-8-sig", errors="replace") as file:
         for number, line in enumerate(file, 1):
             text, _, comment = line.replace("//", "#").partition("#")
-            text = comment if not (begun or text.strip()) else text
+            only = not (begun or text.strip())
+            text = comment if only else text
             text = text.replace(",", ".") if ";" in text else text  # decimal commas
-            words = text.replace(";", " ").replace(",", " ").split()
+            cells = re.split("[,;]", text) if re.search("[,;]", text) else text.split()
+            if not any(cell.strip() for cell in cells):
+                continue
+            words = [word for cell in cells for word in cell.split() or ["nan"]]
             try:
                 row = [float(word) for word in words]
             except ValueError:
@@ -214,9 +223,13 @@ def numbers_of(path: Path) -> Iterator[tuple[list[str], list[float]]]:
                 row = []
             if len(row) > 1 and not line.lstrip().startswith(("#", "//")):
                 begun = True
-                yield names, row
-            elif words and not begun:
-                names = [word.strip("\"'").lower() for word in words]
+                yield (
+                    (names if said or len(names) == len(row) else []),
+                    row,
+                )  # a comment may be prose
+            elif not begun:
+                said = not only
+                names = [(cell.strip(" \t\n\"'").split() or [""])[0].lower() for cell in cells]
 
 
 READERS: dict[str, Callable[[Path], Polygons]] = {

@@ -121,6 +121,7 @@ class LaplaceBeltrami(StencilMethods, PairMethods):
             (N, n), if known (d = n − 1): they orient the surface where neighbours agree; a warning says where not.
         boundary
             (N,) mask of the points on the boundary; by default, or for "detect", that of the complex through the cloud.
+            Dirichlet's and Robin's condition need one of the two.
         condition
             Boundary condition: "neumann", ∂_ν f = 0; "dirichlet", f = 0; or `torchlb.Robin(a)`, ∂_ν f + a f = 0. With
             Dirichlet's the values of f at boundary points enter only the rows of these points. None uses no boundary

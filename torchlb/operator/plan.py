@@ -173,7 +173,7 @@ def evaluate(plan: Plan, points: Points) -> Parts:
     here = plan._sorted(points)
     with renumbered(plan.numbering.given), threads_for(len(points)):
         placed, fits = plan.shape.at(here)
-        pair_plan, pair, mass = plan.pair.at(fits, plan.numbering)
+        pair_plan, pair, mass = plan.pair.at(fits, plan.numbering, plan.warned)
         rows, shape = plan._rows(placed, mass)
     plan = plan if pair_plan is plan.pair else replace(plan, pair=pair_plan)
     return operator_parts(plan, points, rows, shape, pair)

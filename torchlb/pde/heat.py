@@ -137,6 +137,11 @@ def flow(lb: PairMethods, x: Tensor, time: Tensor, method: str, k: int, toleranc
     if method == "spectral":
         return _spectral(lb.eigenbasis(k), x, time)
     if method == "deflated":
+        if lb.weak.values.dtype.itemsize < 4:
+            raise InputError(
+                'method: "deflated" needs an operator in float32 or float64, whose matrices keep constants; pass '
+                f"lb.float(), got {lb.weak.values.dtype}"
+            )
         return _deflated(lb, lb._invariant_basis(k), x, time, tolerance)
     return pair_flow(lb, x, time, tolerance).to(x.dtype)
 
