@@ -1,6 +1,7 @@
 """What every layer has to bear: batches of shapes, compilers, half precision, copies, workers, devices."""
 
 import copy
+import functools
 import json
 import shutil
 import subprocess
@@ -342,6 +343,7 @@ def compiled_and_not(name, batched):
     return results
 
 
+@functools.cache
 def operators_of_sizes(count):
     """Operators of as many sizes, with eigenpairs."""
     meshes = [Sphere().mesh(60 + 12 * i) for i in range(count)]
@@ -352,12 +354,12 @@ def operators_of_sizes(count):
 
 
 def graphs_of_sizes(name, batched):
-    """Number of graphs compiled for ten shapes, or batches of two, of ten sizes; all outputs are the layer's own."""
+    """Number of graphs for seven shapes, or batches of two, of seven sizes; all outputs are the layer's own."""
     torch._dynamo.reset()
     layer, backend = layer_of(name), torch._dynamo.testing.CompileCounterWithBackend("aot_eager")
     compiled, operators = (
         torch.compile(layer, backend=backend, fullgraph=True),
-        operators_of_sizes(10),
+        operators_of_sizes(7),
     )
     for i, alone in enumerate(operators):
         lb = LaplaceBeltrami.batch([alone, operators[i - 1]]) if batched else alone
@@ -393,9 +395,9 @@ def test_compiled_without_graph_breaks_it_gives_the_same(name, batched):
 
 @pytest.mark.slow
 def test_compiled_for_two_sizes_it_takes_all():
-    """At most four graphs for ten sizes: the first, that of any size, and two for other sizes of the basis."""
+    """At most four graphs for seven sizes: the first, that of any size, and two for other sizes of the basis."""
     graphs = json.loads(run_apart("sizes"))
-    assert len(graphs) == 5
+    assert len(graphs) == 4
     assert max(graphs.values()) <= 4, graphs
 
 
@@ -618,7 +620,6 @@ def test_wavelets_of_one_function():
 if __name__ == "__main__" and sys.argv[1] == "sizes":
     kinds = [
         ("net", False),
-        ("spectral", False),
         ("deflated", False),
         ("convolution", True),
         ("classifier", True),
