@@ -211,7 +211,7 @@ class Elements:
     share: Any = 1.0
     mix: Any = None
     lumped: Float[Tensor, " N"] | None = None
-    turns: Float[Tensor, "T corners d n"] | None = None
+    turns: Float[Tensor, "T corners d space"] | None = None
 
     @classmethod
     def flat(

@@ -38,7 +38,7 @@ def creased_cells(
     2 − tr P² > ½ sin² 45°, for the mean P of the projectors onto them. Where the triangles tell the sides of a surface
     in R³ folds beyond 135° are seen by the mean of the normals. None of other cells than triangles.
     """
-    if cells.shape[1] != 3:
+    if cells.shape[1] != 3 or len(cells) == 0:
         return torch.zeros(len(cells), dtype=torch.bool)
     total = summed_projectors(points, cells)
     size = (total.diagonal(dim1=1, dim2=2).sum(1) / 2).clamp_min(TINY)
@@ -61,7 +61,9 @@ def across_creases(
     """The elements for the derivatives of fields: in the place of the creased cells, flat ones with `turns`."""
     if not creased.any():
         return forms
-    gone = creased.double().numpy()
+    gone, curved, share = creased.double().numpy(), forms.lots[0], 1.0
+    if isinstance(curved.share, Tensor):  # cells that overlap
+        share = torch.from_numpy(curved.mix.T @ curved.share.numpy())[creased]
     lots = [
         lot
         if lot.mix is None
@@ -71,7 +73,7 @@ def across_creases(
     own, points = cells[creased], forms.places[: len(frames)]
     lengths = sound_lengths(edge_lengths(points, own), own)
     mix: Any = sparse.eye_array(len(cells), format="csr")
-    flat = Elements.flat(own, lengths, mix=mix[creased.numpy()])
+    flat = Elements.flat(own, lengths, share=share, mix=mix[creased.numpy()])
     a = orthonormal(flat.slopes(points)[:, 0]).mT[:, None] @ at(frames, own)
     turns = _nearest(a, _sides(points, cells, frames, own)) @ at(frames, own).mT
     lots.append(replace(flat, turns=turns))
