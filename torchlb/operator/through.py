@@ -83,7 +83,8 @@ def _finite(gradient: Tensor) -> Tensor:
     if len(bad):
         raise DerivativeError(
             f"points or medium: the derivative at {len(bad)} points or faces ({first_few(bad)}) is not finite, as "
-            "where all cells of a point are degenerate; remove these, or merge their corners"
+            "where all cells of a point are degenerate, which can be removed or merged, or where they meet at a right "
+            "angle, which leaves open what the tangent plane is: a small displacement helps"
         )
     return gradient
 
