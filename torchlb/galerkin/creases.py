@@ -22,7 +22,7 @@ from torchlb.galerkin.delaunay import sound_lengths
 from torchlb.galerkin.forms import Forms, edge_lengths
 from torchlb.galerkin.medium import orthonormal
 from torchlb.geometry.complex import consistently_wound
-from torchlb.geometry.frames import summed_projectors, vertex_normals
+from torchlb.geometry.frames import summed_normals, summed_projectors, vertex_normals
 from torchlb.geometry.local_fits import Neighborhoods
 from torchlb.geometry.thresholds import LEVEL
 from torchlb.geometry.vectors import Frames, Points, at, dot
@@ -44,9 +44,7 @@ def creased_cells(
     size = (total.diagonal(dim1=1, dim2=2).sum(1) / 2).clamp_min(TINY)
     spread = 2 - total.square().sum((1, 2)) / size.square()
     if points.shape[1] == 3 and consistently_wound(cells):
-        one, two = (points[cells[:, k]] - points[cells[:, 0]] for k in (1, 2))
-        across = torch.linalg.cross(one, two).repeat_interleave(3, 0)
-        normal = torch.zeros_like(points).index_add(0, cells.flatten(), across)
+        normal, _ = summed_normals(points, cells)
         spread = spread.maximum(1 - dot(normal, normal) / size.square())
     at_crease = spread > (1 - LEVEL**2) / 2
     reached = at_crease.clone()

@@ -158,12 +158,9 @@ class _Elements:
             cross = torch.stack([q[..., 1, :], -q[..., 0, :]], -2)  # the quarter turn of ω
             inner = torch.einsum("tika,tjkb->tijab", q, cross)
             total += (slopes.flatten(1) @ products.flatten(0, 1)).view(-1, size, size, 1, 1) * inner
-        rows = frames.shape[2] * nodes[..., None] + torch.arange(frames.shape[2])
-        row, col = (
-            x.expand(total.shape) for x in (rows[:, :, None, :, None], rows[:, None, :, None, :])
-        )
-        entries = total.flatten().numpy(), (row.flatten().numpy(), col.flatten().numpy())
-        whole = sparse.csr_array(entries, shape=(frames.shape[2] * len(frames),) * 2)
+        dim = frames.shape[2]
+        rows = (dim * nodes[..., None] + torch.arange(dim)).flatten(1)
+        whole = summed(total.transpose(2, 3).flatten(1), rows, dim * len(frames))
         return (whole + whole.T) / 2  # symmetric but for rounding
 
 

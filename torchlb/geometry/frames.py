@@ -135,12 +135,10 @@ def _edges(vertices: Points, faces: Int[Tensor, "F v"]) -> Float[Tensor, "F edge
     return corners[:, 1:] - corners[:, :1]
 
 
-def vertex_normals(vertices: Points, faces: Int[Tensor, "F n"]) -> Points:
-    """Unit mean of the normals of the faces (segments in R², triangles in R³) at every vertex, weighted by area.
-
-    Counter-clockwise triangles face the viewer, counter-clockwise polygons outward. Zero where the mean vanishes up to
-    the rounding of the faces.
-    """
+def summed_normals(
+    vertices: Points, faces: Int[Tensor, "F n"]
+) -> tuple[Points, Float[Tensor, " N"]]:
+    """(sums of the normals of the faces at every vertex, weighted by (n − 1)! times their areas; bound of its size)."""
     edges = _edges(vertices, faces)
     if vertices.shape[1] == 3:
         normal = torch.linalg.cross(edges[:, 0], edges[:, 1])
@@ -150,5 +148,15 @@ def vertex_normals(vertices: Points, faces: Int[Tensor, "F n"]) -> Points:
     for corner in faces.T:
         total.index_add_(0, corner, normal)
         size.index_add_(0, corner, edges.norm(dim=-1).prod(1))
+    return total, size
+
+
+def vertex_normals(vertices: Points, faces: Int[Tensor, "F n"]) -> Points:
+    """Unit mean of the normals of the faces (segments in R², triangles in R³) at every vertex, weighted by area.
+
+    Counter-clockwise triangles face the viewer, counter-clockwise polygons outward. Zero where the mean vanishes up to
+    the rounding of the faces.
+    """
+    total, size = summed_normals(vertices, faces)
     length = total.norm(dim=1)
     return torch.where((length > ROUNDING * size)[:, None], total / length[:, None], 0.0)

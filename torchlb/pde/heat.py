@@ -10,6 +10,7 @@ hardly resolves functions beyond the basis.
 from __future__ import annotations
 
 import math
+from functools import partial
 from numbers import Real
 from typing import Any, Literal
 
@@ -262,18 +263,17 @@ def _summed(
     solver = pair_system(lb)
     x = solver.inside(x)
 
-    def inverse_mass(v: Tensor) -> Tensor:
-        return solver.solve(v, torch.zeros_like(v[0]), tolerance)
+    def generated(v: Tensor) -> Tensor:
+        inverse = partial(solver.solve, time=torch.zeros_like(v[0]), tolerance=tolerance)
+        if transposed:
+            return -solver.stiffness_product(inverse(v))
+        return -inverse(solver.stiffness_product(v))
 
     if bool(at_zero.any()):
         start = x[:, at_zero]
-        for j in range(order + 2):
-            if j >= order:
-                (result, slope)[j - order][:, at_zero] = start
-            if transposed:
-                start = -solver.stiffness_product(inverse_mass(start))
-            else:
-                start = -inverse_mass(solver.stiffness_product(start))
+        for _ in range(order):
+            start = generated(start)
+        result[:, at_zero], slope[:, at_zero] = start, generated(start)
     for pole, chosen in poles(times):
         columns = torch.from_numpy(chosen).to(x.device)
         at_pole = x.new_full((len(chosen),), pole)
