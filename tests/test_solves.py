@@ -111,6 +111,18 @@ def test_no_time_no_step(build):
     torch.testing.assert_close(implicit_step(lb, f, 0.0), f, rtol=0, atol=1e-8)
 
 
+@pytest.mark.parametrize("name", ["pair", "cotangent", "neumann", "dirichlet"])
+def test_a_very_long_step_leaves_the_mean_and_a_poisson_problem(name):
+    """Where M has long been lost in the rounding of M + tK."""
+    lb, time = BUILDERS[name](), 1e15
+    f = rough(lb, 2)
+    one = free(lb).double()[:, None].expand_as(f)
+    mean = lb.inner(one, f) / lb.inner(one, one) if lb.fixed is None else 0 * f
+    rest = time * (implicit_step(lb, f, time) - mean)
+    assert rest.abs().max() < 10 * poisson_solve(lb, f).abs().max() + 1e-14 * time
+    torch.testing.assert_close(heat_flow(lb, f, time), mean.expand_as(f), rtol=1e-6, atol=1e-7)
+
+
 @pytest.mark.parametrize("name", ["pair", "cotangent", "neumann"])
 def test_constants_and_mass_stay_to_rounding(name):
     lb = BUILDERS[name]()

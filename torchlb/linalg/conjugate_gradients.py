@@ -54,5 +54,6 @@ def conjugate_gradients(
     left = float((square / enough.clamp_min(TINY)).max()) ** 0.5 * tolerance
     raise DiffusionError(
         f"conjugate gradients: {left:.1e} of the residual is left after {max_steps} steps, not {tolerance:.0e}. "
-        "Some triangles are too degenerate: merge vertices that nearly coincide, or raise `tolerance`"
+        "Some cells are too degenerate, or shapes of one batch differ too much in size: merge vertices that nearly "
+        "coincide, solve for shapes one by one, or raise `tolerance`"
     )

@@ -37,6 +37,7 @@ from torchlb.geometry.numbering import Numbering
 from torchlb.geometry.thresholds import NEAREST
 from torchlb.geometry.vectors import Points
 from torchlb.linalg.precision import LOW
+from torchlb.linalg.sparse import from_scipy
 from torchlb.linalg.threads import threads_for
 from torchlb.operator.checks import (
     check_boundary,
@@ -304,7 +305,8 @@ def build_cotangent(vertices: ArrayLike, faces: ArrayLike) -> Parts:
     options = Options(1, 0, condition=None, weak_form=False)
     shape = replace(mesh_shape(vertices, corners, options), mass=mass)
     centers = torch.arange(len(vertices))
-    rows = matrix_rows(matrix, shape.points, shape.frames, centers)
+    crow, *entries = from_scipy(matrix)
+    rows = matrix_rows(crow.diff(), *entries, shape.points, shape.frames, centers)
     row = centers.repeat_interleave(rows.length)
     diagonal = row == rows.col
     weak = [-mass[row] * rows.laplacian, mass[row] * diagonal]

@@ -27,7 +27,7 @@ from torch import Tensor
 from torchlb.errors import DiffusionError
 from torchlb.linalg.conjugate_gradients import Linear, conjugate_gradients
 from torchlb.linalg.factor import Factor
-from torchlb.linalg.precision import LOW, NEGLIGIBLE, SINGLE, TINY
+from torchlb.linalg.precision import LOW, NEGLIGIBLE, ROOT_EPS, SINGLE, TINY
 from torchlb.linalg.sparse import multiply, to_scipy
 from torchlb.linalg.two_grid import Matrix, absolute_row_sums, two_grid, without_small_entries
 from torchlb.operator.batching import shapes_of
@@ -140,6 +140,10 @@ class PairSystem:
         b = self.inside(b.double())
         mean = self.mean(b)
         right = torch.addcmul(b, self.ones_mass, mean, value=-1)
+        if time is not None and bool(self.unheld.all()):
+            # for a longer time the constants of M + tK would be lost in rounding; without them u is K⁻¹b/t
+            longest = float(self.area.amax()) ** (2 / self.dim) / ROOT_EPS
+            right, time = right * (longest / time).clamp_max(1.0), time.clamp_max(longest)
         near = partial(self.near, self.levels(time, b.shape[1]))
         x = near(right) if tolerance == "P1" else self._solved(right, time, tolerance, near)
         shift = -self._mean(self.ones_mass, x)

@@ -266,10 +266,7 @@ class Stencils:
 
     def _low_order_rows(self, centers: Int[Tensor, " B"], gradients: Iterable[Gradients]) -> Rows:
         """Low-order rows, some of them with the gradients of fits."""
-        low = self.shape.low_order
-        rows = matrix_rows(low.rows(centers), *self.placed, centers)
-        if self.shape.points.requires_grad:
-            rows = replace(rows, laplacian=low.entries(centers[rows.row], rows.col))
+        rows = matrix_rows(*self.shape.low_order.rows(centers), *self.placed, centers)
         rows = replace(rows, candidate=torch.full_like(centers, len(self.candidates)))
         found = list(gradients)
         if not found:

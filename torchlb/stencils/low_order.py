@@ -6,19 +6,16 @@ from dataclasses import dataclass
 from functools import cached_property
 from math import factorial
 
-import numpy as np
 import torch
 from jaxtyping import Float, Int
-from scipy import sparse
 from torch import Tensor
 
 from torchlb.errors import first_few, warn
-from torchlb.galerkin.assembly import ElementMatrices, Elements, summed
+from torchlb.galerkin.assembly import Elements, area_element, flat_metric
 from torchlb.galerkin.delaunay import delaunay_cover, sound_lengths
 from torchlb.galerkin.nodes import lagrange_nodes
 from torchlb.geometry.vectors import Points
 from torchlb.linalg.precision import ROUNDING
-from torchlb.linalg.sparse import with_diagonal
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,66 +36,68 @@ class MeshLowOrder:
     @property
     def flips(self) -> list[Tensor]:
         """Edge flips to the triangulation; none where it was not needed, or for other cells than triangles."""
-        return self._elements[2] if "_elements" in vars(self) else []
+        return self._flat[3] if "_flat" in vars(self) else []
 
-    def _matrices(self) -> tuple[ElementMatrices, list[Tensor]]:
-        """Element matrices K + iM, differentiable in the points, and flips."""
+    @cached_property
+    def _flat(self) -> tuple[Int[Tensor, "T corners"], Tensor, Float[Tensor, " T"], list[Tensor]]:
+        """Flat cells, the lengths of their edges, the fractions of them that are integrated, and flips."""
         nodes, flips = lagrange_nodes(self.cells, len(self.points), 1), []
-        share = 1.0 if self.shares is None else self.shares
         cells, lengths = nodes.cells, sound_lengths(nodes.lengths(self.points), nodes.cells)
+        shares = torch.ones_like(lengths[:, 0]) if self.shares is None else self.shares
         if nodes.dim == 2:
             free = torch.zeros(len(nodes.edges), dtype=torch.bool)
             cover = delaunay_cover(cells, lengths, nodes.edge, free, self.planned)
-            cells, lengths, flips, share = cover.faces, cover.lengths, cover.flips, 0.5
-        return Elements.flat(cells, lengths, share=share).matrices(), flips
+            cells, lengths, flips = cover.faces, cover.lengths, cover.flips
+            shares = torch.full_like(lengths[:, 0], 0.5)
+        return cells, lengths, shares, flips
 
     @cached_property
-    def _elements(self) -> tuple[sparse.csr_array, Float[Tensor, " N"], list[Tensor]]:
-        """Rows of Δ, lumped masses, none of them zero, and flips."""
-        (cells, blocks), flips = self._matrices()
-        pair = summed(blocks.detach(), cells, len(self.points))
-        mass = torch.from_numpy(pair.imag.sum(axis=1))
-        least = ROUNDING * mass.mean()
+    def _mass(self) -> Float[Tensor, " N"]:
+        """Lumped masses, none of them zero."""
+        cells, lengths, shares, _ = self._flat
+        mass = self._in_equal_parts(cells, shares * area_element(flat_metric(lengths)))
+        least = ROUNDING * float(mass.detach().mean())
         tiny = (mass < least).nonzero()[:, 0]
         if len(tiny):
             warn(
                 f"{len(tiny)} points ({first_few(tiny)}) have next to no area, their triangles are degenerate; "
                 f"{ROUNDING:.0e} of the mean is taken, so that rows stay finite"
             )
-        mass = mass.clamp_min(least)
-        strong = pair.real  # with entries that are zero: all points have one pattern
-        strong.data /= -mass.numpy().repeat(np.diff(strong.indptr))
-        return with_diagonal(strong), mass, flips
+        return mass.clamp_min(least)
 
-    def rows(self, centers: Int[Tensor, " B"]) -> sparse.csr_array:
-        """Rows (B, N) of Δ, 1/ℓ²."""
-        return sparse.csr_array(self._elements[0][centers.numpy()])
+    def _in_equal_parts(self, cells: Tensor, boxes: Float[Tensor, " T"]) -> Float[Tensor, " N"]:
+        """Volumes of cells, given those of the parallelotopes on them, in equal shares at their corners."""
+        corners = cells.shape[1]
+        share = (boxes / factorial(corners)).repeat_interleave(corners)
+        return torch.zeros_like(self.points[:, 0]).index_add(0, cells.flatten(), share)
 
-    def entries(self, row: Int[Tensor, " e"], col: Int[Tensor, " e"]) -> Float[Tensor, " e"]:
-        """Entries of Δ, 1/ℓ², differentiable in the points."""
-        (cells, blocks), _ = self._matrices()
-        count, corners = len(self.points), cells.shape[1]
-        first, second = cells.repeat_interleave(corners, 1).flatten(), cells.repeat(1, corners)
-        mass = blocks.imag.new_zeros(count).index_add(0, first, blocks.imag.flatten())
-        mass = mass.clamp_min(ROUNDING * float(mass.detach().mean()))
-        key, place = (row * count + col).unique(return_inverse=True)
-        ours = first * count + second.flatten()
-        where = torch.searchsorted(key, ours).clamp_max(len(key) - 1)
-        asked = key[where] == ours
-        values = blocks.real.flatten()[asked]
-        stiffness = values.new_zeros(len(key)).index_add(0, where[asked], values)
-        return -stiffness[place] / mass[row]
+    def rows(
+        self, centers: Int[Tensor, " B"]
+    ) -> tuple[Int[Tensor, " B"], Int[Tensor, " nnz"], Float[Tensor, " nnz"]]:
+        """Rows of Δ, 1/ℓ²: their lengths, and columns and entries, the diagonal among them."""
+        count, batch = len(self.points), torch.arange(len(centers))
+        local = torch.full((count,), -1)
+        local[centers] = batch
+        around = (local[self._flat[0]] >= 0).any(1)
+        cells, lengths, shares = (part[around] for part in self._flat[:3])
+        blocks = Elements.flat(cells, lengths, share=shares).matrices().blocks
+        corners = cells.shape[1]
+        row = local[cells].repeat_interleave(corners, 1).flatten()
+        key = (row * count + cells.repeat(1, corners).flatten())[row >= 0]
+        key, place = torch.cat([key, batch * count + centers]).unique(return_inverse=True)
+        values = blocks.real.flatten()[row >= 0]
+        stiffness = values.new_zeros(len(key)).index_add(0, place[: len(values)], values)
+        row = key // count
+        return torch.bincount(row), key % count, -stiffness / self._mass[centers[row]]
 
     def areas(self) -> Float[Tensor, " N"]:
         """Equal shares of the cells around each vertex, ℓ^d, or lumped masses where some are almost zero."""
         points, cells, corners = self.points, self.cells, self.cells.shape[1]
         upper = torch.linalg.qr((points[cells[:, 1:]] - points[cells[:, :1]]).mT).R
-        volume = torch.diagonal(upper, dim1=-2, dim2=-1).prod(-1).abs() / factorial(corners - 1)
-        volume = volume if self.shares is None else self.shares * volume
-        share = (volume / corners).repeat_interleave(corners)
-        shares = torch.zeros_like(points[:, 0]).index_add_(0, cells.flatten(), share)
+        boxes = torch.diagonal(upper, dim1=-2, dim2=-1).prod(-1).abs()
+        shares = self._in_equal_parts(cells, boxes if self.shares is None else self.shares * boxes)
         lengths = lagrange_nodes(cells, len(points), 1).lengths(points)
         square = lengths.amax(1).square().repeat_interleave(corners)
         longest = torch.zeros_like(shares).scatter_reduce(0, cells.flatten(), square, "amax")
         sound = corners != 3 or (shares > ROUNDING * longest).all()
-        return shares if sound else self._elements[1]
+        return shares if sound else self._mass

@@ -8,7 +8,6 @@ from enum import IntEnum
 
 import torch
 from jaxtyping import Bool, Float, Int
-from scipy import sparse
 from torch import Tensor
 
 from torchlb.fits.rules import WEIGHT_RULES
@@ -17,7 +16,6 @@ from torchlb.geometry.numbering import Numbering
 from torchlb.geometry.thresholds import SLIGHT
 from torchlb.geometry.vectors import Frames, Points, at
 from torchlb.linalg.precision import NEGLIGIBLE, ROOT_EPS
-from torchlb.linalg.sparse import from_scipy
 
 
 class Reason(IntEnum):
@@ -198,14 +196,17 @@ def stencil_rows(
 
 
 def matrix_rows(
-    matrix: sparse.csr_array, points: Points, frames: Frames, centers: Int[Tensor, " B"]
+    length: Int[Tensor, " B"],
+    col: Int[Tensor, " nnz"],
+    laplacian: Float[Tensor, " nnz"],
+    points: Points,
+    frames: Frames,
+    centers: Int[Tensor, " B"],
 ) -> Rows:
-    """Rows of a given strong-form matrix (B, N), with the least-squares gradient over the points of each row.
+    """Rows of a given strong-form matrix, with the least-squares gradient over the points of each row.
 
     Where these lie on a line, the derivative across it is zero. For steep rows see `to_tangent_vectors`.
     """
-    crow, col, laplacian = from_scipy(matrix)
-    length = crow.diff()
     local = Pattern(length, col).row
     offset = points[col] - points[centers[local]]
     coords = torch.einsum("en,end->ed", offset, frames[centers[local]])
