@@ -25,7 +25,6 @@ from torchlb.surfaces import StarShaped
 
 COMMUNICATION = {
     "spectral": {},
-    "deflated": {"method": "deflated"},
     "implicit": {"block": "implicit"},
     "Poisson": {"block": "poisson"},
     "tangent": {"tangent": True},
@@ -165,7 +164,7 @@ def compiled(points: int, width: int, k: int, repeats: int, device: str) -> None
 def epoch(shapes: list[LaplaceBeltrami], width: int, k: int, repeats: int, device: str) -> None:
     """A training step for each shape, against a single step for all of them."""
     batch = LaplaceBeltrami.batch(shapes)
-    for method in ("spectral", "deflated", "Poisson"):
+    for method in ("spectral", "implicit", "Poisson"):
         alone = [step_of(lb, method, width, k, device) for lb in shapes]
         steps = {
             "one by one, 8 steps": lambda alone=alone: [step() for step in alone],

@@ -64,7 +64,7 @@ from torchlb.surfaces import Ellipsoid
 class Takes(nn.Module):
     def __init__(self):
         super().__init__()
-        self.diffusion = Diffusion(3, method="deflated", k=4, init_time=0.1).double()
+        self.diffusion = Diffusion(3, k=4, init_time=0.1).double()
 
     def forward(self, x, lb):
         return self.diffusion(x, lb)

@@ -17,7 +17,6 @@ from torch.autograd import gradcheck, gradgradcheck
 
 from torchlb import InputError, LaplaceBeltrami, collate, load_or_build
 from torchlb.linalg.csr import tensors_of
-from torchlb.linalg.sparse import to_scipy
 from torchlb.operator.parts import BASIS
 from torchlb.surfaces import (
     Circle,
@@ -272,38 +271,6 @@ def test_a_whole_module_can_be_saved(lb):
     assert torch.equal(torch.load(file, weights_only=True).stencil.values[0], lb.stencil.values[0])
 
 
-def test_the_spectral_radius_travels_with_it(lb):
-    """Found when it is built; the same in every type and in every copy, and found again for a state without it."""
-    state = lb.state_dict()
-    other = LaplaceBeltrami()
-    other.load_state_dict(state)
-    for copied in (copy.deepcopy(lb).half(), pickle.loads(pickle.dumps(lb)), other):
-        assert copied.weak._radius is not None
-        assert copied.weak.radius == lb.weak.radius
-    del state["_extra_state"]["radius"]
-    other.load_state_dict(state)
-    assert other.weak._radius is None
-    assert float(other.weak.radius) == pytest.approx(float(lb.weak.radius))
-
-
-def test_a_batch_has_the_radius_of_its_shapes():
-    """The largest, which nothing is solved for."""
-    shapes = [built(name) for name in ("points", "mesh", "cotangent")]
-    batch = LaplaceBeltrami.batch(shapes)
-    assert batch.weak._radius is not None
-    assert batch.weak.radius == max(shape.weak.radius for shape in shapes)
-
-
-def test_the_radius_bounds_the_linear_pair_with_lumped_mass(lb):
-    """Eigenvalues of D⁻¹K₁, and by no more than a half too large."""
-    crow, col, (stiffness, mass, *_) = lb.weak.linear_pair
-    size = (lb.num_points, lb.num_points)
-    k, m = (to_scipy(crow, col, values, size).toarray() for values in (stiffness, mass))
-    root = m.sum(1) ** -0.5
-    largest = np.linalg.eigvalsh(root[:, None] * k * root).max()
-    assert largest <= float(lb.weak.radius) <= 1.5 * largest
-
-
 def test_repr_says_what_it_is(lb):
     text = repr(lb)
     assert f"{lb.num_points} points" in text
@@ -341,7 +308,7 @@ def disk(condition="dirichlet"):
 
 @pytest.mark.parametrize("pairs", [False, True])
 def test_unbatch_is_the_inverse_of_batch(pairs):
-    """Every tensor, the certificate, radius, options and eigenbasis of every shape, also of a batch of batches."""
+    """Every tensor, the certificate, options and eigenbasis of every shape, also of a batch of batches."""
     names = ("mesh", "cotangent") if pairs else ("points", "polyharmonic", "normal")
     shapes = [copy.deepcopy(built(name)) for name in names]
     shapes += [copy.deepcopy(disk())] if pairs else []

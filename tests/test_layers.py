@@ -43,7 +43,6 @@ needs_cuda = pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA d
 CHANNELS, K = 4, 24
 SMALL = {"width": 8, "num_blocks": 2, "k": K}
 LAYERS = {
-    "deflated": lambda: Diffusion(CHANNELS, method="deflated", k=K),
     "spectral": lambda: Diffusion(CHANNELS, k=K),
     "rational": lambda: Diffusion(CHANNELS, method="rational"),
     "convolution": lambda: SpectralConv(CHANNELS, 3, k=K),
@@ -229,23 +228,6 @@ def test_linear_elements_solve_as_well_in_float32(unit):
         assert (single[part] - expected[part]).norm() < 1e-5 * expected[part].norm()
 
 
-@pytest.mark.parametrize("rows", [1, 250, 10000])
-def test_a_batch_diffuses_in_blocks_of_shapes(eight, monkeypatch, rows):
-    """One shape, a few or all at a time: the same, derivatives in x and t too."""
-    batch = LaplaceBeltrami.batch(eight)
-    x, time = features(batch).requires_grad_(), torch.tensor([0.0, 0.01, 0.05, 0.2])
-    time.requires_grad_()
-
-    def results():
-        y = heat_flow(batch, x, time, method="deflated", k=K)
-        return y, *torch.autograd.grad(y.pow(3).sum(), (x, time))
-
-    expected = results()
-    monkeypatch.setattr("torchlb.linalg.exponential.AT_ONCE", rows)
-    for a, b in zip(results(), expected, strict=True):
-        torch.testing.assert_close(a, b, rtol=3e-5, atol=1e-6 * float(b.abs().max()))
-
-
 def test_a_batch_is_block_diagonal(eight):
     """Δ, gradient, Δx, mass and report of the shapes below each other; offsets, signatures."""
     for lb in eight:
@@ -298,14 +280,13 @@ def test_a_batch_asks_for_the_pairs_that_one_of_its_shapes_lacks():
     long.eigenbasis(40), short.eigenbasis(10)
     batch, f = LaplaceBeltrami.batch([long, short]), torch.randn(200, 2, dtype=torch.float64)
     assert batch.modes.count == 10
-    for method in ("deflated", "spectral"):
-        for k in (10, 30):
-            alone = [
-                heat_flow(lb, g, 0.1, method=method, k=k)
-                for lb, g in zip((long, short), f.split(100), strict=True)
-            ]
-            flowed = heat_flow(batch, f, 0.1, method=method, k=k)
-            torch.testing.assert_close(flowed, torch.cat(alone), rtol=1e-6, atol=1e-6)
+    for k in (10, 30):
+        alone = [
+            heat_flow(lb, g, 0.1, method="spectral", k=k)
+            for lb, g in zip((long, short), f.split(100), strict=True)
+        ]
+        flowed = heat_flow(batch, f, 0.1, method="spectral", k=k)
+        torch.testing.assert_close(flowed, torch.cat(alone), rtol=1e-6, atol=1e-6)
     assert (long.modes.count, short.modes.count, batch.modes.count) == (40, 30, 30)
 
 
@@ -418,7 +399,7 @@ def compiled_as_one_graph():
     lb = LaplaceBeltrami.from_mesh(vertices.float(), faces, order=1)
     lb.eigenbasis(K)
     x = features(lb)
-    names = ["deflated", "spectral", "convolution", "gradients", "net"]
+    names = ["spectral", "convolution", "gradients", "net"]
     functions = [partial(layer_of(name), lb=lb) for name in names]
     functions += [lb, lb.gradient, lambda f: lb.divergence(lb.gradient(f[:, 0]))]
     functions += [lambda f: lb.eigenbasis(K).from_basis(lb.eigenbasis(K).to_basis(f))]
@@ -437,7 +418,7 @@ def test_autocast_to_bfloat16_stays_close(eight, name):
     with torch.autocast("cpu", dtype=torch.bfloat16):
         y = layer(x, lb)
         half = layer(x.bfloat16(), lb)
-    exact = name in ("deflated", "spectral", "rational", "convolution", "implicit")
+    exact = name in ("spectral", "rational", "convolution", "implicit")
     scale = float(expected.detach().abs().max())
     assert (y.float() - expected).abs().max() <= (1e-6 if exact else 0.2) * scale
     assert (half.float() - expected).abs().max() <= 0.2 * scale
@@ -506,10 +487,10 @@ def test_one_rule_of_types(name):
             wrong(features_of_other, double)
 
 
-@pytest.mark.parametrize("name", ["deflated", "spectral", "convolution", "net"])
+@pytest.mark.parametrize("name", ["spectral", "convolution", "net"])
 def test_a_stored_basis_that_is_too_short_is_named(name):
     lb = LaplaceBeltrami.from_cotangent(*Sphere().mesh(60))
-    held = lb.float()._invariant_basis(8).eigenvectors.shape[1]
+    held = lb.float().eigenbasis(8).eigenvectors.shape[1]
     with pytest.warns(UserWarning, match=f"basis of {held} pairs, a layer asks for k = {K}"):
         layer_of(name)(features(lb), lb)
 
@@ -620,7 +601,7 @@ def test_wavelets_of_one_function():
 if __name__ == "__main__" and sys.argv[1] == "sizes":
     kinds = [
         ("net", False),
-        ("deflated", False),
+        ("spectral", False),
         ("convolution", True),
         ("classifier", True),
     ]

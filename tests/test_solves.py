@@ -200,27 +200,23 @@ def test_data_of_a_boundary_enter_with_the_order(condition, data):
     assert (fine < coarse / 8).all()
 
 
-def test_second_derivatives_of_deflated_flows_and_media_are_an_error():
+def test_second_derivatives_in_media_are_an_error():
     """And not half of what they should be."""
     lb = BUILDERS["cotangent"]()
-    deflated = functools.partial(heat_flow, method="deflated", k=6)
     t = torch.tensor(0.1, dtype=torch.float64, requires_grad=True)
     x, kappa = (lb.points[:, 0].exp().clone().requires_grad_() for _ in range(2))
-    flow = deflated(lb, x, t).pow(2).sum()
     step = implicit_step(lb, x, t, conductivity=kappa).pow(2).sum()
-    for slopes in (
-        torch.autograd.grad(flow, (x, t), create_graph=True),
-        torch.autograd.grad(step, (x, t, kappa), create_graph=True),
-    ):
-        for slope in slopes:
-            with pytest.raises(RuntimeError, match="differentiable once"):
-                slope.sum().backward(retain_graph=True)
+    for slope in torch.autograd.grad(step, (x, t, kappa), create_graph=True):
+        with pytest.raises(RuntimeError, match="differentiable once"):
+            slope.sum().backward(retain_graph=True)
+
+    def of_medium(s):
+        return implicit_step(lb, x.detach(), 0.1, conductivity=kappa.detach() * s).pow(2).sum()
+
     with pytest.raises(RuntimeError, match="differentiable once"):
-        torch.autograd.functional.hessian(
-            lambda s: deflated(lb, s * x.detach(), 0.1).pow(2).sum(), t
-        )
-    with pytest.raises(RuntimeError, match="linear: the derivative in a direction"):
-        torch.autograd.functional.jvp(lambda f: deflated(lb, f, 0.1), x.detach(), x.detach())
+        torch.autograd.functional.hessian(of_medium, t)
+    with pytest.raises(RuntimeError, match="jvp goes back twice"):
+        torch.autograd.functional.jvp(of_medium, t.detach(), torch.ones_like(t))
 
 
 @pytest.mark.parametrize("condition", ["neumann", "dirichlet"])

@@ -164,7 +164,7 @@ def test_all_that_a_dirichlet_condition_leaves_is_solved_once(monkeypatch):
     again.load_state_dict(lb.state_dict())
     for one in (again, LaplaceBeltrami.batch([lb, again])):
         assert one.eigenbasis(1000).eigenvectors.shape == (one.num_points, free)
-        layer = Diffusion(1, method="deflated", k=free + 1).double()
+        layer = Diffusion(1, k=free + 1).double()
         layer(torch.ones(one.num_points, 1, dtype=torch.float64), one)
 
 
@@ -364,7 +364,7 @@ def test_dirichlet_basis(surface, dtype):
     assert (product - torch.eye(20)).abs().max() < tolerance
     f = basis.eigenvectors[:, 0]
     cooled = torch.exp(-0.1 * basis.eigenvalues[0]) * f
-    for method in ("deflated", "spectral", "rational"):
+    for method in ("spectral", "rational"):
         assert (heat_flow(lb, f, 0.1, method=method, k=20) - cooled).norm() < 2e-2 * cooled.norm()
 
 

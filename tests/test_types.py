@@ -128,7 +128,6 @@ def test_maps_with_nan_are_refused_with_the_points(infinite, channels):
         LB.eigenbasis(4).to_basis,
         lambda f: heat_flow(LB, f, 0.1),
         lambda f: heat_flow(LB, f, 0.1, method="spectral", k=4),
-        lambda f: heat_flow(LB, f, 0.1, method="deflated", k=4),
         lambda f: implicit_step(LB, f, 0.1),
         lambda f: poisson_solve(LB, f),
         lambda f: torchlb.spectral_wavelets(LB, f, torch.tensor([0.1]), k=4),

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -13,9 +12,7 @@ from torch import Tensor
 from torchlb.geometry.boundary import boundary_faces
 from torchlb.geometry.vectors import Points
 from torchlb.linalg.csr import Csr
-from torchlb.linalg.exponential import spectral_radius
 from torchlb.linalg.precision import LOW
-from torchlb.linalg.sparse import to_scipy
 
 
 class PairMatrices(Csr):
@@ -46,7 +43,6 @@ class PairMatrices(Csr):
         super().__init__(crow, col, values)
         self.linear = Csr() if linear is None else linear
         self.of_functions = of_functions
-        self.set_radius(None)
 
     @property
     def has_boundary(self) -> bool:
@@ -76,26 +72,6 @@ class PairMatrices(Csr):
         if len(self.near.values) > 3:
             found = self.near.values[3:, self.near.row == self.near.col].sum(0) > 0
         return found if fixed is None else found | fixed
-
-    @property
-    def radius(self) -> Float[Tensor, ""]:
-        """Bound on the eigenvalues of D⁻¹K₁, the P1 pair with lumped mass, for flows beyond the basis, 1/ℓ².
-
-        A float64 tensor on the CPU, computed once, which compiled code can take; neither rounded nor moved.
-        """
-        if self._radius is None:
-            crow, col, values = self.linear_pair
-            shape = self.num_rows, self.num_rows
-            stiffness, mass = (to_scipy(crow, col, v.double(), shape) for v in values)
-            lumped: Any = mass.sum(axis=1)
-            self.set_radius(spectral_radius(stiffness, lumped))
-        known: Any = self._radius
-        return known
-
-    def set_radius(self, radius: float | None) -> None:
-        """Set the radius where it is known."""
-        known = None if radius is None else torch.tensor(radius, dtype=torch.float64, device="cpu")
-        self._radius = known
 
     def absorbing(
         self, points: Points, cells: Int[Tensor, "F corners"], a: Float[Tensor, " N"]

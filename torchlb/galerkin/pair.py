@@ -73,13 +73,15 @@ class Pattern:
         ours, theirs = (self.indptr, self.indices), (upper.indptr, upper.indices)
         return all(np.array_equal(x, y) for x, y in zip(ours, theirs, strict=True))
 
-    def whole(self, upper: Float[np.ndarray, " upper"]) -> Float[np.ndarray, " nnz"]:
-        """The values of the full matrix from those of the upper triangle."""
-        return upper.copy().take(self.order, mode="clip")  # this mode is not buffered
+    def whole(self, upper: Float[np.ndarray, " upper"], out: Any = None) -> np.ndarray:
+        """The values of the full matrix, (nnz,), from those of the upper triangle."""
+        return upper.copy().take(self.order, out=out, mode="clip")  # this mode is not buffered
 
     def pair(self, upper: Any) -> Csr:
         """Unpack K + iM into real matrices, rows of K summing to zero."""
-        values = np.stack([self.whole(upper.data.real), self.whole(upper.data.imag)])
+        values = np.empty((2, len(self.order)))
+        for part, full in zip((upper.data.real, upper.data.imag), values, strict=True):
+            self.whole(part, out=full)
         values[0, self.diagonal] -= np.add.reduceat(values[0], self.crow.numpy()[:-1])
         return Csr(self.crow, self.col, torch.from_numpy(values))
 

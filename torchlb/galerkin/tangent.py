@@ -38,6 +38,7 @@ from torchlb.galerkin.medium import orthonormal
 from torchlb.galerkin.pair import Pattern
 from torchlb.geometry.vectors import Frames, at, dot
 from torchlb.linalg.csr import Csr
+from torchlb.linalg.precision import AT_ONCE
 from torchlb.linalg.sparse import values_on
 
 
@@ -199,9 +200,12 @@ def _framed(
     count, _, dim = frames.shape
     pattern, ends = Pattern.of(upper, given), torch.from_numpy(upper.indices).long()
     starts = torch.arange(count).repeat_interleave(torch.from_numpy(np.diff(upper.indptr)))
-    left, right = (frames.permute(1, 2, 0)[..., given[x]] for x in (starts, ends))  # (n, d, upper)
-    terms = [torch.einsum("kmu,mbu->kbu", stiffness, right), right]
-    whole, inner = (torch.einsum("kau,kbu->uab", left, term) for term in terms)
+    frames = frames[given]
+    whole, inner = (frames.new_empty(len(ends), dim, dim) for _ in range(2))
+    for part in torch.arange(len(ends)).split(AT_ONCE):
+        left, right = (at(frames, x[part]) for x in (starts, ends))
+        inner[part] = left.mT @ right
+        whole[part] = left.mT @ (stiffness[..., part].permute(2, 0, 1) @ right)
     own = whole[starts == ends]
     whole[starts == ends] = (own + own.mT) / 2  # symmetric but for rounding
     crow, col, order = pattern.crow, pattern.col, torch.from_numpy(pattern.order).long()

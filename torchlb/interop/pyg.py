@@ -179,7 +179,7 @@ def _keys(lb: LaplaceBeltrami, k: int) -> dict[str, Any]:
         keys[f"lb_{name}_index"] = torch.stack([pair.col, pair.row])
         keys[f"lb_{name}_values"] = pad(pair.values, (0, 0, 0, more)).T.contiguous()
     if k > 0:
-        basis = lb._invariant_basis(k)
+        basis = lb.eigenbasis(k)
         parts = [getattr(basis, name) for name in BASIS]
         keys["lb_basis"] = torch.cat([part.flatten() for part in parts if part is not None])
         keys["lb_basis_size"] = torch.tensor([basis.eigenvectors.shape[1]])

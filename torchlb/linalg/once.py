@@ -13,9 +13,8 @@ from torch.utils.checkpoint import checkpoint
 from torchlb.errors import DerivativeError
 
 DIFFERENTIABLE_ONCE = (
-    "second derivatives in points or medium, or of the deflated heat flow: they are differentiable once, by "
-    "backward(); torch.autograd.functional.jvp goes back twice, too. In f they are linear: the derivative in a "
-    "direction is what they make of that direction; in other data take vjp, or a difference quotient"
+    "second derivatives in points or medium: results are differentiable once in these, by backward(); "
+    "torch.autograd.functional.jvp goes back twice, too; take vjp, or a difference quotient"
 )
 """Message of the error for second derivatives."""
 

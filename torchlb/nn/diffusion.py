@@ -58,14 +58,14 @@ class Diffusion(LearnedTimes):
     channels
         C.
     method
-        "spectral" (as in the original DiffusionNet: Φe^{−λt}ΦᵀM, which drops everything beyond the basis), "deflated"
-        (exact at every scale), "rational" (no basis, but solves). See `docs/conventions.md`.
+        "spectral" (as in the original DiffusionNet: Φe^{−λt}ΦᵀM, which drops everything beyond the basis), or
+        "rational" (exact at every scale; no basis, but solves). See `docs/conventions.md`.
     k
-        Number of eigenpairs for the first two.
+        Number of eigenpairs for the first.
     init_time
         Initial time, ℓ². Shapes of radius about one are expected.
     tolerance
-        Tolerance of the methods other than "spectral", see `heat_flow`; None for 1e-5 in float32, 1e-10 in float64.
+        Tolerance of "rational", see `heat_flow`; None for 1e-5 in float32, 1e-10 in float64.
 
     Attributes
     ----------
@@ -94,7 +94,7 @@ class Diffusion(LearnedTimes):
         super().__init__(channels, init_time)
         check_choice("method", method, Method)
         self.method, self.k, self.tolerance = method, k, tolerance
-        self.used_k = k if method in ("deflated", "spectral") else 0
+        self.used_k = k if method == "spectral" else 0
 
     def _diffused(self, x: Tensor, lb: PairMethods, time: Tensor) -> Tensor:
         return flow(lb, x, time, self.method, self.k, tolerance_for(x, self.tolerance))

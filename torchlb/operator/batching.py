@@ -87,7 +87,7 @@ def shapes_of(batch: Any) -> tuple[Any, ...]:
 
 def join_states(states: Sequence[dict[str, Any]], sizes: Sequence[int]) -> dict[str, Any]:
     """The extra state of a batch, with those of its shapes and the options that all shapes share."""
-    known, options = ([state[key] for state in states] for key in ("radius", "options"))
+    options = [state["options"] for state in states]
     first = options[0]
     parts = [part for state in states for part in state.get("parts") or [state]]
     return {
@@ -95,7 +95,6 @@ def join_states(states: Sequence[dict[str, Any]], sizes: Sequence[int]) -> dict[
         "options": {k: v for k, v in first.items() if all(o.get(k, ...) == v for o in options)},
         "certificate": _joined_certificate([state["certificate"] for state in states]),
         "sizes": list(sizes),
-        "radius": None if any(each is None for each in known) else max(known),
         "parts": parts,
         "medium": any(part.get("medium") for part in parts),
     }

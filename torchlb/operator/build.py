@@ -305,8 +305,8 @@ def build_cotangent(vertices: ArrayLike, faces: ArrayLike) -> Parts:
     options = Options(1, 0, condition=None, weak_form=False)
     shape = replace(mesh_shape(vertices, corners, options), mass=mass)
     centers = torch.arange(len(vertices))
-    crow, *entries = from_scipy(matrix)
-    rows = matrix_rows(crow.diff(), *entries, shape.points, shape.frames, centers)
+    crow, col, laplacian = from_scipy(matrix)
+    rows = matrix_rows(crow.diff(), col, laplacian, shape.points, shape.frames, centers)
     row = centers.repeat_interleave(rows.length)
     diagonal = row == rows.col
     weak = [-mass[row] * rows.laplacian, mass[row] * diagonal]

@@ -225,8 +225,6 @@ class LaplaceBeltrami(StencilMethods, PairMethods):
             raise InputError("batch: got no shapes")
         check_alike(shapes)
         sizes = [n for shape in shapes for n in shape.sizes or (shape.num_points,)]
-        if all(shape._has_weak_form for shape in shapes):
-            _ = [shape.weak.radius for shape in shapes]  # computed here, once, where one was loaded
         state = join_states([shape.get_extra_state() for shape in shapes], sizes)
         bases = [shape._basis for shape in shapes if shape._basis and not shape.sizes]
         with torch.inference_mode(False):
@@ -359,10 +357,7 @@ class LaplaceBeltrami(StencilMethods, PairMethods):
     ) -> LaplaceBeltrami:
         """Store a finished operator, in the floating type of the input, whose gradient it carries."""
         with torch.inference_mode(False):
-            lb = cls._of_parts(parts)
-            if lb._has_weak_form:
-                _ = lb.weak.radius  # before the values are rounded
-            lb = lb.to(device, float_type(given))
+            lb = cls._of_parts(parts).to(device, float_type(given))
         return carrying(lb, given)
 
 

@@ -195,13 +195,6 @@ class PairMethods(OperatorStorage):
         count = k + (0 if origins(self) is None else BEYOND)
         return through_eigenpairs(self, self._known_basis(count, tolerance, store), k)
 
-    def _invariant_basis(self, k: int) -> Eigenbasis:
-        """All eigenpairs known, at least k: their span is invariant under Δ. They have no derivatives in the shape."""
-        basis = self._known_basis(check_num_pairs(k))
-        names = ("eigenvalues", "eigenvectors", "left") if origins(self) else ()
-        held = {n: without(self, getattr(basis, n), "the deflated flow") for n in names}
-        return replace(basis, **held)
-
     def _known_basis(
         self, k: int, tolerance: float | None = None, store: bool = False
     ) -> Eigenbasis:

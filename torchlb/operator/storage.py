@@ -255,13 +255,12 @@ class OperatorStorage(Tensors):
         return f"{type(self).__name__}({inside})"
 
     def get_extra_state(self) -> dict[str, Any]:
-        """Source, options, certificate, spectral radius and the surface's summary, plain types only."""
+        """Source, options, certificate and the surface's summary, plain types only."""
         return {
             "source": self.source,
             "options": self.options,
             "certificate": None if self.certificate is None else asdict(self.certificate),
             "sizes": None if self.sizes is None else list(self.sizes),
-            "radius": None if self.weak._radius is None else float(self.weak._radius),
             "parts": self._states,
             "medium": self._in_medium,
             "surface": None if self.surface is None else asdict(self.surface),
@@ -274,7 +273,6 @@ class OperatorStorage(Tensors):
         self.surface = None if surface is None else SurfaceSummary.of(surface)
         self.certificate = None if found is None else Certificate(**found)
         self.sizes, self._states = sizes, state.get("parts")
-        self.weak.set_radius(state.get("radius"))
         self._in_medium = bool(state.get("medium"))
 
     def _load_from_state_dict(self, state_dict: Any, prefix: str, *given: Any) -> None:

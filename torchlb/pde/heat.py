@@ -2,9 +2,7 @@
 
 `Method` names the ways to compute it. "rational", the default of functions, needs no basis and is exact to the
 tolerance: a rational series in Z = (M + γK)⁻¹M. "spectral", the default of layers, is exact on the span of the slow
-eigenvectors; everything beyond the basis is dropped, also as t → 0. "deflated" is the same on that span; the rest,
-which has decayed after about 16/λ_k, takes a short Chebyshev series of the P1 pair with lumped mass, since the mesh
-hardly resolves functions beyond the basis.
+eigenvectors; everything beyond the basis is dropped, also as t → 0.
 """
 
 from __future__ import annotations
@@ -22,7 +20,7 @@ from torchlb.errors import InputError, shown
 from torchlb.galerkin.forms import BilinearForm
 from torchlb.linalg.checks import check_choice, check_tensor, takes_arrays
 from torchlb.linalg.csr import shaped_like, side_by_side
-from torchlb.linalg.exponential import chebyshev_vectors, heat, poles, rational_coefficients
+from torchlb.linalg.exponential import chebyshev_vectors, poles, rational_coefficients
 from torchlb.linalg.once import once_differentiable
 from torchlb.linalg.precision import ROOT_EPS
 from torchlb.linalg.sparse import compute_dtype
@@ -35,7 +33,7 @@ from torchlb.operator.through import Origins, origins
 from torchlb.pde.checks import as_columns, as_times, check_shape, uncompiled
 from torchlb.spectral.eigenbasis import Eigenbasis
 
-Method = Literal["rational", "spectral", "deflated"]
+Method = Literal["rational", "spectral"]
 
 
 @takes_arrays
@@ -48,7 +46,7 @@ def heat_flow(
     k: int = 128,
     tolerance: float = ROOT_EPS,
 ) -> Tensor:
-    """e^{tΔ}f: f after diffusion over the surface for a time t; differentiable in f and t ("deflated" once).
+    """e^{tΔ}f: f after diffusion over the surface for a time t; differentiable in f and t.
 
     Computed in the wider of the types of f and the operator, at least float32; only a half-precision f gets its own
     type back.
@@ -62,9 +60,9 @@ def heat_flow(
     t
         Time ≥ 0 in ℓ², one for all channels or (C,). (In a time t a peak spreads to a width of √(2t).)
     method
-        "rational", which is exact to the tolerance, "spectral" or "deflated" (`docs/conventions.md`).
+        "rational", which is exact to the tolerance, or "spectral" (`docs/conventions.md`).
     k
-        Number of eigenpairs, for the last two.
+        Number of eigenpairs, for "spectral".
     tolerance
         Bound on the error in the norm of M, relative to |f|. Where all values around are smaller, as far from a heated
         point, they are noise: their logarithms and directions (geodesics) need an implicit step.
@@ -137,13 +135,6 @@ def flow(lb: PairMethods, x: Tensor, time: Tensor, method: str, k: int, toleranc
     check_pair(lb)
     if method == "spectral":
         return _spectral(lb.eigenbasis(k), x, time)
-    if method == "deflated":
-        if lb.weak.values.dtype.itemsize < 4:
-            raise InputError(
-                'method: "deflated" needs an operator in float32 or float64, whose matrices keep constants; pass '
-                f"lb.float(), got {lb.weak.values.dtype}"
-            )
-        return _deflated(lb, lb._invariant_basis(k), x, time, tolerance)
     return pair_flow(lb, x, time, tolerance).to(x.dtype)
 
 
@@ -151,40 +142,6 @@ def _spectral(basis: Eigenbasis, x: Tensor, time: Tensor) -> Tensor:
     """Φ e^{−λt} ΦᵀMx."""
     decay = torch.exp(-basis.eigenvalues.to(x.dtype)[..., None] * time)
     return basis.from_basis(decay * basis.analyse(basis.left, x))
-
-
-def _deflated(
-    lb: PairMethods, basis: Eigenbasis, x: Tensor, time: Tensor, tolerance: float
-) -> Tensor:
-    """e^{−λt} on the basis' span; on the rest, the flow of the P1 pair with lumped mass, projected off that span."""
-    if lb.fixed is not None:
-        x = x * ~lb.fixed[:, None]
-    values, coefficients = basis.eigenvalues.to(x.dtype), basis.analyse(basis.left, x)
-    slow = basis.from_basis(torch.exp(-values[..., None] * time) * coefficients)
-    if lb.modes.has(lb.num_points):
-        return slow
-    fastest = values.amax(-1)
-    if basis.sizes is not None:  # a shape whose basis is complete has no rest
-        incomplete = [size > lb.modes.count for size in basis.sizes]
-        fastest = torch.where(torch.tensor(incomplete, device=x.device), fastest, torch.inf).amin()
-    whole, time = time, torch.minimum(time, math.log(1 / tolerance) / fastest)
-    pattern, matrix, root = _linear_flow(lb)
-    options = lb.weak.radius, tolerance, lb.sizes or (lb.num_points,)
-    rest = root.to(x.dtype)[:, None] * (x - basis.from_basis(coefficients))
-    rest = heat(pattern, matrix.to(x.dtype), rest, time, *options)
-    rest = rest / root.to(x.dtype)[:, None] * torch.exp(-fastest * (whole - time))
-    return slow + rest - basis.from_basis(basis.analyse(basis.left, rest))
-
-
-def _linear_flow(lb: PairMethods) -> tuple[list[Tensor], Tensor, Tensor]:
-    """Pattern and values of −D^{−½}K₁D^{−½}, zero for Dirichlet points, and D^½, where D are the row sums of M₁."""
-    crow, col, (stiffness, mass, *_) = lb.weak.linear_pair
-    row = lb.weak.near.row
-    root = torch.zeros_like(lb.mass).index_add(0, row, mass.to(lb.mass)).sqrt()
-    values = -stiffness / (root[row] * root[col])
-    if lb.fixed is not None:
-        values = torch.where(lb.fixed[row] | lb.fixed[col], 0.0, values)
-    return [crow, col], values, root
 
 
 def pair_flow(
