@@ -286,7 +286,7 @@ def test_low_order_rows_and_areas_of_a_square_in_four_dimensions():
     square = torch.cartesian_prod(line, line)
     found = reconstruct(torch.cat([square, 0 * square], 1), 2)
     low_order, x = MeshLowOrder(found.points, found.cells), square[:, 0]
-    length, col, values = low_order.rows(((x > 0) & (x < 1)).nonzero()[:, 0])
+    length, col, values, _ = low_order.rows(((x > 0) & (x < 1)).nonzero()[:, 0])
     assert torch.segment_reduce(values * x[col], "sum", lengths=length).abs().max() < 1e-10
     assert abs(low_order.areas().sum() - 1) < 1e-12
 

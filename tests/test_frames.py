@@ -5,8 +5,10 @@ from functools import cache
 import numpy as np
 import pytest
 import torch
+import trimesh
 
 from tolerances import TOLERANCE
+from torchlb import LaplaceBeltrami
 from torchlb.cloud.frames import cloud_frames
 from torchlb.cloud.voronoi import nearest_graph
 from torchlb.geometry.fit_search import FitSearch
@@ -27,6 +29,7 @@ from torchlb.surfaces import (
     StarShaped,
     ThreeSphere,
     Torus,
+    limit_surface,
 )
 
 MANIFOLDS = [Sphere(), Torus(), CliffordTorus(), ThreeSphere(), SpaceCurve()]
@@ -107,13 +110,54 @@ def test_frames_in_other_codimensions_and_dimensions(surface, factor):
 
 @each([Sphere(), Torus()])
 def test_frames_of_a_mesh_ignore_the_orientation_of_its_faces(surface):
-    """Flipping every other triangle leaves the projectors E Eᵀ as they were, and they are near the exact planes."""
+    """Turning all triangles leaves the projectors E Eᵀ as they were; turning every other one leaves planes as near."""
     vertices, faces = surface.mesh(500)
-    flipped = faces.clone()
-    flipped[::2] = flipped[::2, [1, 0, 2]]
-    one, other = mesh_frames(vertices, faces), mesh_frames(vertices, flipped)
-    close(one @ one.mT, other @ other.mT)
-    assert tilt(one, surface.frames(vertices)).max() < 0.3
+    some = faces.clone()
+    some[::2] = some[::2, [1, 0, 2]]
+    one, all_, other = (mesh_frames(vertices, f) for f in (faces, faces[:, [1, 0, 2]], some))
+    close(one @ one.mT, all_ @ all_.mT)
+    for frames in (one, other):
+        close(frames.mT @ frames, torch.eye(2, dtype=torch.float64).expand(500, -1, -1))
+        assert tilt(frames, surface.frames(vertices)).max() < 0.3
+
+
+@pytest.mark.parametrize("height", [1.0, 2.0, 8.0])
+def test_frames_at_the_tip_of_a_cone_are_across_its_axis(height):
+    """Of a pyramid and of a roof, whose faces may be farther from that plane than from others."""
+    angle = 2 * torch.pi * torch.arange(12, dtype=torch.float64) / 12
+    rim = torch.stack([angle.cos(), angle.sin(), 0 * angle], 1)
+    points = torch.cat([rim, rim.new_tensor([[0.0, 0.0, height]])])
+    number = torch.arange(12)
+    faces = torch.stack([number, (number + 1) % 12, torch.full_like(number, 12)], 1)
+    assert mesh_frames(points, faces)[12, 2].abs().max() < 1e-12
+    for build in (LaplaceBeltrami.from_cotangent, LaplaceBeltrami.from_mesh):
+        below = torch.cat([points, -points[12:]])
+        both = torch.cat([faces, torch.where(faces == 12, 13, faces)[:, [1, 0, 2]]])
+        assert build(below, both).normals[12, 2] > 1 - 1e-12
+    roof = torch.tensor([[-1.0, 0.0], [0.0, height], [1.0, 0.0]], dtype=torch.float64)
+    segments = torch.tensor([[0, 1], [1, 2]])
+    assert mesh_frames(roof, segments)[1, 1].abs() < 1e-12
+
+
+def test_unresolved_places_are_no_worse_than_linear_elements():
+    """∇f and the normals of a limit surface that its mesh resolves in part, beside those of the cotangent operator."""
+    control = trimesh.creation.icosphere(subdivisions=2)
+    radius = np.random.default_rng(0).uniform(0.5, 1.5, (len(control.vertices), 1))
+    corners = torch.from_numpy(control.vertices * radius)
+    points, meshes = limit_surface(corners, torch.from_numpy(np.array(control.faces)), 4)
+    faces = meshes[1]
+    vertices = points[: int(faces.max()) + 1]
+    exact = vertex_normals(points, meshes[4])[: len(vertices)]
+    f, slope = vertices[:, 0].sin() * vertices[:, 1], torch.zeros_like(vertices)
+    slope[:, 0], slope[:, 1] = vertices[:, 0].cos() * vertices[:, 1], vertices[:, 0].sin()
+    slope -= (slope * exact).sum(1, keepdim=True) * exact
+    off = []
+    for build in (LaplaceBeltrami.from_mesh, LaplaceBeltrami.from_cotangent):
+        lb = build(vertices, faces)
+        off.append([(lb.gradient(f) - slope).norm(), (lb.normals - exact).norm()])
+    (gradient, normal), (of_cotangent, its_normal) = off
+    assert gradient < 1.1 * of_cotangent
+    assert normal < 1.1 * its_normal
 
 
 def test_frames_of_a_polyline_and_of_a_flat_mesh():

@@ -19,6 +19,11 @@ SIZE_FACTORS = {
     "polyharmonic": (2.0, 2.5, 3.0),
 }
 """Points of a stencil per polynomial, by the rule for its weights, in the order in which they are tried."""
+RESOLVED_ON_MESH, RESOLVED_ON_CLOUD = 1.8, 4.1
+"""Largest scatter of heights about a fit times the growth g∞, which turns it into an error of Δ. The bound is lower on
+a mesh, whose triangles follow a surface that its points do not resolve better than a fit."""
+RESOLVING_DEGREE = 4
+"""Degree up to which the bound stays constant: the scatter about a low degree does not justify the next fits."""
 
 
 def polyharmonic_weights(
@@ -100,3 +105,12 @@ def reference(
     center, others = weights.laplacian[0, 0].abs(), weights.laplacian[0, 1:].abs().sum()
     growth = weights.radius[0].square() * (center + others)
     return Reference(float(growth), float(others / center))
+
+
+def resolution(dim: int, degree: int, *, on_mesh: bool, normals: bool) -> float:
+    """Largest scatter of heights about a fit (`CenteredFit.scatter`) of a surface that its points resolve.
+
+    On a mesh it is half as large if the `normals` of the fit count.
+    """
+    growth = max(reference(dim, m).growth for m in (degree, RESOLVING_DEGREE))
+    return (RESOLVED_ON_MESH / (1 + normals) if on_mesh else RESOLVED_ON_CLOUD) / growth

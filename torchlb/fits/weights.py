@@ -154,10 +154,13 @@ class CenteredFit:
         return self._left(heights, graph).norm(dim=-1).amax(1) / self.radius
 
     def scatter(
-        self, heights: Float[Tensor, "B neighbors n"], coords: Float[Tensor, "B neighbors d"]
+        self,
+        heights: Float[Tensor, "B neighbors n"],
+        graph: Float[Tensor, "B M n"],
+        coords: Float[Tensor, "B neighbors d"],
     ) -> Float[Tensor, " B"]:
         """Scatter of the heights about their fit, per degree of freedom, over root mean square distance."""
-        left = self._left(heights, self.coefficients @ heights)
+        left = self._left(heights, graph)
         count, terms = self.values.shape[1:]
         square = coords.norm(dim=-1).square() + heights.norm(dim=-1).square()
         distance = max(count - terms, 1) / count * (self.root.square() * square).sum(1)
@@ -172,14 +175,16 @@ class CenteredFit:
     ) -> Weights:
         """Weights in units of length, from those in units of the radius."""
         dim, rho = coords.shape[2], self.radius[:, None, None]
-        none = torch.zeros_like(self.radius)
+        left = none = torch.zeros_like(self.radius)
+        if heights is not None:
+            left = self.scatter(heights, self.coefficients @ heights, coords)
         return Weights(
             gradient=weights[..., :dim] / rho,
             laplacian=weights[..., dim] / rho[..., 0].square(),
             radius=self.radius,
             condition=self.condition,
             residual=residual,
-            height_residual=none if heights is None else self.scatter(heights, coords),
+            height_residual=left,
             slope=none.long(),
         )
 

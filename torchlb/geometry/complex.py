@@ -167,9 +167,22 @@ def pieces_of(faces: Faces, count: int) -> Int[np.ndarray, " N"]:
     return components(i, j, count)
 
 
-def consistently_wound(faces: Int[Tensor, "F v"]) -> bool:
-    """Whether neighbouring triangles (or segments) are consistently oriented: no directed edge is used twice."""
+def seams(faces: Int[Tensor, "F v"], count: int) -> Bool[Tensor, " N"]:
+    """Mask of the points where triangles (or segments) are wound against each other, or three and more meet.
+
+    >>> seams(torch.tensor([[0, 1, 2], [0, 1, 3]]), 4).tolist()
+    [True, True, False, False]
+    """
+    found = torch.zeros(count, dtype=torch.bool)
     if faces.shape[1] == 2:
-        return all(len(torch.unique(end)) == len(end) for end in faces.T)
-    edges = torch.cat([faces[:, a] * (faces.max() + 1) + faces[:, a - 2] for a in range(3)])
-    return len(torch.unique(edges)) == len(edges)
+        return (torch.stack([torch.bincount(end, minlength=count) for end in faces.T]) > 1).any(0)
+    tail, head = faces.flatten(), faces.roll(-1, 1).flatten()
+    _, number, uses = torch.unique(tail * count + head, return_inverse=True, return_counts=True)
+    again = uses[number] > 1  # a directed edge
+    found[tail[again]] = found[head[again]] = True
+    return found
+
+
+def consistently_wound(faces: Int[Tensor, "F v"]) -> bool:
+    """Whether neighbouring triangles (or segments) are consistently oriented."""
+    return not bool(seams(faces, int(faces.max()) + 1).any())

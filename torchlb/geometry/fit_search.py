@@ -10,6 +10,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from torchlb.fits.polynomials import num_monomials
+from torchlb.fits.rules import resolution
 from torchlb.fits.weights import CenteredFit
 from torchlb.geometry.candidates import Search, list_candidates
 from torchlb.geometry.local_fits import FitPlan, LocalFits, Neighborhoods, slope_of
@@ -34,7 +35,7 @@ class FitSearch:
 
     `frame_degree` is q, and 0 keeps the initial planes; `degrees` are those of the fits of functions, best first:
     without any there are neither such fits nor graphs. A user may have fixed the number of points of the fits of
-    heights.
+    heights. `on_mesh` says whether triangles are given.
     """
 
     def __init__(
@@ -43,10 +44,15 @@ class FitSearch:
         frame_degree: int = 0,
         degrees: tuple[int, ...] = (),
         num_neighbors: int | None = None,
+        *,
+        on_mesh: bool = False,
     ) -> None:
+        self.on_mesh = on_mesh
         count, self.neighborhoods, self.degrees = len(neighborhoods.points), neighborhoods, degrees
         self.candidates = list_candidates(
-            neighborhoods.dim, range(frame_degree, 0, -1), num_neighbors=num_neighbors
+            neighborhoods.dim,
+            range(frame_degree, min(frame_degree, 2) - 1, -1) if frame_degree else (),
+            num_neighbors=num_neighbors,
         )
         self.highest = max(frame_degree, *degrees, 0) if degrees else 0
         self.jet, self.reach = (1, 0.5) if max(degrees, default=0) <= 3 else (degrees[0], 1.0)
@@ -61,7 +67,9 @@ class FitSearch:
     def refine(self, centers: Int[Tensor, " B"]) -> None:
         """Find the tangent planes at `centers`, and try the same neighbourhoods for fits of functions.
 
-        Each centre takes the first candidate whose fit is regular and tilted by less than 60°.
+        Each centre takes the first candidate whose fit is regular, tilted by less than 60° and, unless it is a plane,
+        followed by its points as those of a stencil have to follow theirs; else it keeps its initial plane. Planes are
+        no candidates where more is asked for.
         """
         middles = self.neighborhoods.middles(centers)
         search = Search(self.neighborhoods, centers, self.candidates)
@@ -71,7 +79,10 @@ class FitSearch:
             fit, heights, graph = self.fits.fitted(block)
             regular = is_regular(fit, middles[rows], block.degree)
             flat_enough = slope_of(fit, graph, self.fits.initial).square().sum((1, 2)) <= steepest
-            passed = regular & flat_enough  # false for NaN
+            coords = fit.radius[:, None, None] * fit.values[..., : self.neighborhoods.dim]
+            bound = resolution(coords.shape[2], block.degree, on_mesh=self.on_mesh, normals=True)
+            resolved = (fit.scatter(heights, graph, coords) <= bound) | (block.degree == 1)
+            passed = regular & flat_enough & resolved  # false for NaN
             self.order[centers[rows[passed]]] = block.degree
             self._keep_surface(block, fit, heights, graph, regular, passed)
             if number == 0 and self.degrees:

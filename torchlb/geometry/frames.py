@@ -13,6 +13,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from torchlb.geometry.complex import seams
 from torchlb.geometry.vectors import Frames, Points, at, dot
 from torchlb.linalg.once import once_differentiable
 from torchlb.linalg.precision import ROUNDING
@@ -24,10 +25,24 @@ PROJECTIONS = get_args(Projection)
 def mesh_frames(vertices: Points, faces: Int[Tensor, "F v"]) -> Frames:
     """Initial frames of a mesh of d-simplices: at each vertex the plane closest to those of its faces.
 
-    The frame spans the leading eigenvectors of the area-weighted mean of the projectors onto the faces' planes,
-    whatever their orientation and the codimension. The error is O(h) on a smooth surface.
+    Of a curve in the plane and a surface in space it is orthogonal to the area-weighted mean of the normals. In other
+    codimensions, and where normals cancel or faces are wound against each other, it spans the leading eigenvectors of
+    the area-weighted mean of the projectors onto the planes. The error is O(h) on a smooth surface.
     """
-    return _Leading.apply(summed_projectors(vertices, faces), faces.shape[1] - 1)  # pyright: ignore[reportReturnType]
+    count, n = vertices.shape
+    frames = vertices.new_zeros(count, n, faces.shape[1] - 1)
+    opposed = torch.ones(count, dtype=torch.bool)
+    if faces.shape[1] == n <= 3:
+        total, bound = summed_normals(vertices, faces)
+        length = total.norm(dim=1)
+        opposed = seams(faces, count) | ~(length > ROUNDING * bound)
+        normal = total[~opposed] / length[~opposed, None]
+        own = complete_frames(normal.detach())
+        frames[~opposed] = orthonormalized(own - normal[..., None] * (normal[:, None] @ own))
+    if opposed.any():
+        planes = summed_projectors(vertices, faces)[opposed]
+        frames[opposed] = _Leading.apply(planes, faces.shape[1] - 1)  # pyright: ignore[reportArgumentType]
+    return frames
 
 
 def summed_projectors(vertices: Points, faces: Int[Tensor, "F v"]) -> Float[Tensor, "N n n"]:

@@ -306,7 +306,8 @@ def build_cotangent(vertices: ArrayLike, faces: ArrayLike) -> Parts:
     shape = replace(mesh_shape(vertices, corners, options), mass=mass)
     centers = torch.arange(len(vertices))
     crow, col, laplacian = from_scipy(matrix)
-    rows = matrix_rows(crow.diff(), col, laplacian, shape.points, shape.frames, centers)
+    entries = col, laplacian, torch.ones_like(col, dtype=torch.bool)
+    rows = matrix_rows(crow.diff(), *entries, shape.points, shape.frames, centers)
     row = centers.repeat_interleave(rows.length)
     diagonal = row == rows.col
     weak = [-mass[row] * rows.laplacian, mass[row] * diagonal]

@@ -18,7 +18,7 @@ from tqdm import tqdm
 
 from torchlb.errors import StencilError, first_few
 from torchlb.fits.polynomials import num_monomials
-from torchlb.fits.rules import SIZE_FACTORS, WEIGHT_RULES, reference
+from torchlb.fits.rules import SIZE_FACTORS, WEIGHT_RULES, reference, resolution
 from torchlb.fits.weights import Weights, least_squares_weights
 from torchlb.geometry.candidates import Candidate, Search, list_candidates
 from torchlb.geometry.frames import local_heights, local_offsets
@@ -29,11 +29,6 @@ from torchlb.stencils.rows import Reason, Rows, RowsPlan, matrix_rows, stencil_r
 from torchlb.stencils.shape import Shape
 
 RULES = list(WEIGHT_RULES)
-RESOLVED_ON_MESH, RESOLVED_ON_CLOUD = 1.8, 4.1
-"""Largest height residual of a stencil times the growth g∞, which turns it into an error of Δ. The bound is lower on a
-mesh, whose triangles follow a surface that its points do not resolve better than a fit; along normals half of it."""
-RESOLVING_DEGREE = 4
-"""Degree up to which the bound stays constant: the residual of a low degree does not justify the next rows."""
 GRADIENT_GROWTH = 30.0
 """Largest ρ Σ|w| of a first derivative beside a boundary; well-placed points have 5 to 15."""
 Gradients = tuple[Int[Tensor, " b"], Int[Tensor, "b K"], Float[Tensor, "b K d"], int]
@@ -174,11 +169,10 @@ class Stencils:
         over more of them. On a cloud, noise may shrink by the ratio of the widest stencil to the first; a size fixed by
         the user cannot widen.
         """
-        growth = max(reference(self.dim, m).growth for m in (candidate.degree, RESOLVING_DEGREE))
+        kind = {"on_mesh": self.shape.on_mesh, "normals": self.projection == "normal"}
+        bound = resolution(self.dim, candidate.degree, **kind)
         if self.shape.on_mesh:
-            bound = RESOLVED_ON_MESH / (1 + (self.projection == "normal")) / growth
             return bound * FACTOR / max(candidate.factor, FACTOR), bound
-        bound = RESOLVED_ON_CLOUD / growth
         factors = SIZE_FACTORS["least_squares"]
         widest = bound * (factors[-1] / factors[0]) ** (1 / self.dim)
         return (bound if candidate.factor else widest), widest

@@ -7,7 +7,7 @@ from functools import cached_property
 from math import factorial
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from torchlb.errors import first_few, warn
@@ -73,22 +73,31 @@ class MeshLowOrder:
 
     def rows(
         self, centers: Int[Tensor, " B"]
-    ) -> tuple[Int[Tensor, " B"], Int[Tensor, " nnz"], Float[Tensor, " nnz"]]:
-        """Rows of Δ, 1/ℓ²: their lengths, and columns and entries, the diagonal among them."""
-        count, batch = len(self.points), torch.arange(len(centers))
-        local = torch.full((count,), -1)
-        local[centers] = batch
+    ) -> tuple[Int[Tensor, " B"], Int[Tensor, " nnz"], Float[Tensor, " nnz"], Bool[Tensor, " nnz"]]:
+        """Rows of Δ, 1/ℓ²: their lengths, columns and entries, and which columns are of the point's own cells.
+
+        The diagonal is among them.
+        """
+        count, local = len(self.points), torch.full((len(self.points),), -1)
+        local[centers] = torch.arange(len(centers))
+
+        def pairs(cells: Int[Tensor, "T corners"]) -> Int[Tensor, " e"]:
+            """A number for each pair of a center, or −1, and a corner of the same cell."""
+            corners = cells.shape[1]
+            row = local[cells].repeat_interleave(corners, 1).flatten()
+            return torch.where(row < 0, -1, row * count + cells.repeat(1, corners).flatten())
+
         around = (local[self._flat[0]] >= 0).any(1)
         cells, lengths, shares = (part[around] for part in self._flat[:3])
         blocks = Elements.flat(cells, lengths, share=shares).matrices().blocks
-        corners = cells.shape[1]
-        row = local[cells].repeat_interleave(corners, 1).flatten()
-        key = (row * count + cells.repeat(1, corners).flatten())[row >= 0]
-        key, place = torch.cat([key, batch * count + centers]).unique(return_inverse=True)
-        values = blocks.real.flatten()[row >= 0]
+        mine, own = pairs(cells), pairs(self.cells[(local[self.cells] >= 0).any(1)])
+        own = torch.cat([own[own >= 0], torch.arange(len(centers)) * count + centers]).unique()
+        key, place = torch.cat([mine[mine >= 0], own]).unique(return_inverse=True)
+        values = blocks.real.flatten()[mine >= 0]
         stiffness = values.new_zeros(len(key)).index_add(0, place[: len(values)], values)
-        row = key // count
-        return torch.bincount(row), key % count, -stiffness / self._mass[centers[row]]
+        row, beside = key // count, torch.zeros_like(key, dtype=torch.bool)
+        beside[place[len(values) :]] = True
+        return torch.bincount(row), key % count, -stiffness / self._mass[centers[row]], beside
 
     def areas(self) -> Float[Tensor, " N"]:
         """Equal shares of the cells around each vertex, ℓ^d, or lumped masses where some are almost zero."""

@@ -199,17 +199,18 @@ def matrix_rows(
     length: Int[Tensor, " B"],
     col: Int[Tensor, " nnz"],
     laplacian: Float[Tensor, " nnz"],
+    beside: Bool[Tensor, " nnz"],
     points: Points,
     frames: Frames,
     centers: Int[Tensor, " B"],
 ) -> Rows:
-    """Rows of a given strong-form matrix, with the least-squares gradient over the points of each row.
+    """Rows of a given strong-form matrix, with the least-squares gradient over the points `beside` the row's own.
 
     Where these lie on a line, the derivative across it is zero. For steep rows see `to_tangent_vectors`.
     """
     local = Pattern(length, col).row
     offset = points[col] - points[centers[local]]
-    coords = torch.einsum("en,end->ed", offset, frames[centers[local]])
+    coords = torch.einsum("en,end->ed", offset, frames[centers[local]]) * beside[:, None]
 
     def summed(values: Tensor) -> Tensor:
         return values.new_zeros(len(centers), *values.shape[1:]).index_add_(0, local, values)

@@ -264,7 +264,8 @@ def _shape(
     """
     points, dim, sides = neighborhoods.points, neighborhoods.dim, neighborhoods.sides
     degree = 0 if dim == points.shape[1] else options.q
-    search = FitSearch(neighborhoods, degree, options.elements[1], options.num_neighbors)
+    rest = options.elements[1], options.num_neighbors
+    search = FitSearch(neighborhoods, degree, *rest, on_mesh=on_mesh)
     if degree == 0:
         search.order.fill_(options.q)
     else:
