@@ -246,6 +246,10 @@ def test_derivatives_where_a_dirichlet_condition_holds_and_f_does_not_vanish():
     assert not of_f[lb.fixed].any()
 
 
+def test_a_time_may_be_an_integer(unchecked):
+    assert Diffusion(3, init_time=1).time.eq(1.0).all()
+
+
 @pytest.mark.parametrize("time", [0.0, -1.0, math.nan])
 def test_learned_times_start_above_zero(time):
     with pytest.raises(InputError, match="init_time"):

@@ -16,6 +16,7 @@ from torchlb import (
     ImplicitDiffusion,
     InputError,
     LaplaceBeltrami,
+    PoissonFeatures,
     heat_flow,
     heat_kernel_signature,
     implicit_step,
@@ -474,3 +475,17 @@ def test_a_cloud_conducts_as_its_surface_does():
     for step in (implicit_step, lambda lb, f, t, **k: poisson_solve(lb, f, **k)):
         one, two = (step(lb, x, 0.3, conductivity=z.exp()) for lb in (cloud, mesh))
         assert (one - two).norm() < 1e-3 * two.norm()
+
+
+def test_the_conductivity_of_a_solve_keeps_the_rest_of_the_medium():
+    """On the sphere −2Δu + 3u = 4z for z has u = 4z/7; sources of layers have the density, too."""
+    lb = LaplaceBeltrami.from_mesh(*Sphere().mesh(300))
+    z, medium = lb.points[:, 2], lb.with_medium(density=4.0, potential=3.0)
+    u = poisson_solve(medium, z, conductivity=2.0 * torch.ones_like(z))
+    torch.testing.assert_close(u, 4 * z / 7, rtol=0, atol=1e-3)
+    step = implicit_step(medium, z, 0.5, conductivity=2.0 * torch.ones_like(z))
+    torch.testing.assert_close(step, 8 * z / 15, rtol=0, atol=1e-3)
+    dense, layer = lb.with_medium(density=4.0), PoissonFeatures(1, tolerance=1e-9).double()
+    torch.testing.assert_close(
+        layer(z[:, None], dense), 4 * layer(z[:, None], lb), rtol=0, atol=1e-3
+    )

@@ -304,3 +304,13 @@ def test_rows_lowered_for_a_positive_mass_are_decided_at_the_points():
     (g,) = torch.autograd.grad((weight * lb.at(x).mass).sum(), x)
     ends = [float((weight * lb.at(base + s * 1e-6 * way).mass).sum()) for s in (1, -1)]
     assert float((g * way).sum()) == pytest.approx((ends[0] - ends[1]) / 2e-6, rel=1e-6)
+
+
+@pytest.mark.parametrize("time", [4.0, 4.2])
+def test_derivatives_of_long_flows_of_modes_do_not_underflow(time):
+    """Of e^{−2t/r²}x on spheres, by modes whose e^{−λt} float32 has no digits for."""
+    x, faces = Sphere().mesh(1000)
+    moved = LaplaceBeltrami.from_mesh(x.clone().requires_grad_(), faces)
+    warmth = heat_flow(moved, x, time, method="spectral", k=25).square().sum()
+    (g,) = torch.autograd.grad(warmth, moved.points)
+    torch.testing.assert_close((g * x).sum(), 8 * time * warmth, rtol=1e-3, atol=0.0)

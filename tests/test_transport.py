@@ -1,5 +1,6 @@
 """Transport of tangent vectors, the logarithmic map, curl, the Helmholtz–Hodge decomposition."""
 
+import numpy as np
 import pytest
 import torch
 from scipy.spatial import Delaunay
@@ -207,3 +208,32 @@ def test_bad_input_is_refused(sphere):
     batch = LaplaceBeltrami.batch([sphere, sphere])
     with pytest.raises(InputError, match="unbatch"):
         hodge_decomposition(batch, batch.points)
+
+
+def test_vectors_stay_as_they_are_in_flat_spaces():
+    """On random triangles and tetrahedra; with two sources that of the nearest one."""
+    rng = np.random.default_rng(0)
+    for dim, count in ((2, 300), (3, 400)):
+        points = rng.uniform(size=(count, dim))
+        cells = Delaunay(points).simplices
+        sides = points[cells[:, 1:]] - points[cells[:, :1]]
+        lb = LaplaceBeltrami.from_mesh(points, cells[np.abs(np.linalg.det(sides)) > 1e-6])
+        given = torch.randn(2, dim, dtype=torch.float64)
+        for method in (None, "heat"):
+            one = parallel_transport(lb, 5, given[0], method=method)
+            torch.testing.assert_close(one, given[:1].expand(count, -1))
+            both = parallel_transport(lb, [5, 9], given, method=method)
+            nearest = geodesic_distance(lb, [5, 9], each=True).argmin(1)
+            torch.testing.assert_close(both, given[nearest])
+
+
+def test_heat_that_may_reverse_vectors_is_told():
+    """On random triangles in a plane of space, the exact result is the vector itself."""
+    points = np.random.default_rng(0).uniform(size=(1500, 2))
+    faces, space = Delaunay(points).simplices, np.pad(points, ((0, 0), (0, 1)))
+    lb, axis = LaplaceBeltrami.from_mesh(space, faces), torch.eye(3, dtype=torch.float64)[0]
+    with pytest.warns(UserWarning, match="a step of heat from the sources is not positive"):
+        moved = parallel_transport(lb, 400, axis, method="heat")
+    reversed_ = moved[:, 0] < 0
+    assert 0 < reversed_.sum() < 20
+    assert parallel_transport(lb, 400, axis, method="paths")[:, 0].min() > 0.99

@@ -33,7 +33,7 @@ class LearnedTimes(nn.Module):
         if not 0 < init_time < math.inf:
             raise InputError(f"init_time: expected a positive time, got {init_time}")
         self.channels = channels
-        self.raw_time = nn.Parameter(raw_of_time(torch.full((channels,), init_time)))
+        self.raw_time = nn.Parameter(raw_of_time(torch.full((channels,), float(init_time))))
 
     @property
     def time(self) -> Float[Tensor, " C"]:

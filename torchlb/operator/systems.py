@@ -174,8 +174,10 @@ class PairSystem:
             return x - known @ (left.T @ x)
 
         b = self.inside(b - left @ (known.T @ b))
-        x, _ = conjugate_gradients(partial(self._product, terms), b * time / unit, precondition)
-        return x
+        size = b.norm(dim=0).clamp_min(TINY)
+        right = b / size * (time / unit)
+        x, _ = conjugate_gradients(partial(self._product, terms), right, precondition)
+        return x * size
 
     def mass_product(self, x: Float[Tensor, "N C"]) -> Float[Tensor, "N C"]:
         """M x, in float64."""

@@ -102,7 +102,8 @@ def smooth(
     """f smoothed along the surface by a Gaussian of a given full width at half maximum; differentiable in f.
 
     `heat_flow` for the time t = σ²/2, where σ = fwhm/√(8 ln 2); in the plane it is the convolution with the Gaussian of
-    standard deviation σ. A width of less than two edges is not resolved. Errors are those of `heat_flow`.
+    standard deviation σ. A width of less than four edges is not resolved: the weights have both signs then, and values
+    may leave the range of f, most of all within a mask of single points. Errors are those of `heat_flow`.
 
     Parameters
     ----------

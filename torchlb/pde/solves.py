@@ -11,7 +11,7 @@ from torch import Tensor
 from torchlb.errors import InputError
 from torchlb.galerkin.forms import BilinearForm
 from torchlb.linalg.checks import check_finite, takes_arrays
-from torchlb.linalg.csr import shaped_like, side_by_side
+from torchlb.linalg.csr import shaped_like, side_by_side, tensors_of
 from torchlb.linalg.once import once_differentiable
 from torchlb.linalg.precision import SINGLE
 from torchlb.linalg.sparse import compute_dtype, symmetric_product
@@ -60,7 +60,7 @@ def implicit_step(
         smoothly to them.
     conductivity
         κ > 0 of u − t div(κ∇u) = f, at the vertices (N,), its logarithm prolonged as the surface is, or on the faces
-        (F,), if F ≠ N; 1 by default. Of one shape; the solution is differentiable in it, too.
+        (F,), if F ≠ N; by default that of the medium, or 1. Of one shape; the solution is differentiable in it, too.
     tolerance
         Relative tolerance of the solver.
 
@@ -90,8 +90,9 @@ def poisson_solve(
 ) -> Tensor:
     """u with −Δu = f; differentiable in f and the boundary's data. Units of f by ℓ².
 
-    Ku = Mf + B·flux. On a component without a Dirichlet or Robin condition u has mean zero, and the data are made
-    compatible: the total of f and flux is subtracted from f, evenly. Arguments and errors as for `implicit_step`.
+    Ku = Mf + B·flux; in a medium −div(A∇u) + cu = ρf. On a component without a Dirichlet or Robin condition u has mean
+    zero, and the data are made compatible: the total of f and flux is subtracted from f, evenly. Arguments and errors
+    as for `implicit_step`.
 
     Examples
     --------
@@ -189,8 +190,9 @@ def potential(
 ) -> Float[Tensor, "*B N C"]:
     """u with −Δu = s − ∇·v for a tangent field v, given in the frames, and a source s; differentiable.
 
-    Ku = Σ_c G_cᵀ(π v_c) + π s, where G are the rows of the gradient and π is the mass. u has mean zero where no
-    condition holds it. For a field alone, ∇u is closest to it; for v = ∇f, u is f less its mean, up to the order.
+    Ku = Σ_c G_cᵀ(π v_c) + π s, where G are the rows of the gradient and π is the mass, for s with the density of a
+    medium. u has mean zero where no condition holds it. For a field alone, ∇u is closest to it; for v = ∇f, u is f less
+    its mean, up to the order.
 
     Fields are (N, d, C) or (B, N, d, C), as `lb.local_gradient` gives them, sources (N, C) or (B, N, C), less their
     means; without a field it is None. The tolerance is that of the weak pair's solve, or "P1".
@@ -199,7 +201,8 @@ def potential(
         check_tolerance(tolerance)
     products = []
     if source is not None:
-        products.append(lb.mass.to(source.dtype)[:, None] * source)
+        mass = lb.product("mass", torch.ones_like(lb.mass)) if lb._in_medium else lb.mass
+        products.append(mass.to(source.dtype)[:, None] * source)
     if field is not None:
         weighted = lb.mass.to(field.dtype)[:, None, None] * field
         products += [
@@ -219,14 +222,15 @@ def potential(
 
 
 def _with_conductivity(lb: PairMethods, conductivity: Tensor | None) -> PairMethods:
-    """The operator with this conductivity, if any."""
+    """The operator with this conductivity, if any, in place of that of its medium."""
     if conductivity is None:
         return lb
     if not isinstance(lb, LaplaceBeltrami):
         raise InputError(
             "conductivity: tangent fields have that of their operator, lb.with_medium(κ).connection"
         )
-    return lb.with_medium(conductivity=conductivity)
+    others = tensors_of(lb._known_medium) | {"conductivity": conductivity}
+    return lb.with_medium(**others)
 
 
 def _data(lb: PairMethods, data: Tensor | float | None, kind: int, f: Tensor) -> Tensor | None:

@@ -11,7 +11,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from torchlb.errors import InputError
+from torchlb.errors import InputError, first_few, warn
 from torchlb.geometry.complex import edges_of
 from torchlb.linalg.checks import (
     check_choice,
@@ -89,8 +89,9 @@ def parallel_transport(
         arrives in that of the gradient of `geodesic_distance`. On smooth surfaces it is of second order. It is for
         oriented surfaces in space with triangles. "heat": the vector heat method (Sharp, Soliman, Crane 2019), for all
         shapes. The direction is that of an implicit step of the connection Laplacian, the length the ratio of two
-        steps of functions. It mixes paths, and is of first order, but differentiable in points and medium. By default
-        "paths" for such surfaces without a medium or points that require gradients, else "heat".
+        steps of functions. It mixes paths, and is of first order, but differentiable in points and medium; a warning
+        names the points where the step is not positive. By default "paths" for such surfaces without a medium or points
+        that require gradients, else "heat". In the plane and in solids vectors stay as they are.
 
     Differentiable in the vectors. Zero where no path leads to a source. Raises InputError for indices out of range,
     vectors of other shapes, and a method that is not for this shape.
@@ -121,10 +122,12 @@ def _transport(lb: Any, method: Transport | None) -> Any:
     """The transport of components by a method, or the default one."""
     if method is not None:
         check_choice("method", method, Transport)
+    elif lb.dim == lb.points.shape[1]:
+        return _in_flat_space
     elif lb._in_medium or lb._carries or lb.points.requires_grad:
         method = "heat"
     if method == "heat":
-        return _by_heat
+        return _by_heat if lb.dim < lb.points.shape[1] else _in_flat_space
     in_space = lb.dim == 2 and len(lb.normals) > 0 and len(lb.faces) > 0
     if in_space and not edges_of(lb.faces.cpu().numpy(), lb.num_points).against.any():
         return _by_paths
@@ -151,20 +154,35 @@ def _by_paths(lb: Any, index: Tensor, local: Float[Tensor, "S 2 C"]) -> Float[Te
 
 
 def _by_heat(lb: Any, index: Tensor, local: Float[Tensor, "S d C"]) -> Float[Tensor, "N d C"]:
-    """Components by steps of heat, one of the fields and, for several sources, one of the lengths."""
+    """Components by steps of heat, one of the fields and one of one and of the lengths."""
     count, dim, width = lb.num_points, *local.shape[1:]
+    distance = geodesic_distance(lb, index)
+    t, size = _time(lb, distance), local.norm(dim=1)
+    spread = size.new_zeros(count, 1 + width)
+    spread = spread.index_add(0, index, torch.cat([torch.ones_like(size[:, :1]), size], 1))
+    reached = _step(lb, spread, t)
+    cold = ((reached[:, 0] <= 0) & distance.isfinite()).nonzero()[:, 0]
+    if len(cold):
+        warn(
+            f"parallel_transport: at {len(cold)} points ({first_few(cold)}) a step of heat from the sources is not "
+            'positive, as on coarse meshes, and vectors may be reversed there; method="paths", where it is possible, '
+            "takes no such step"
+        )
     start = local.new_zeros(count, dim, width).index_add(0, index, local)
-    t = _time(lb, geodesic_distance(lb, index))
     moved = _step(lb.connection, start.flatten(0, 1), t).unflatten(0, (count, dim))
-    size = local.norm(dim=1)
     lengths = size.amin(0).expand(count, -1)
     if len(index) > 1:
-        spread = size.new_zeros(count, 1 + width)
-        spread = spread.index_add(0, index, torch.cat([torch.ones_like(size[:, :1]), size], 1))
-        reached = _step(lb, spread, t)
         lengths = reached[:, 1:] / reached[:, :1].clamp_min(TINY)
         lengths = lengths.clamp(size.amin(0), size.amax(0))
     return normalize(moved, dim=1, eps=TINY) * lengths[:, None]
+
+
+def _in_flat_space(lb: Any, index: Tensor, local: Float[Tensor, "S d C"]) -> Float[Tensor, "N d C"]:
+    """The vector of the nearest source."""
+    distance = geodesic_distance(lb, index, each=True)
+    vectors = torch.einsum("snd,sdc->snc", lb.frames[index].double(), local)
+    found = torch.einsum("ind,inc->idc", lb.frames.double(), vectors[distance.argmin(1)])
+    return torch.where(distance.amin(1).isfinite()[:, None, None], found, 0.0)
 
 
 def _time(lb: LaplaceBeltrami, distance: Tensor) -> Float[Tensor, ""]:
