@@ -140,31 +140,21 @@ class CenteredFit:
         rows = cardinal(kept, places / self.radius[:, None, None], degree)
         return rows.abs().sum(-1).amax(1)
 
-    def _left(
+    def apart(
         self, heights: Float[Tensor, "B neighbors n"], graph: Float[Tensor, "B M n"]
-    ) -> Float[Tensor, "B neighbors n"]:
-        """Distances √ω (h − V c) of the heights from the polynomials `graph` fitted to them."""
+    ) -> Float[Tensor, "B neighbors"]:
+        """Distances √ω |h − V c| of the heights from the polynomials `graph` fitted to them, ℓ."""
         # a product with few long rows takes half the time of one with few long columns
-        return self.root[..., None] * (heights - (graph.mT @ self.values.mT).mT)
-
-    def misfit(
-        self, heights: Float[Tensor, "B neighbors n"], graph: Float[Tensor, "B M n"]
-    ) -> Float[Tensor, " B"]:
-        """Largest weighted distance of the heights from the polynomials `graph` fitted to them, relative to ρ."""
-        return self._left(heights, graph).norm(dim=-1).amax(1) / self.radius
+        left = heights - (graph.mT @ self.values.mT).mT
+        return self.root * left.norm(dim=-1)
 
     def scatter(
-        self,
-        heights: Float[Tensor, "B neighbors n"],
-        graph: Float[Tensor, "B M n"],
-        coords: Float[Tensor, "B neighbors d"],
+        self, apart: Float[Tensor, "B neighbors"], square: Float[Tensor, "B neighbors"]
     ) -> Float[Tensor, " B"]:
-        """Scatter of the heights about their fit, per degree of freedom, over root mean square distance."""
-        left = self._left(heights, graph)
+        """Scatter of heights, `apart` per degree of freedom, over the root of the mean squared distance `square`."""
         count, terms = self.values.shape[1:]
-        square = coords.norm(dim=-1).square() + heights.norm(dim=-1).square()
-        distance = max(count - terms, 1) / count * (self.root.square() * square).sum(1)
-        return left.flatten(1).norm(dim=1) / distance.sqrt()
+        size = max(count - terms, 1) / count * (self.root.square() * square).sum(1)
+        return apart.norm(dim=1) / size.sqrt()
 
     def weights(
         self,
@@ -177,7 +167,8 @@ class CenteredFit:
         dim, rho = coords.shape[2], self.radius[:, None, None]
         left = none = torch.zeros_like(self.radius)
         if heights is not None:
-            left = self.scatter(heights, self.coefficients @ heights, coords)
+            square = coords.norm(dim=-1).square() + heights.norm(dim=-1).square()
+            left = self.scatter(self.apart(heights, self.coefficients @ heights), square)
         return Weights(
             gradient=weights[..., :dim] / rho,
             laplacian=weights[..., dim] / rho[..., 0].square(),

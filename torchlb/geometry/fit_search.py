@@ -79,14 +79,18 @@ class FitSearch:
             fit, heights, graph = self.fits.fitted(block)
             regular = is_regular(fit, middles[rows], block.degree)
             flat_enough = slope_of(fit, graph, self.fits.initial).square().sum((1, 2)) <= steepest
-            coords = fit.radius[:, None, None] * fit.values[..., : self.neighborhoods.dim]
-            bound = resolution(coords.shape[2], block.degree, on_mesh=self.on_mesh, normals=True)
-            resolved = (fit.scatter(heights, graph, coords) <= bound) | (block.degree == 1)
+            apart, dim = fit.apart(heights, graph), self.neighborhoods.dim
+            flat = fit.radius[:, None] * fit.values[..., :dim].norm(dim=-1)
+            square = flat.square() + heights.square().sum(-1)
+            bound = resolution(dim, block.degree, on_mesh=self.on_mesh, normals=True)
+            resolved = (fit.scatter(apart, square) <= bound) | (block.degree == 1)
             passed = regular & flat_enough & resolved  # false for NaN
             self.order[centers[rows[passed]]] = block.degree
-            self._keep_surface(block, fit, heights, graph, regular, passed)
+            self._keep_surface(block, fit, apart, graph, regular, passed)
             if number == 0 and self.degrees:
-                self._offer(block, fit, heights, graph)
+                self._offer(block, fit, apart, graph)
+            if self.on_mesh:
+                search.settle(rows[regular & ~resolved])
             search.settle(rows[passed])
 
     def finish(self) -> tuple[FitPlan, LocalFits]:
@@ -121,9 +125,7 @@ class FitSearch:
         settings = self.highest, self.jet, self.reach
         return FitPlan(surface, functions, *counts, *settings), self.fits
 
-    def _offer(
-        self, block: Neighborhoods, fit: CenteredFit, heights: Tensor, graph: Tensor
-    ) -> None:
+    def _offer(self, block: Neighborhoods, fit: CenteredFit, apart: Tensor, graph: Tensor) -> None:
         """Try the nearest of these points for functions, by the same fit if it is the first candidate."""
         first = list_candidates(self.neighborhoods.dim, self.degrees)[0]
         size = block.points.shape[1]
@@ -131,22 +133,23 @@ class FitSearch:
             return
         self.tried[block.vertices] = 1
         if (block.degree, size) == (first.degree, first.size):
-            self._keep(block, fit, heights, graph)
+            self._keep(block, fit, apart, graph)
         else:
             self._try(_block(first.degree, block.vertices, block.points[:, : first.size]))
 
     def _try(self, block: Neighborhoods) -> Bool[Tensor, " b"]:
         """Make fits of functions and keep those that pass; return which do."""
-        return self._keep(block, *self.fits.fitted(block))
+        fit, heights, graph = self.fits.fitted(block)
+        return self._keep(block, fit, fit.apart(heights, graph), graph)
 
     def _keep(
-        self, block: Neighborhoods, fit: CenteredFit, heights: Tensor, graph: Tensor
+        self, block: Neighborhoods, fit: CenteredFit, apart: Tensor, graph: Tensor
     ) -> Bool[Tensor, " b"]:
         """Keep the fits of functions that pass; return which do."""
         degree = min(block.degree, self.jet)
         terms = num_monomials(self.neighborhoods.dim, degree) - 1
         regular = is_regular(fit, self.neighborhoods.middles(block.vertices), degree)
-        good = self._keep_surface(block, fit, heights, graph, regular, torch.zeros_like(regular))
+        good = self._keep_surface(block, fit, apart, graph, regular, torch.zeros_like(regular))
         if good.any():
             found, size = block.vertices[good], block.points.shape[1]
             none = torch.zeros(2, len(found), dtype=torch.bool)
@@ -161,7 +164,7 @@ class FitSearch:
         self,
         block: Neighborhoods,
         fit: CenteredFit,
-        heights: Float[Tensor, "b neighbors n"],
+        apart: Float[Tensor, "b neighbors"],
         graph: Float[Tensor, "b M n"],
         regular: Bool[Tensor, " b"],
         frame: Bool[Tensor, " b"],
@@ -171,7 +174,8 @@ class FitSearch:
         new = torch.zeros_like(frame)
         if self.degrees:
             # quadratics are the last resort
-            good = regular & (fit.misfit(heights, graph) <= (ROUGH if fit.degree == 2 else SLIGHT))
+            misfit = apart.amax(1) / fit.radius
+            good = regular & (misfit <= (ROUGH if fit.degree == 2 else SLIGHT))
             vacant = self.surface_degree[vertices] < fit.degree
             if fit.degree == self.highest:
                 reason = torch.where(good, 0, torch.where(regular, 3, IN_ROWS))
