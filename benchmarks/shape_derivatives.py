@@ -20,7 +20,7 @@ from torch import Tensor
 from torchlb import LaplaceBeltrami, read_shape
 from torchlb.surfaces import StarShaped
 
-STEP = 1e-4
+STEP = 1e-6
 
 
 def logarithms(lb: LaplaceBeltrami) -> Tensor:
