@@ -47,12 +47,10 @@ class FitSearch:
         *,
         on_mesh: bool = False,
     ) -> None:
-        self.on_mesh = on_mesh
+        self.on_mesh = on_mesh and frame_degree > 1  # points do not follow planes
         count, self.neighborhoods, self.degrees = len(neighborhoods.points), neighborhoods, degrees
         self.candidates = list_candidates(
-            neighborhoods.dim,
-            range(frame_degree, min(frame_degree, 2) - 1, -1) if frame_degree else (),
-            num_neighbors=num_neighbors,
+            neighborhoods.dim, range(frame_degree, 0, -1), num_neighbors=num_neighbors
         )
         self.highest = max(frame_degree, *degrees, 0) if degrees else 0
         self.jet, self.reach = (1, 0.5) if max(degrees, default=0) <= 3 else (degrees[0], 1.0)
@@ -67,9 +65,8 @@ class FitSearch:
     def refine(self, centers: Int[Tensor, " B"]) -> None:
         """Find the tangent planes at `centers`, and try the same neighbourhoods for fits of functions.
 
-        Each centre takes the first candidate whose fit is regular, tilted by less than 60° and, unless it is a plane,
-        followed by its points as those of a stencil have to follow theirs; else it keeps its initial plane. Planes are
-        no candidates where more is asked for.
+        Each centre takes the first candidate whose fit is regular and tilted by less than 60°. On a mesh it keeps its
+        initial plane where the points do not follow the fit as those of a stencil have to follow theirs.
         """
         middles = self.neighborhoods.middles(centers)
         search = Search(self.neighborhoods, centers, self.candidates)
@@ -79,18 +76,19 @@ class FitSearch:
             fit, heights, graph = self.fits.fitted(block)
             regular = is_regular(fit, middles[rows], block.degree)
             flat_enough = slope_of(fit, graph, self.fits.initial).square().sum((1, 2)) <= steepest
-            apart, dim = fit.apart(heights, graph), self.neighborhoods.dim
-            flat = fit.radius[:, None] * fit.values[..., :dim].norm(dim=-1)
-            square = flat.square() + heights.square().sum(-1)
-            bound = resolution(dim, block.degree, on_mesh=self.on_mesh, normals=True)
-            resolved = (fit.scatter(apart, square) <= bound) | (block.degree == 1)
-            passed = regular & flat_enough & resolved  # false for NaN
+            apart, passed = fit.apart(heights, graph), regular & flat_enough  # false for NaN
+            if self.on_mesh:
+                dim = self.neighborhoods.dim
+                flat = fit.radius[:, None] * fit.values[..., :dim].norm(dim=-1)
+                square = flat.square() + heights.square().sum(-1)
+                bound = resolution(dim, block.degree, on_mesh=True, normals=True)
+                unresolved = regular & (fit.scatter(apart, square) > bound)
+                search.settle(rows[unresolved])
+                passed &= ~unresolved
             self.order[centers[rows[passed]]] = block.degree
             self._keep_surface(block, fit, apart, graph, regular, passed)
             if number == 0 and self.degrees:
                 self._offer(block, fit, apart, graph)
-            if self.on_mesh:
-                search.settle(rows[regular & ~resolved])
             search.settle(rows[passed])
 
     def finish(self) -> tuple[FitPlan, LocalFits]:
