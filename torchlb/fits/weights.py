@@ -149,10 +149,15 @@ class CenteredFit:
         return self.root * left.norm(dim=-1)
 
     def scatter(
-        self, apart: Float[Tensor, "B neighbors"], square: Float[Tensor, "B neighbors"]
+        self, heights: Float[Tensor, "B neighbors n"], apart: Float[Tensor, "B neighbors"], dim: int
     ) -> Float[Tensor, " B"]:
-        """Scatter of heights, `apart` per degree of freedom, over the root of the mean squared distance `square`."""
+        """Scatter of the heights about their fit, of which they are `apart`, over root mean square distance.
+
+        It is per degree of freedom; the first `dim` monomials are the coordinates.
+        """
         count, terms = self.values.shape[1:]
+        flat = self.radius[:, None] * self.values[..., :dim].norm(dim=-1)
+        square = flat.square() + heights.norm(dim=-1).square()
         size = max(count - terms, 1) / count * (self.root.square() * square).sum(1)
         return apart.norm(dim=1) / size.sqrt()
 
@@ -167,8 +172,8 @@ class CenteredFit:
         dim, rho = coords.shape[2], self.radius[:, None, None]
         left = none = torch.zeros_like(self.radius)
         if heights is not None:
-            square = coords.norm(dim=-1).square() + heights.norm(dim=-1).square()
-            left = self.scatter(self.apart(heights, self.coefficients @ heights), square)
+            apart = self.apart(heights, self.coefficients @ heights)
+            left = self.scatter(heights, apart, dim)
         return Weights(
             gradient=weights[..., :dim] / rho,
             laplacian=weights[..., dim] / rho[..., 0].square(),

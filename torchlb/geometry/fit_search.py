@@ -79,10 +79,8 @@ class FitSearch:
             apart, passed = fit.apart(heights, graph), regular & flat_enough  # false for NaN
             if self.on_mesh:
                 dim = self.neighborhoods.dim
-                flat = fit.radius[:, None] * fit.values[..., :dim].norm(dim=-1)
-                square = flat.square() + heights.square().sum(-1)
                 bound = resolution(dim, block.degree, on_mesh=True, normals=True)
-                unresolved = regular & (fit.scatter(apart, square) > bound)
+                unresolved = regular & (fit.scatter(heights, apart, dim) > bound)
                 search.settle(rows[unresolved])
                 passed &= ~unresolved
             self.order[centers[rows[passed]]] = block.degree

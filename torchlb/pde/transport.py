@@ -122,12 +122,12 @@ def _transport(lb: Any, method: Transport | None) -> Any:
     """The transport of components by a method, or the default one."""
     if method is not None:
         check_choice("method", method, Transport)
-    elif lb.dim == lb.points.shape[1]:
+    if lb.dim == lb.points.shape[1] and method != "paths":
         return _in_flat_space
-    elif lb._in_medium or lb._carries or lb.points.requires_grad:
+    if method is None and (lb._in_medium or lb._carries or lb.points.requires_grad):
         method = "heat"
     if method == "heat":
-        return _by_heat if lb.dim < lb.points.shape[1] else _in_flat_space
+        return _by_heat
     in_space = lb.dim == 2 and len(lb.normals) > 0 and len(lb.faces) > 0
     if in_space and not edges_of(lb.faces.cpu().numpy(), lb.num_points).against.any():
         return _by_paths
@@ -154,12 +154,14 @@ def _by_paths(lb: Any, index: Tensor, local: Float[Tensor, "S 2 C"]) -> Float[Te
 
 
 def _by_heat(lb: Any, index: Tensor, local: Float[Tensor, "S d C"]) -> Float[Tensor, "N d C"]:
-    """Components by steps of heat, one of the fields and one of one and of the lengths."""
+    """Components by steps of heat, one of the fields and one of ones at the sources; of several also of lengths."""
     count, dim, width = lb.num_points, *local.shape[1:]
     distance = geodesic_distance(lb, index)
     t, size = _time(lb, distance), local.norm(dim=1)
-    spread = size.new_zeros(count, 1 + width)
-    spread = spread.index_add(0, index, torch.cat([torch.ones_like(size[:, :1]), size], 1))
+    marks = torch.ones_like(size[:, :1])
+    if len(index) > 1:
+        marks = torch.cat([marks, size], 1)
+    spread = size.new_zeros(count, marks.shape[1]).index_add(0, index, marks)
     reached = _step(lb, spread, t)
     cold = ((reached[:, 0] <= 0) & distance.isfinite()).nonzero()[:, 0]
     if len(cold):
