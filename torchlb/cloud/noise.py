@@ -13,8 +13,8 @@ from scipy.spatial import KDTree
 
 from torchlb.cloud.frames import local_polynomials
 from torchlb.fits.polynomials import num_monomials
-from torchlb.geometry.thresholds import AROUND, RING, ROUGH
-from torchlb.geometry.vectors import Frames, Mask, Near, Points, Vectors, inner, lengths
+from torchlb.geometry.thresholds import AROUND, KINK, RING, ROUGH
+from torchlb.geometry.vectors import Frames, Mask, Near, Points, Vectors, inner, lengths, unit
 from torchlb.linalg.precision import AT_ONCE, NEGLIGIBLE
 
 SMOOTH = 4.0
@@ -69,8 +69,10 @@ def spacing_at(
 def lone_points(points: Vectors, near: Int[np.ndarray, "N K"]) -> Mask:
     """Points with a far larger spacing than their neighbours, off the plane of these, and in none with their like.
 
-    Others such as they do not tilt the plane, as the second of two that hang beside each other would.
-    At a jump in density half a disc of twice the spacing holds twelve other points of a like spacing.
+    Others such as they do not tilt the plane, as the second of two that hang beside each other would. Points that see
+    all neighbours in one direction may lie in it, as past the end of a limb: at the edge of a denser part neighbours
+    spread along the edge. At a jump in density half a disc of twice the spacing holds twelve other points of a like
+    spacing. Of many outliers some lie in one plane by chance, but most of their like are lone, too.
     """
     lone = np.zeros(len(points), dtype=bool)
     spacing = spacing_at(points, near)
@@ -85,20 +87,35 @@ def lone_points(points: Vectors, near: Int[np.ndarray, "N K"]) -> Mask:
     offset = kept * (around - middle[:, None])
     normal = np.linalg.svd(offset, full_matrices=False)[2][:, 2]
     above = points[far] - middle
-    lone[far] = np.abs(inner(above, normal)) > HIGH * lengths(above)
-    octave = np.floor(np.log2(spacing[far]))
-    for scale in np.unique(octave):
-        alike = points[spacing >= 2.0 ** (scale - 1)]
-        if len(alike) > RING:
-            own = far[octave == scale]
-            found = KDTree(alike).query(points[own], k=RING + 1)
-            distance, mates = (np.asarray(part) for part in found)
-            offset = alike[mates[:, 1:]] - points[own, None]
-            offset = np.concatenate([0 * offset[:, :1], offset], 1)
-            offset -= offset.mean(1, keepdims=True)
-            _, middle, least = np.linalg.svd(offset, compute_uv=False).T
-            lone[own] &= (least >= ROUGH * middle) | (distance[:, -1] > 2 * spacing[own])
+    away = unit(points[far, None] - around)
+    narrow = inner(away, unit(above)[:, None]).min(1, where=kept[..., 0], initial=1.0) > KINK
+    left = far[narrow | (np.abs(inner(above, normal)) > HIGH * lengths(above))]
+    mates = _mates_in_a_sheet(points, spacing, left)
+    found = (mates == left[:, None]).all(1)
+    while found.any():
+        lone[left[found]] = True
+        left, mates = left[~found], mates[~found]
+        found = lone[mates].mean(1) > 0.5
     return lone
+
+
+def _mates_in_a_sheet(
+    points: Vectors, spacing: Float[np.ndarray, " N"], some: Int[np.ndarray, " M"]
+) -> Int[np.ndarray, "M K"]:
+    """The nearest points of at least half the spacing of each of some, if all lie on one sheet, else itself alone."""
+    mates = some[:, None].repeat(RING, axis=1)
+    octave = np.floor(np.log2(spacing[some]))
+    for scale in np.unique(octave):
+        alike, own = np.flatnonzero(spacing >= 2.0 ** (scale - 1)), np.flatnonzero(octave == scale)
+        if len(alike) <= RING:
+            continue
+        found = KDTree(points[alike]).query(points[some[own]], k=RING + 1)
+        distance, near = np.asarray(found[0])[:, -1], alike[np.asarray(found[1])]
+        offset = points[near] - points[near].mean(1, keepdims=True)
+        _, middle, least = np.linalg.svd(offset, compute_uv=False).T
+        sheet = (least < ROUGH * middle) & (distance <= 2 * spacing[some[own]])
+        mates[own[sheet]] = near[sheet, 1:]
+    return mates
 
 
 def put_beside(points: Vectors, lone: Mask) -> Vectors:
