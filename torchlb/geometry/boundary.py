@@ -24,7 +24,7 @@ from torchlb.geometry.local_fits import FitPlan, LocalFits
 from torchlb.geometry.neighbors import GraphNeighborhoods, mesh_graph
 from torchlb.geometry.thresholds import CREASE, KINK
 from torchlb.geometry.vectors import Frames, Points
-from torchlb.linalg.precision import TINY
+from torchlb.linalg.precision import SMALL, TINY
 
 
 @dataclass(frozen=True)
@@ -136,6 +136,25 @@ def outer_faces(points: Points, cells: Int[Tensor, "F 4"]) -> Int[Tensor, "G 3"]
     a, b, c = points[sides].unbind(1)
     turned = (torch.linalg.cross(b - a, c - a) * (points[opposite] - a)).sum(1) > 0
     return torch.where(turned[:, None], sides.flip(1), sides)
+
+
+def folded_sides(points: Points, cells: Int[Tensor, "F 4"]) -> Int[Tensor, "G 3"]:
+    """Boundary triangles of tetrahedra that lie on another: at an edge both are in one half-plane."""
+    sides, _ = open_sides(cells)
+    ends = sides[:, [[1, 2], [0, 2], [0, 1]]]
+    start, stop = points[ends].unbind(2)
+    along, inward = normalize(stop - start, dim=-1), points[sides] - start
+    away = normalize(inward - (inward * along).sum(-1, keepdim=True) * along, dim=-1).flatten(0, 1)
+    key, order = (ends[..., 0] * len(points) + ends[..., 1]).flatten().sort()
+    folded = torch.zeros_like(key, dtype=torch.bool)
+    for shift in range(1, len(key)):
+        one, two = order[:-shift], order[shift:]
+        same = key[:-shift] == key[shift:]
+        if not same.any():
+            break
+        on = same & ((away[one] - away[two]).norm(dim=1) < SMALL)
+        folded[one[on]] = folded[two[on]] = True
+    return sides[folded.view(-1, 3).any(1)]
 
 
 def boundary_of_mesh(

@@ -12,6 +12,7 @@ from scipy.spatial import KDTree
 from torch import Tensor
 
 from torchlb.errors import InputError, InputTypeError, first_few, warn
+from torchlb.geometry.boundary import folded_sides
 from torchlb.geometry.vectors import Points
 from torchlb.linalg.precision import NEGLIGIBLE, ROUNDING, SMALL
 from torchlb.operator.cleaning import (
@@ -136,6 +137,13 @@ def mended_faces(vertices: Points, faces: Int[Tensor, "F v"]) -> Int[Tensor, "G 
             warn(
                 f"faces: {len(none)} tetrahedra have no volume ({first_few(none)}) and count for nothing; that is "
                 "right of slivers between others, as Delaunay's of a grid"
+            )
+        within = folded_sides(vertices, faces).unique()
+        if len(within):
+            warn(
+                f"faces: at {len(within)} vertices ({first_few(within)}) sides of tetrahedra lie on one another, not "
+                "one and the same, as where slivers between them were removed: they are a boundary within, where "
+                "conditions and boundary data hold, too. Keep the slivers, which count for nothing"
             )
     first = first_of_each(faces)
     if not first.all():

@@ -257,7 +257,7 @@ class LaplaceBeltrami(StencilMethods, PairMethods):
     def at(self, points: ArrayLike) -> LaplaceBeltrami:
         """The operator of the shape moved to other points, by the same decisions: neighbours, degrees, cells.
 
-        Takes some two thirds of the time of a build. It is meant for points that moved a little, as in an animation or
+        Takes about half the time of a build. It is meant for points that moved a little, as in an animation or
         a flow; for others the decisions may not fit, and `from_mesh` or `from_points` makes new ones.
 
         Parameters
