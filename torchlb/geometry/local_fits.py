@@ -77,6 +77,8 @@ class FitPlan:
 class LocalFits:
     """Tangent planes (`frames`), graphs and coefficients of the fits at given points, over the `initial` frames.
 
+    `second`, (N, d, d, n), 1/ℓ, are second derivatives of the graphs that gave the tangent planes, as vectors, zero for
+    planes of degree 0 and 1.
     `heights`, (N, M − 1, n), ℓ, are graphs of the surface up to a degree, as vectors, zero beyond the monomials of a
     fit; `surface_radius` and `radius`, (N,), ℓ, are radii of the fits of heights and of functions; `coefficients` those
     of functions, in the order of `FitPlan.functions`, as in `CenteredFit`.
@@ -87,6 +89,7 @@ class LocalFits:
         terms = num_monomials(initial.shape[2], degree) - 1
         self.heights = points.new_zeros(len(points), terms, points.shape[1])
         self.surface_radius, self.radius = (points.new_ones(len(points)) for _ in range(2))
+        self.second = points.new_zeros(len(points), *2 * initial.shape[2:], points.shape[1])
         self.coefficients: list[Tensor] = []
 
     @classmethod
@@ -109,7 +112,8 @@ class LocalFits:
 
     def let_go(self) -> None:
         """Release the graphs and the fits of functions, which are not needed once there is a pair."""
-        self.heights, self.coefficients = self.heights[:0].clone(), []
+        self.heights, self.second = self.heights[:0].clone(), self.second[:0].clone()
+        self.coefficients = []
 
     def fit(self, block: Neighborhoods) -> tuple[CenteredFit, Tensor, Tensor]:
         """Fit polynomials around some vertices; return the fits, and offsets and coordinates of the neighbours.
@@ -141,6 +145,8 @@ class LocalFits:
             slope = slope_of(fit, graph, self.initial)[on].mT
             tilted = at(self.initial, block.vertices[on]) + slope
             self.frames[block.vertices[on]] = orthonormalized(tilted)
+            if block.degree > 1:
+                self.second[block.vertices[on]] = second_of(fit, graph, tilted.shape[2])[on]
         on = block.surface
         if on.any():
             self.heights[block.vertices[on], : graph.shape[1]] = graph[on]
@@ -152,3 +158,14 @@ def slope_of(
 ) -> Float[Tensor, "b d n"]:
     """First derivatives of the fitted heights, vectors in the normal space."""
     return graph[:, : frames.shape[2]] / fit.radius[:, None, None]
+
+
+def second_of(
+    fit: CenteredFit, graph: Float[Tensor, "b M n"], dim: int
+) -> Float[Tensor, "b d d n"]:
+    """Second derivatives of the fitted heights, vectors in the normal space."""
+    row, column = torch.triu_indices(dim, dim)
+    found = graph.new_zeros(len(graph), dim, dim, graph.shape[2])
+    terms = graph[:, dim : dim + len(row)] / fit.radius[:, None, None] ** 2
+    found[:, row, column] = terms
+    return found + found.transpose(1, 2)

@@ -60,6 +60,7 @@ class LaplaceBeltramiTransform(BaseTransform):
     lb_frames          (N, n, d)    orthonormal tangent vectors
     lb_pos             (N, n)       the points, by which `to_operator` detects a change of `pos`
     lb_normals         (N, n)       unit normals of a hypersurface
+    lb_shape_operators (N, d, d)    its curvatures, 1/ℓ, in the frames
     lb_face_index      (d + 1, F)   faces of the mesh, or of the surface through the cloud; F = 0 for other clouds
     lb_boundary        (N,)         mask of the points where the boundary condition holds; all False on a closed shape
     lb_weak_index      (2, nnz)     [j; i] of every entry of the weak pair, none where there is no pair
@@ -171,7 +172,7 @@ def _keys(lb: LaplaceBeltrami, k: int) -> dict[str, Any]:
         "lb_info": json.dumps(lb.get_extra_state()),
     }
     if len(lb.normals):
-        keys["lb_normals"] = lb.normals
+        keys |= {"lb_normals": lb.normals, "lb_shape_operators": lb._shape_operators}
     kind = kind_of(lb.options.get("condition"))
     width = 3 if kind.conserves or kind.fixes else 4  # the same for every shape with this condition
     for name, pair in {"stencil": lb.stencil, "weak": lb.weak, "linear": lb.weak.near}.items():
@@ -224,6 +225,7 @@ def _parts(data: Any, sizes: Int[Tensor, " S"]) -> dict[str, Any]:
         "points": points,
         "frames": data.lb_frames,
         "normals": data.get("lb_normals", points[:0]),
+        "_shape_operators": data.get("lb_shape_operators", points[:0]),
         "_on_boundary": boundary[: None if boundary.any() else 0],
         "faces": data.lb_face_index.T,
     }

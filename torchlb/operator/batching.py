@@ -14,8 +14,8 @@ from torchlb.linalg.csr import Csr, Record, starts, tensors_of
 from torchlb.operator.storage import OperatorStorage
 
 Parts = dict[str, Any]
-BY_POINT = ("mass", "points", "frames", "normals", "_on_boundary")
-"""Tensors with a row for each point; normals, and the mask of the boundary, are empty where there are none."""
+BY_POINT = ("mass", "points", "frames", "normals", "_shape_operators", "_on_boundary")
+"""Tensors with a row for each point; some are empty: normals, shape operators, the mask of the boundary."""
 
 
 def check_alike(shapes: Sequence[OperatorStorage]) -> None:

@@ -129,22 +129,7 @@ def mended_faces(vertices: Points, faces: Int[Tensor, "F v"]) -> Int[Tensor, "G 
                 "vertex of the two with vertices, faces, kept = torchlb.clean_mesh(vertices, faces, merge=True)"
             )
     if faces.shape[1] == 4:
-        edges = vertices[faces[:, 1:]] - vertices[faces[:, :1]]
-        longest = (vertices[faces[:, None]] - vertices[faces[:, :, None]]).norm(dim=-1).amax((1, 2))
-        flat = torch.linalg.svdvals(edges)[:, :3].prod(1) <= NEGLIGIBLE * longest**3
-        if flat.any():
-            none = flat.nonzero()[:, 0]
-            warn(
-                f"faces: {len(none)} tetrahedra have no volume ({first_few(none)}) and count for nothing; that is "
-                "right of slivers between others, as Delaunay's of a grid"
-            )
-        within = folded_sides(vertices, faces).unique()
-        if len(within):
-            warn(
-                f"faces: at {len(within)} vertices ({first_few(within)}) sides of tetrahedra lie on one another, not "
-                "one and the same, as where slivers between them were removed: they are a boundary within, where "
-                "conditions and boundary data hold, too. Keep the slivers, which count for nothing"
-            )
+        _warn_of_flat_tetrahedra(vertices, faces)
     first = first_of_each(faces)
     if not first.all():
         again = (~first).nonzero()[:, 0]
@@ -169,6 +154,26 @@ def mended_faces(vertices: Points, faces: Int[Tensor, "F v"]) -> Int[Tensor, "G 
             "if it should not be, merge them: vertices, faces, kept = torchlb.clean_mesh(vertices, faces, merge=True)"
         )
     return faces
+
+
+def _warn_of_flat_tetrahedra(vertices: Points, faces: Int[Tensor, "F 4"]) -> None:
+    """Warn of tetrahedra without volume, and of what is left of them where they were removed."""
+    edges = vertices[faces[:, 1:]] - vertices[faces[:, :1]]
+    longest = (vertices[faces[:, None]] - vertices[faces[:, :, None]]).norm(dim=-1).amax((1, 2))
+    flat = torch.linalg.svdvals(edges)[:, :3].prod(1) <= NEGLIGIBLE * longest**3
+    if flat.any():
+        none = flat.nonzero()[:, 0]
+        warn(
+            f"faces: {len(none)} tetrahedra have no volume ({first_few(none)}) and count for nothing; that is "
+            "right of slivers between others, as Delaunay's of a grid"
+        )
+    within = folded_sides(vertices, faces).unique()
+    if len(within):
+        warn(
+            f"faces: at {len(within)} vertices ({first_few(within)}) sides of tetrahedra lie on one another, not "
+            "one and the same, as where slivers between them were removed: they are a boundary within, where "
+            "conditions and boundary data hold, too. Keep the slivers, which count for nothing"
+        )
 
 
 def check_faces(faces: ArrayLike, num_points: int) -> Int[Tensor, "F v"]:

@@ -31,7 +31,7 @@ from torchlb.galerkin.tangent import in_space
 from torchlb.geometry.boundary import BoundaryPlan
 from torchlb.geometry.local_fits import FitPlan, Neighborhoods
 from torchlb.geometry.numbering import Numbering
-from torchlb.geometry.thresholds import FACTOR
+from torchlb.geometry.thresholds import CREASE, FACTOR
 from torchlb.geometry.vectors import Points
 from torchlb.linalg.csr import Csr, Record
 from torchlb.linalg.threads import threads_for
@@ -129,14 +129,16 @@ class Plan:
         return creased_cells(points, self.pair.curving.nodes.faces, self.pair.fits.functions)
 
     def rows_at(self, points: Points, mass: Float[Tensor, " N"]) -> list[Tensor]:
-        """Values of Δ and of the derivatives in the frames, (1 + d, nnz), frames and normals, if there are any.
+        """Values of Δ and of the derivatives in the frames, (1 + d, nnz), frames; normals and shape operators, if any.
 
         Differentiable in points and mass, but for a turn of each frame in its plane.
         """
         placed, _ = self.shape.at(self._sorted(points))
         rows, _ = self._rows(placed, self.numbering.sorted(mass))
+        found = [placed.frames]
+        if placed.normals is not None:
+            found += [placed.normals, shape_operators(placed, rows, self.shape.fits.order)]
         rows = rows.restored(self.numbering)
-        found = [placed.frames, *([] if placed.normals is None else [placed.normals])]
         values = torch.cat([rows.laplacian[None], rows.gradient.T])
         return [values, *(self.numbering.restored(each) for each in found)]
 
@@ -184,7 +186,10 @@ def operator_parts(
 ) -> Parts:
     """What an operator stores, from rows and a shape in the order of the plan; points and pair are in the user's."""
     numbering, options = plan.numbering, plan.options
-    given, rows = numbering.restored, rows.restored(numbering)
+    given, bending = numbering.restored, points.new_zeros(0, 0, 0)
+    if shape.normals is not None:
+        bending = given(shape_operators(shape, rows, shape.normal_order))
+    rows = rows.restored(numbering)
     counts = rows.length.new_zeros(4, len(points))
     counts = counts if plan.pair is None else plan.pair.counts[:, numbering.here]
     report = {"num_neighbors": rows.length, "normal_order": given(shape.normal_order)}
@@ -199,6 +204,7 @@ def operator_parts(
         "mass": given(shape.areas),
         "frames": given(shape.frames),
         "normals": points[:0] if shape.normals is None else given(shape.normals),
+        "_shape_operators": bending,
         "stencil": Csr.with_transpose(rows.crow, rows.col, values),
         "_record": Record({name: report[name] for name in FIELDS}),
     }
@@ -212,6 +218,23 @@ def operator_parts(
             )
         parts["weak"] = pair
     return parts
+
+
+def shape_operators(placed: Placed, rows: Rows, order: Int[Tensor, " N"]) -> Float[Tensor, "N d d"]:
+    """Those of the fits; where these are of an order below 2, derivatives of the normals by the rows of ∇."""
+    found, normals = placed.shape_operators, placed.normals
+    assert found is not None
+    assert normals is not None
+    rough = order < 2
+    if not rough.any():
+        return found
+    # a neighbour's normal on the side of that of the row: surfaces without sides have curvatures, too
+    opposed = (normals[rows.row] * normals[rows.col]).sum(1) < -CREASE
+    near = torch.where(opposed[:, None], -normals[rows.col], normals[rows.col])
+    slopes = normals.new_zeros(*normals.shape, found.shape[1])
+    slopes = slopes.index_add(0, rows.row, near[..., None] * rows.gradient[:, None])
+    own = placed.frames.mT @ slopes
+    return torch.where(rough[:, None, None], (own + own.mT) / 2, found)
 
 
 def check_fit(plan: Plan, after: Points) -> None:

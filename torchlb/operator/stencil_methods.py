@@ -10,10 +10,8 @@ from torch import Tensor
 
 from torchlb.errors import InputError
 from torchlb.geometry.boundary import boundary_faces
-from torchlb.geometry.thresholds import CREASE
 from torchlb.linalg.checks import check_tensor, takes_arrays
 from torchlb.linalg.csr import tensors_of
-from torchlb.linalg.sparse import csr_product
 from torchlb.operator.report import StencilReport
 from torchlb.operator.storage import OperatorStorage
 
@@ -201,9 +199,10 @@ class StencilMethods(OperatorStorage):
     def curvatures(self) -> Curvatures:
         """Principal, mean and Gaussian curvature of a surface in R³, of the order p of the operator.
 
-        They are those of the derivative of the normals by the rows of ∇, on meshes and clouds; at low-order rows
-        (`report`) of first order at best. Signs are those of the normals: positive on a sphere with outer ones.
-        Differentiable in the points. Raises InputError for other shapes.
+        They are those of the polynomial that gives the normal (osculating jets; Cazals, Pouget 2005), on meshes and
+        clouds. Where the points do not resolve it, and for the cotangent operator, they are those of the derivative of
+        the normals by the rows of ∇, of first order at best. Signs are those of the normals: positive on a sphere with
+        outer ones. Differentiable in the points. Raises InputError for other shapes.
 
         >>> from torchlb.surfaces import Sphere
         >>> from torchlb import LaplaceBeltrami
@@ -212,15 +211,7 @@ class StencilMethods(OperatorStorage):
         True
         """
         check_surface(self, "curvatures")
-        stencil, normals = self.stencil, self.normals
-        # a neighbour's normal on the side of that of the row: surfaces without sides have curvatures, too
-        opposed = (normals[stencil.row] * normals[stencil.col]).sum(1) < -CREASE
-        sign = torch.where(opposed, -1.0, 1.0).to(normals.dtype)
-        slopes = [
-            csr_product(stencil.pattern, v * sign, normals, False) for v in stencil.values[1:]
-        ]
-        own = self.frames.mT @ torch.stack(slopes, 2)
-        return Curvatures((own + own.mT) / 2, self.frames)
+        return Curvatures(self._shape_operators, self.frames)
 
     def _boundary_points(self) -> Bool[Tensor, " N"]:
         """Mask of the boundary points, whether or not a condition holds there."""

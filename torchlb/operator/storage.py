@@ -40,6 +40,7 @@ class OperatorStorage(Tensors):
     points: Tensor
     frames: Tensor
     normals: Tensor
+    _shape_operators: Tensor
     _on_boundary: Tensor
     faces: Tensor
     stencil: Csr
@@ -50,7 +51,8 @@ class OperatorStorage(Tensors):
 
     def __init__(self) -> None:
         none, whole = torch.zeros(0), torch.zeros(0, dtype=torch.int64)
-        by_point = dict.fromkeys(("mass", "points", "frames", "normals"), none)
+        names = ("mass", "points", "frames", "normals", "_shape_operators")
+        by_point = dict.fromkeys(names, none)
         super().__init__(by_point | {"_on_boundary": whole.bool(), "faces": whole.view(0, 3)})
         self.source = "empty"
         self.options: dict[str, Any] = {}

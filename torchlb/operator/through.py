@@ -227,9 +227,11 @@ def carrying(lb: Any, points: Any) -> Any:
     variables = (
         [own, lb.mass] if lb.weak.near.values[3:4].any() else [own]
     )  # Robin's low-order rows
-    rows = [lb.stencil.values, lb.frames, *([lb.normals] if len(lb.normals) else [])]
-    lb.stencil.values, lb.frames, *normals = _following(rows, of_rows, *variables)
-    lb.normals = normals[0] if normals else lb.normals
+    rows = [lb.stencil.values, lb.frames]
+    rows += [lb.normals, lb._shape_operators] if len(lb.normals) else []
+    lb.stencil.values, lb.frames, *rest = _following(rows, of_rows, *variables)
+    if rest:
+        lb.normals, lb._shape_operators = rest
     return lb
 
 

@@ -33,15 +33,18 @@ from torchlb.stencils.options import Options
 
 @dataclass(frozen=True)
 class Placed:
-    """Points, frames, normals and boundary of a shape.
+    """Points, frames, normals, shape operators and boundary of a shape.
 
     [frames, normal] is right-handed where there is a normal, which hypersurfaces have, oriented by the cells, or
-    consistently on a cloud. There is no boundary of a closed shape, nor where no condition holds.
+    consistently on a cloud. The shape operator, 1/ℓ, is the derivative of the normal along the frames, in the frames,
+    zero where the tangent plane is of degree 0 or 1. There is no boundary of a closed shape, nor where no condition
+    holds.
     """
 
     points: Points
     frames: Frames
     normals: Points | None
+    shape_operators: Float[Tensor, "N d d"] | None
     boundary: Boundary | None
 
 
@@ -64,7 +67,7 @@ class ShapePlan:
     boundary: BoundaryPlan | None
 
     def at(self, points: Points) -> tuple[Placed, LocalFits]:
-        """Frames, normals and boundary at these points, and the fits behind them."""
+        """Frames, normals, shape operators and boundary at these points, and the fits behind them."""
         if self.beside is None:
             places, initial = points, mesh_frames(points, self.cells)
         else:
@@ -74,13 +77,16 @@ class ShapePlan:
         return self.placed(fits), fits
 
     def placed(self, fits: LocalFits) -> Placed:
-        """Frames, normals and boundary from given fits."""
-        reference = None
+        """Frames, normals, shape operators and boundary from given fits."""
+        reference = bending = None
         if self.side is not None:
             reference = self.side[:, None] * vertex_normals(fits.points, self.cells)
         frames, normals = righthanded(fits.frames, reference)
+        if normals is not None:
+            along = fits.initial.mT @ frames
+            bending = along.mT @ -(fits.second @ normals[:, None, :, None])[..., 0] @ along
         boundary = None if self.boundary is None else self.boundary.at(fits.points, frames)
-        return Placed(fits.points, frames, normals, boundary)
+        return Placed(fits.points, frames, normals, bending, boundary)
 
 
 class Beside(NamedTuple):
