@@ -50,5 +50,9 @@ def surfaces_once():
 
 @pytest.fixture
 def unchecked(monkeypatch):
-    """Without the tests' own checks of types: as a user calls it."""
+    """Without the tests' own checks of types: as a user calls it.
+
+    Also for long computations, since a check takes longer than many of the functions in the loops of a solver, which
+    shorter tests call with the same types.
+    """
     monkeypatch.setattr(jaxtyping.config, "jaxtyping_disable", True)
