@@ -183,10 +183,20 @@ def first_eigenvalue(shape, condition):
     return smallest(lb, 2)[int(condition == "neumann")]
 
 
-@pytest.mark.parametrize("shape", [wavy_disk, cut_torus])
-@pytest.mark.parametrize("condition", ["neumann", "dirichlet"])
-@pytest.mark.parametrize("order", [1, 3, 4, 5])
-def test_curved_boundaries(shape, condition, order):
+@pytest.mark.parametrize(
+    ("order", "shape", "condition"),
+    [
+        (1, wavy_disk, "neumann"),
+        (1, cut_torus, "dirichlet"),
+        (3, wavy_disk, "dirichlet"),
+        (3, cut_torus, "neumann"),
+        (4, wavy_disk, "neumann"),
+        (4, cut_torus, "dirichlet"),
+        (5, wavy_disk, "dirichlet"),
+        (5, cut_torus, "neumann"),
+    ],
+)
+def test_curved_boundaries(order, shape, condition):
     """The certificate holds, and the first eigenvalue is within 2 % of that with 2,000 points at p = 3."""
     vertices, faces, mask = shape(700)
     exact = first_eigenvalue(shape, condition)

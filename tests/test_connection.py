@@ -175,6 +175,7 @@ SHAPES = {
 }
 
 
+@pytest.mark.usefixtures("unchecked")
 @pytest.mark.parametrize("kind", SHAPES)
 def test_derivatives_in_points_and_medium_are_those_of_differences(kind):
     lb = SHAPES[kind]()

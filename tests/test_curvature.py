@@ -59,6 +59,7 @@ def test_a_torus_of_2000_points(source, bound):
     assert turn.max() < 0.5 if source != "random" else turn.median() < 0.5
 
 
+@pytest.mark.usefixtures("unchecked")
 @pytest.mark.parametrize(("order", "least"), [(1, 1.5), (3, 3.0), (5, 4.5)])
 def test_the_order(order, least):
     """The error of K on an ellipsoid falls like h^p or faster, from 700 to 5,600 vertices."""

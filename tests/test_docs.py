@@ -25,6 +25,7 @@ CALLED = re.compile(r"(?<![\w−])([A-Za-z_][\w.]*)\(")
 WITH_CODE = [page for page in PAGES if CODE.search(page.read_text("utf-8"))]
 
 
+@pytest.mark.usefixtures("unchecked")
 @pytest.mark.parametrize("page", WITH_CODE, ids=lambda page: str(page.relative_to(ROOT)))
 def test_the_code_of_a_page_runs_from_top_to_bottom(page, tmp_path, monkeypatch, capsys):
     """So does what a user may write instead, `# or: `; a comment calls what there is, and `# → ` is printed."""

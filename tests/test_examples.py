@@ -16,6 +16,7 @@ pytest.importorskip("matplotlib")
 EXAMPLES = Path(__file__).parents[1] / "examples"
 PNG = b"\x89PNG"
 sys.path.append(str(EXAMPLES))  # as python does for a script
+pytestmark = pytest.mark.usefixtures("unchecked")
 
 
 def load(name):

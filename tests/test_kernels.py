@@ -54,7 +54,8 @@ def test_left_inverses_are_those_of_normal_equations_by_qr(dim, degree, batch):
 def test_left_inverses_are_as_accurate_as_their_condition_allows(degree):
     """Every row, beside one computed with 50 digits."""
     mpmath.mp.dps = 50
-    coords = torch.randn(2, int(0.8 * (degree + 1) * (degree + 2)), 2, dtype=torch.float64)
+    many = 1 if degree == 8 else 2
+    coords = torch.randn(many, int(0.8 * (degree + 1) * (degree + 2)), 2, dtype=torch.float64)
     _, values, root = scaled_system(coords, degree)
     inverse, condition = left_inverse(values, root)
     for v, w, found, bound in zip(values, root, inverse, condition, strict=True):

@@ -632,6 +632,7 @@ def test_hessian_on_the_sphere():
     assert (lb.hessian(points[:, 2]) - exact).abs().max() <= 1e-4
 
 
+@pytest.mark.usefixtures("unchecked")
 @pytest.mark.parametrize(
     ("projection", "order", "bound"),
     [("tangent", 3, 5.2e-5), ("tangent", 5, 6.7e-7), ("normal", 3, 4e-4), ("normal", 5, 2.4e-5)],
@@ -644,6 +645,7 @@ def test_accuracy_on_the_sphere(projection, order, bound):
     assert relative(lb(smooth_function(points)), exact) <= bound
 
 
+@pytest.mark.usefixtures("unchecked")
 @pytest.mark.parametrize(
     ("projection", "order", "bound"),
     [("tangent", 3, 6e-5), ("tangent", 5, 2e-7), ("normal", 5, 2e-5)],

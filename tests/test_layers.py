@@ -69,18 +69,29 @@ def layer_of(name, dtype=torch.float32):
     return layer
 
 
-def shapes(dtype=torch.float32):
-    """Eight operators of five kinds and sizes, one smaller than the basis, one of another unit of length."""
-    clouds = [Sphere().points(90), Torus().points(150), Torus().random_points(120)]
-    built = [LaplaceBeltrami.from_points(points.to(dtype)) for points in clouds]
-    for surface in (Sphere(), Ellipsoid(), Torus()):
-        vertices, faces = surface.mesh(100)
-        built.append(LaplaceBeltrami.from_mesh(vertices.to(dtype), faces))
-    vertices, faces = Sphere().mesh(110)
-    built.append(LaplaceBeltrami.from_cotangent(3 * vertices.to(dtype), faces))
-    vertices, faces = Sphere().mesh(20)
-    built.append(LaplaceBeltrami.from_cotangent(vertices.to(dtype), faces))
-    return built
+def shapes(dtype=torch.float32, count=8):
+    """Eight operators of five kinds and sizes, one smaller than the basis, one of another unit of length; or fewer."""
+
+    def cloud(points):
+        return LaplaceBeltrami.from_points(points.to(dtype))
+
+    def mesh(vertices, faces):
+        return LaplaceBeltrami.from_mesh(vertices.to(dtype), faces)
+
+    def cotangent(vertices, faces, unit=1):
+        return LaplaceBeltrami.from_cotangent(unit * vertices.to(dtype), faces)
+
+    builders = [
+        lambda: cloud(Sphere().points(90)),
+        lambda: cloud(Torus().points(150)),
+        lambda: cloud(Torus().random_points(120)),
+        lambda: mesh(*Sphere().mesh(100)),
+        lambda: mesh(*Ellipsoid().mesh(100)),
+        lambda: mesh(*Torus().mesh(100)),
+        lambda: cotangent(*Sphere().mesh(110), 3),
+        lambda: cotangent(*Sphere().mesh(20)),
+    ]
+    return [build() for build in builders[:count]]
 
 
 @pytest.fixture(scope="module")
@@ -93,6 +104,7 @@ def features(lb, channels=CHANNELS):
     return torch.randn(lb.num_points, channels, generator=generator).to(lb.stencil.values[0])
 
 
+@pytest.mark.usefixtures("unchecked")
 @every_layer
 def test_a_batch_of_eight_shapes_gives_what_they_give_one_by_one(eight, name):
     """To 2e-5 of the largest value, in float32 where diagonals are up to 1,600; gradients of the parameters too."""
@@ -254,10 +266,10 @@ def test_a_batch_is_block_diagonal(eight):
 
 
 def test_a_batch_takes_bases_over_solves_what_is_missing_and_is_stored():
-    fresh = shapes(torch.float64)[:3]
+    fresh = shapes(torch.float64, 3)
     for lb in fresh:
         lb.eigenbasis(K)
-    ready, later = LaplaceBeltrami.batch(fresh), LaplaceBeltrami.batch(shapes(torch.float64)[:3])
+    ready, later = LaplaceBeltrami.batch(fresh), LaplaceBeltrami.batch(shapes(torch.float64, 3))
     assert ready.modes.left.shape[1] >= K
     assert later.modes.left.numel() == 0
     for field in ("eigenvalues", "eigenvectors", "left"):
@@ -311,11 +323,19 @@ def test_shapes_that_do_not_go_together_are_refused():
         LaplaceBeltrami.batch([sphere, LaplaceBeltrami.from_points(Sphere().points(60).float())])
 
 
-def compiled_and_not(name, batched):
+def with_one_block(name):
+    """A layer to compile: more blocks take longer, and are of the same operations."""
+    layer = layer_of(name)
+    if isinstance(layer, DiffusionNet):
+        del layer.blocks[1:]
+    return layer
+
+
+def compiled_and_not(name, operators):
     """Outputs and gradients in x of the compiled layer and of the layer itself."""
     torch._dynamo.reset()
-    layer, operators = layer_of(name), shapes()
-    lb = LaplaceBeltrami.batch(operators[:3]) if batched else operators[1]
+    layer = with_one_block(name)
+    lb = LaplaceBeltrami.batch(operators) if len(operators) > 1 else operators[0]
     x = features(lb).requires_grad_()
     results = []
     expected = layer(x, lb)  # solves what is solved once
@@ -337,11 +357,10 @@ def operators_of_sizes(count):
 def graphs_of_sizes(name, batched):
     """Number of graphs for seven shapes, or batches of two, of seven sizes; all outputs are the layer's own."""
     torch._dynamo.reset()
-    layer, backend = layer_of(name), torch._dynamo.testing.CompileCounterWithBackend("aot_eager")
-    compiled, operators = (
-        torch.compile(layer, backend=backend, fullgraph=True),
-        operators_of_sizes(7),
-    )
+    layer = with_one_block(name)
+    backend = torch._dynamo.testing.CompileCounterWithBackend("aot_eager")
+    compiled = torch.compile(layer, backend=backend, fullgraph=True)
+    operators = operators_of_sizes(7)
     for i, alone in enumerate(operators):
         lb = LaplaceBeltrami.batch([alone, operators[i - 1]]) if batched else alone
         x = features(lb)
@@ -351,7 +370,9 @@ def graphs_of_sizes(name, batched):
 
 def graphs_of_steps():
     """Number of graphs compiled for training steps on five sizes, with dropout, by the options of docs/training.md."""
-    net = layer_of("net").train()
+    torch._dynamo.reset()
+    torch._dynamo.utils.counters.clear()
+    net = with_one_block("net").train()
     compiled = torch.compile(net, backend="aot_eager", fullgraph=True, dynamic=True)
     for lb in operators_of_sizes(5):
         compiled(features(lb), lb).square().mean().backward()
@@ -369,28 +390,22 @@ def run_apart(*arguments):
 
 @needs_compiler
 @pytest.mark.slow
-@pytest.mark.parametrize(("name", "batched"), [("classifier", True), ("convolution", False)])
-def test_compiled_without_graph_breaks_it_gives_the_same(name, batched):
-    run_apart(name, *["batched"][: int(batched)])
+def test_compiled_without_graph_breaks_it_gives_the_same():
+    """A classifier of a batch and a convolution on one shape, with their gradients."""
+    run_apart("compiled")
 
 
 @pytest.mark.slow
-def test_compiled_for_two_sizes_it_takes_all():
-    """At most four graphs for seven sizes: the first, that of any size, and two for other sizes of the basis."""
-    graphs = json.loads(run_apart("sizes"))
+def test_few_graphs_are_enough():
+    """`fullgraph=True` for what docs/conventions.md promises: products of the operator, layers that consist of them.
+
+    At most four graphs for seven sizes: the first, that of any size, and two for other sizes of the basis. One with
+    dynamic sizes takes all training steps.
+    """
+    graphs = json.loads(run_apart("graphs"))
+    assert graphs.pop("steps") == 1
     assert len(graphs) == 4
     assert max(graphs.values()) <= 4, graphs
-
-
-@pytest.mark.slow
-def test_one_graph_with_dynamic_sizes_takes_all_steps():
-    assert json.loads(run_apart("steps")) == 1
-
-
-@pytest.mark.slow
-def test_one_graph_is_enough_for_what_conventions_promise():
-    """`fullgraph=True`: products of the operator, and the layers that consist of them."""
-    run_apart("one graph")
 
 
 def compiled_as_one_graph():
@@ -400,7 +415,7 @@ def compiled_as_one_graph():
     lb.eigenbasis(K)
     x = features(lb)
     names = ["spectral", "convolution", "gradients", "net"]
-    functions = [partial(layer_of(name), lb=lb) for name in names]
+    functions = [partial(with_one_block(name), lb=lb) for name in names]
     functions += [lb, lb.gradient, lambda f: lb.divergence(lb.gradient(f[:, 0]))]
     functions += [lambda f: lb.eigenbasis(K).from_basis(lb.eigenbasis(K).to_basis(f))]
     for function in functions:
@@ -458,21 +473,32 @@ def test_gradient_features_compute_in_the_type_of_the_layer():
     assert torch.equal(layer(x, lb), layer(x, copy.deepcopy(lb).float()))
 
 
+@pytest.fixture(scope="module")
+def torus_by_type():
+    """Operators built of the same points in float64 and in float32."""
+    points = Torus().points(150)
+    return LaplaceBeltrami.from_points(points), LaplaceBeltrami.from_points(points.float())
+
+
 @every_layer
-def test_float32_is_close_to_float64(name):
-    double = LaplaceBeltrami.from_points(Torus().points(150))
+def test_float32_is_close_to_float64(torus_by_type, name):
+    double, single = torus_by_type
     layer = layer_of(name, torch.float64)
     expected = layer(features(double), double)
-    single = LaplaceBeltrami.from_points(Torus().points(150).float())
     y = copy.deepcopy(layer).float()(features(double).float(), single)
     assert y.dtype == torch.float32
     assert (y - expected).abs().max() <= 1e-3 * expected.abs().max()
 
 
+@pytest.fixture(scope="module")
+def torus_mesh():
+    return LaplaceBeltrami.from_mesh(*Torus().mesh(100))
+
+
 @every_layer
-def test_one_rule_of_types(name):
+def test_one_rule_of_types(torus_mesh, name):
     """The parameters' type is that of x, which the result has; the operator may have any. Else an error names both."""
-    double = LaplaceBeltrami.from_mesh(*Torus().mesh(100))
+    double = torus_mesh
     layer, x = layer_of(name), features(double).float()
     y = layer(x, double)
     assert y.dtype == torch.float32
@@ -598,18 +624,18 @@ def test_wavelets_of_one_function():
     assert torch.equal(single, spectral_wavelets(lb, f[:, None], scales, k=20)[..., 0])
 
 
-if __name__ == "__main__" and sys.argv[1] == "sizes":
+if __name__ == "__main__" and sys.argv[1] == "compiled":
+    three = shapes(count=3)
+    for name, operators in (("classifier", three), ("convolution", three[1:2])):
+        compiled, plain = compiled_and_not(name, operators)
+        torch.testing.assert_close(compiled, plain, rtol=1e-3, atol=1e-4)
+elif __name__ == "__main__" and sys.argv[1] == "graphs":
+    compiled_as_one_graph()
     kinds = [
         ("net", False),
         ("spectral", False),
         ("convolution", True),
         ("classifier", True),
     ]
-    print(json.dumps({name: graphs_of_sizes(name, batched) for name, batched in kinds}))
-elif __name__ == "__main__" and sys.argv[1] == "steps":
-    print(graphs_of_steps())
-elif __name__ == "__main__" and sys.argv[1] == "one graph":
-    compiled_as_one_graph()
-elif __name__ == "__main__":
-    compiled, plain = compiled_and_not(sys.argv[1], "batched" in sys.argv)
-    torch.testing.assert_close(compiled, plain, rtol=1e-3, atol=1e-4)
+    graphs = {name: graphs_of_sizes(name, batched) for name, batched in kinds}
+    print(json.dumps(graphs | {"steps": graphs_of_steps()}))

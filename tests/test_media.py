@@ -225,6 +225,7 @@ def results(x, t):
 RESULTS = list(results(noise(1, 2), noise(2)))
 
 
+@pytest.mark.usefixtures("unchecked")
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("name", RESULTS)
 def test_derivatives_in_the_medium(kind, name):
@@ -274,6 +275,7 @@ def test_tensors_that_are_multiples_of_one_have_derivatives():
         torch.testing.assert_close(tensor.diagonal(dim1=1, dim2=2).sum(1), number)
 
 
+@pytest.mark.usefixtures("unchecked")
 def test_points_and_medium_together():
     """Gradients in both of one result; `at` keeps the medium."""
     lb = LaplaceBeltrami.from_mesh(

@@ -30,6 +30,7 @@ def difference(one, other):
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("unchecked")
 @pytest.mark.parametrize("name", QUICK)
 def test_a_picture_is_what_its_script_draws(name, tmp_path):
     drawn = draw_docs.draw(name, tmp_path)

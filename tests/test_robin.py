@@ -290,6 +290,7 @@ def test_data_at_the_boundary():
         poisson_solve(lb, 0 * x, boundary_values=1.0)
 
 
+@pytest.mark.usefixtures("unchecked")
 def test_gradients_in_f_and_t():
     lb = disk("mesh", 300)
     f = torch.randn(300, 2, dtype=torch.float64, requires_grad=True)
@@ -329,6 +330,7 @@ def everything(lb, f):
     yield lb(f)
 
 
+@pytest.mark.usefixtures("unchecked")
 def test_a_batch_of_shapes_with_all_conditions():
     """As each alone: by the shapes, by the batch as a whole, and after `unbatch`."""
     parts = shapes()

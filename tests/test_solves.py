@@ -219,6 +219,7 @@ def test_second_derivatives_in_media_are_an_error():
         torch.autograd.functional.jvp(of_medium, t.detach(), torch.ones_like(t))
 
 
+@pytest.mark.usefixtures("unchecked")
 @pytest.mark.parametrize("condition", ["neumann", "dirichlet"])
 def test_second_derivatives_of_solves_and_flows(condition):
     """In f and t, with boundary data; the derivative in a direction is the solution for it."""

@@ -64,6 +64,7 @@ def test_contract(build, n, k):
     assert rest.abs().max() <= 1e-11 * (basis.eigenvalues * basis.left).abs().max()
 
 
+@pytest.mark.usefixtures("unchecked")
 @pytest.mark.parametrize(("order", "first", "second"), [(3, 1.5e-5, 1.6e-4), (5, 5e-10, 8e-9)])
 def test_spectrum_of_the_sphere(order, first, second):
     """λ = l(l+1), 2l + 1 times; the worst relative error of the first 36 and 100."""
@@ -73,6 +74,7 @@ def test_spectrum_of_the_sphere(order, first, second):
     assert worst(values, sphere_eigenvalues(100)) <= second
 
 
+@pytest.mark.usefixtures("unchecked")
 def test_spectrum_of_the_torus():
     """R = 1, r = 0.5: the exact eigenvalues, of the separated equation."""
     exact = [0] + [0.997472228] * 2 + [3.17827121] * 2 + [3.90692525, 4.48915308]
@@ -102,14 +104,15 @@ def three_spheres():
 
 def test_every_component_has_a_zero_and_equal_components_equal_eigenvalues():
     """Radii 1, 2, 1: 0 three times, 1/2 three times, 3/2 five times, 2 six times."""
-    basis = three_spheres().eigenbasis(20)
+    lb = three_spheres()
+    other, basis = copy.deepcopy(lb), lb.eigenbasis(20)
     values = torch.tensor([0.0] * 3 + [0.5] * 3 + [1.5] * 5 + [2.0] * 6).double()
     assert (basis.eigenvalues[:3] == 0).all()
     torch.testing.assert_close(basis.eigenvalues[:17], values, rtol=2e-3, atol=0)
     phi = basis.eigenvectors
     assert (phi[:, 0] == phi[0, 0]).all()
     assert (phi.T @ basis.left - torch.eye(20)).abs().max() <= 1e-10
-    assert three_spheres().eigenbasis(2).eigenvalues.tolist() == [0, 0]
+    assert other.eigenbasis(2).eigenvalues.tolist() == [0, 0]
 
 
 def test_neumann_spectrum_of_the_disk():
@@ -177,16 +180,16 @@ def test_basis_of_a_float32_operator():
     )
 
 
-@pytest.mark.parametrize("scale", [2.0**-45, 2.0**45])
 @pytest.mark.parametrize("size", [300, 500])
-def test_a_basis_does_not_depend_on_the_unit(size, scale):
+def test_a_basis_does_not_depend_on_the_unit(size):
     """λ scales by s⁻², Φ by s⁻¹, W by s."""
-    points = Torus().random_points(size)
-    one, other = (LaplaceBeltrami.from_points(s * points).eigenbasis(12) for s in (1.0, scale))
+    points, scales = Torus().random_points(size), (2.0**-45, 2.0**45)
+    one, *others = (LaplaceBeltrami.from_points(s * points).eigenbasis(12) for s in (1.0, *scales))
     eigenvalues, phi, left = one.eigenvalues, one.eigenvectors, one.left
-    torch.testing.assert_close(other.eigenvalues * scale**2, eigenvalues, rtol=1e-9, atol=0)
-    torch.testing.assert_close(other.eigenvectors * scale, phi, rtol=0, atol=1e-6)
-    torch.testing.assert_close(other.left / scale, left, rtol=0, atol=1e-6)
+    for scale, other in zip(scales, others, strict=True):
+        torch.testing.assert_close(other.eigenvalues * scale**2, eigenvalues, rtol=1e-9, atol=0)
+        torch.testing.assert_close(other.eigenvectors * scale, phi, rtol=0, atol=1e-6)
+        torch.testing.assert_close(other.left / scale, left, rtol=0, atol=1e-6)
 
 
 def test_a_small_component_has_its_eigenvalues_beside_a_large_one():
@@ -219,6 +222,7 @@ def test_signatures_need_a_positive_eigenvalue(signature):
     assert heat_kernel_signature(lb, torch.tensor([1.0]), k=1).shape == (40, 1)
 
 
+@pytest.mark.usefixtures("unchecked")
 def test_heat_kernel_signature_of_the_sphere():
     """Σ (2l + 1)/4π e^{−l(l+1)t}, the same at every point."""
     lb = LaplaceBeltrami.from_points(Sphere().points(2000), order=5)

@@ -32,6 +32,18 @@ def cloud(name, kind, count=1500):
     return getattr(CLOSED[name], kind)(count)
 
 
+@cache
+def operator(name, kind, count=1500):
+    return LaplaceBeltrami.from_points(cloud(name, kind, count))
+
+
+@cache
+def eigenvalues_of_a_fine_mesh(name):
+    """λ_1 to λ_15."""
+    mesh = CLOSED[name].mesh(4000)
+    return LaplaceBeltrami.from_mesh(*mesh, order=5).eigenbasis(16).eigenvalues[1:]
+
+
 @pytest.mark.parametrize("kind", ["points", "random_points"])
 @pytest.mark.parametrize("name", CLOSED)
 def test_closed_shapes_get_closed_surfaces(name, kind):
@@ -55,9 +67,7 @@ def test_closed_shapes_get_closed_surfaces(name, kind):
 @pytest.mark.parametrize("name", ["sphere", "torus"])
 def test_eigenvalues_and_area_of_the_pair_of_a_cloud(name, kind):
     """λ_1 to λ_15 within 1e-3 (even: 1e-4) of those of a fine mesh."""
-    shape, points = CLOSED[name], cloud(name, kind)
-    exact = LaplaceBeltrami.from_mesh(*shape.mesh(4000), order=5).eigenbasis(16).eigenvalues[1:]
-    lb = LaplaceBeltrami.from_points(points)
+    shape, lb, exact = CLOSED[name], operator(name, kind), eigenvalues_of_a_fine_mesh(name)
     assert lb._has_weak_form
     assert lb.certificate is None
     error = (lb.eigenbasis(16).eigenvalues[1:] / exact - 1).abs().max()
@@ -147,14 +157,14 @@ def test_spheres_apart_stay_apart_and_an_outlier_joins_nothing():
 
 def test_outliers_change_nothing():
     """A hundredth of the points anywhere around a torus: area and eigenvalues 1 to 8 within 3 %; nothing is said."""
-    points, generator = Torus().points(2000), torch.Generator().manual_seed(3)
+    points, generator = cloud("torus", "points", 2000), torch.Generator().manual_seed(3)
     far = 2 * (2 * torch.rand(20, 3, generator=generator).double() - 1)
     with warnings.catch_warnings():
         warnings.simplefilter("error", UserWarning)
         lb = LaplaceBeltrami.from_points(torch.cat([points, far]))
     assert lb.surface.lone >= 12
     assert float(lb.mass.sum()) == pytest.approx(Torus().area, rel=0.03)
-    exact = LaplaceBeltrami.from_points(points).eigenbasis(9).eigenvalues[1:]
+    exact = operator("torus", "points", 2000).eigenbasis(9).eigenvalues[1:]
     torch.testing.assert_close(lb.eigenbasis(9).eigenvalues[1:], exact, rtol=0.03, atol=0.0)
 
 
@@ -321,8 +331,8 @@ def test_a_grid_wider_one_way_than_the_other_is_not_warned_of(rows):
         lb = LaplaceBeltrami.from_points(
             torch.stack([across * u.cos(), across * u.sin(), 0.5 * v.sin()], 1)
         )
-    fine = LaplaceBeltrami.from_points(Torus().points(2000))
-    found, right = (float(operator.eigenbasis(2).eigenvalues[1]) for operator in (lb, fine))
+    fine = operator("torus", "points", 2000)
+    found, right = (float(each.eigenbasis(9).eigenvalues[1]) for each in (lb, fine))
     assert found == pytest.approx(right, rel=1e-2)
 
 
@@ -515,7 +525,7 @@ def test_noise_is_seen_and_smoothed(name):
     lb = LaplaceBeltrami.from_points(noisy)
     assert share / 1.5 < lb.surface.noise < 1.5 * share
     assert torch.equal(lb.points, noisy)
-    exact = LaplaceBeltrami.from_points(points).eigenbasis(9).eigenvalues[1:]
+    exact = operator(name, "points").eigenbasis(9).eigenvalues[1:]
     assert (lb.eigenbasis(9).eigenvalues[1:] / exact - 1).abs().max() < 0.01
     assert float(lb.mass.sum()) == pytest.approx(shape.area, rel=0.01)
 
@@ -533,14 +543,13 @@ def test_half_the_spacing_of_noise_is_named():
 
 def test_faces_are_there_and_travel():
     """Of the surface through a cloud, of a mesh as given; through batches and states."""
-    points = cloud("torus", "random_points")
-    lb = LaplaceBeltrami.from_points(points)
+    lb = operator("torus", "random_points")
     vertices, faces = Sphere().mesh(200)
     mesh = LaplaceBeltrami.from_mesh(vertices, faces)
     assert torch.equal(mesh.faces, faces)
     assert mesh.surface is None
     batch = LaplaceBeltrami.batch([lb, mesh])
-    assert torch.equal(batch.faces, torch.cat([lb.faces, faces + len(points)]))
+    assert torch.equal(batch.faces, torch.cat([lb.faces, faces + lb.num_points]))
     first, second = batch.unbatch()
     assert torch.equal(first.faces, lb.faces)
     assert first.surface == lb.surface

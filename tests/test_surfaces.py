@@ -39,6 +39,11 @@ ALL = [*EMBEDDED, CliffordTorus(), ThreeSphere(), *CURVES, *BOUNDED]
 MESHED = [*EMBEDDED, CliffordTorus(), *BOUNDED]
 
 
+@pytest.fixture(scope="module", autouse=True)
+def surfaces_once():
+    """Here they are computed each time."""
+
+
 def each(cases):
     return pytest.mark.parametrize("surface", cases, ids=lambda case: type(case).__name__)
 

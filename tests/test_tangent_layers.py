@@ -143,6 +143,7 @@ def test_a_motion_of_the_shape_moves_the_fields_of_a_network(block):
     assert (lb.normals[:, :, None] * results[1]).sum(1).abs().max() <= 1e-12
 
 
+@pytest.mark.usefixtures("unchecked")
 @pytest.mark.parametrize("method", METHODS)
 @pytest.mark.parametrize("kind", ["closed", "dirichlet"])
 def test_a_block_passes_gradcheck(sphere, kind, method):
