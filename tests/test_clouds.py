@@ -1,5 +1,6 @@
 """Curves and solids as clouds, and reconstructions of the user's (`torchlb.cloud.reconstruct`)."""
 
+import warnings
 from itertools import pairwise
 
 import numpy as np
@@ -11,7 +12,7 @@ from test_simplices import cube, trefoil, worst
 from torchlb import InputError, LaplaceBeltrami, heat_flow, operator_key, poisson_solve
 from torchlb.cloud import Complex, reconstruct
 from torchlb.linalg.csr import tensors_of
-from torchlb.surfaces import Sphere
+from torchlb.surfaces import CliffordTorus, Sphere
 
 PI = np.pi
 
@@ -245,11 +246,15 @@ def test_another_reconstruction_is_put_in_by_its_name(wrapped):
 
 
 def test_the_own_reconstruction_can_be_put_in():
-    """Also of a surface, with its normals and stars; in the user's numbers."""
-    points = Sphere().points(300)
-    for cloud, dim in ((points, 2), (trefoil(60)[0], 1)):
+    """Also of a surface, with its normals and stars; in the user's numbers; of one in R⁴ whose cells have no side."""
+    clouds = (Sphere().points(300), 2), (trefoil(60)[0], 1), (CliffordTorus().points(300), 2)
+    for cloud, dim in clouds:
         own = LaplaceBeltrami.from_points(cloud, dim=dim)
-        given = LaplaceBeltrami.from_points(cloud, reconstruct=lambda p, d=dim: reconstruct(p, d))
+        with warnings.catch_warnings():
+            warnings.simplefilter("error", UserWarning)
+            given = LaplaceBeltrami.from_points(
+                cloud, reconstruct=lambda p, d=dim: reconstruct(p, d)
+            )
         torch.testing.assert_close(given.eigenbasis(6).eigenvalues, own.eigenbasis(6).eigenvalues)
         assert (given.surface is None) == (own.surface is None)
 

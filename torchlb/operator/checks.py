@@ -141,10 +141,11 @@ def mended_faces(vertices: Points, faces: Int[Tensor, "F v"]) -> Int[Tensor, "G 
     turned = turned_faces(faces)
     if turned.any():
         wrong = turned.nonzero()[:, 0]
-        warn(
-            f"faces: {len(wrong)} are wound against their neighbours ({first_few(wrong)}) and are turned round, so "
-            "that the normals agree; torchlb.clean_mesh(vertices, faces) does it in the mesh"
-        )
+        if vertices.shape[1] <= faces.shape[1]:  # else there are no normals
+            warn(
+                f"faces: {len(wrong)} are wound against their neighbours ({first_few(wrong)}) and are turned round, so "
+                "that the normals agree; torchlb.clean_mesh(vertices, faces) does it in the mesh"
+            )
         faces = torch.where(turned[:, None], faces.flip(1), faces)
     spacing, _, bad = coincident(vertices)
     _warn_of_rounding(vertices, spacing)
