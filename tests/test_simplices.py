@@ -139,6 +139,42 @@ def test_corners_and_crossings_of_curves():
     assert worst(lb, quarter) < 2e-3
 
 
+@pytest.mark.parametrize("turn", [PI / 18, PI / 2])
+def test_crossings_of_curves_are_of_high_order(turn):
+    """Two lines that cross: (π/2)² three times, then π²; derivatives jump there, and no fit reaches over it."""
+    errors, counts = [], [11, 21, 41]
+    for count in counts:
+        arm = np.linspace(0, 1, count)[1:]
+        ways = [np.array([np.cos(a), np.sin(a)]) for a in (0, PI, turn, PI + turn)]
+        points = np.concatenate([[[0.0, 0.0]], *(arm[:, None] * way for way in ways)])
+        number = np.arange(1, len(points)).reshape(4, -1)
+        ends = np.concatenate([np.zeros((4, 1), dtype=int), number], 1)
+        lb = LaplaceBeltrami.from_mesh(
+            points, np.stack([ends[:, :-1], ends[:, 1:]], 2).reshape(-1, 2)
+        )
+        assert lb.mass.sum().item() == pytest.approx(4.0, rel=1e-9)
+        errors.append(worst(lb, [0, *[PI**2 / 4] * 3, PI**2]))
+    assert errors[-1] < 5e-5
+    assert -np.polyfit(np.log(counts), np.log(errors), 1)[0] > 2.5
+
+
+def test_a_curved_wall_of_one_cell_is_no_worse_than_linear_elements():
+    """Of a tube of radius 1, where they are off by 2 %: two layers of points nearly satisfy a quadratic."""
+    around, along, wall = 48, 24, 0.1
+    turn, height = np.meshgrid(2 * PI * np.arange(around) / around, np.linspace(0, 2, along))
+    radius = np.stack([np.cos(turn), np.sin(turn)], -1).reshape(-1, 2)
+    layers = [np.c_[r * radius, height.ravel()] for r in (1 - wall / 2, 1 + wall / 2)]
+    row, column = np.divmod(np.arange((along - 1) * around), around)
+    a, b = row * around + column, row * around + (column + 1) % around
+    faces = np.sort(np.concatenate([np.c_[a, b, b + around], np.c_[a, b + around, a + around]]), 1)
+    (a, b, c), (d, e, f) = faces.T, (faces + around * along).T
+    cells = [np.stack(t, 1) for t in ((a, b, c, f), (a, b, e, f), (a, d, e, f))]
+    lb = LaplaceBeltrami.from_mesh(np.concatenate(layers), np.concatenate(cells))
+    values = lb.eigenbasis(12).eigenvalues
+    exact = np.sort([k * k + (PI * j / 2) ** 2 for k in range(-4, 5) for j in range(5)])[:12]
+    assert np.abs(values.numpy()[1:] / exact[1:] - 1).max() < 0.05
+
+
 def test_an_interval_with_data_at_its_ends():
     """u = x³ solves −u'' = −6x with its values, or with the flux 3 at x = 1; e^{−4π²t} sin 2πx."""
     x = torch.linspace(0, 1, 61, dtype=torch.float64) ** 1.3

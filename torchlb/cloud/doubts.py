@@ -86,7 +86,7 @@ def warn_of_buried(cells: Int[Tensor, "F corners"], boundary: Bool[Tensor, " N"]
     """Warn of points of a declared boundary that lie inside the shape."""
     within = torch.isin(torch.arange(len(boundary)), cells) & ~on_rim(cells, len(boundary))
     inside = (boundary & within).nonzero()[:, 0]
-    if len(inside) > SLIGHT * int(boundary.sum()):
+    if len(inside):
         warn(
             f"boundary: {len(inside)} of its points ({first_few(inside)}) lie inside the shape through the cloud, as "
             "around a hole that was closed because it is hardly wider than the spacing; add points around it, or give "

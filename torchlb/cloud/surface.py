@@ -138,6 +138,10 @@ def cloud_surface(
     if given is None:
         cloud = _realigned(cloud, faces)
     stars = stars_in_gaps(cloud, faces, pairs)
+    if len(faces) == 0:
+        raise InputError(
+            f"points: no surface goes through the {count}, as through those of a curve, which has dim=1"
+        )
     loops = boundary_loops(faces, count)
     pieces = pieces_of(np.concatenate([faces, stars]), count)
     figures = len(np.unique(faces)), len(stars), len(done), len(loops), int(pieces.max()) + 1

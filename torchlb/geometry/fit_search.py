@@ -21,6 +21,8 @@ from torchlb.linalg.precision import AT_ONCE, NEGLIGIBLE
 
 MAX_LEBESGUE = 10.0
 """Largest Lebesgue constant of a fit at the midpoints of the edges of its vertex; that of good fits is below 2."""
+MAX_IN_SOLIDS = 4.0
+"""The same of tetrahedra: the two layers of points of a curved wall, one cell thick, nearly satisfy a quadratic."""
 REASONS = (
     "reached",
     "too few compatible neighbours",
@@ -219,4 +221,5 @@ def is_regular(fit: CenteredFit, middles: Tensor, degree: int) -> Bool[Tensor, "
     """
     exact = fit.residual(middles.shape[2]) <= NEGLIGIBLE
     exact &= fit.coefficients.abs().amax((1, 2)) <= 1 / NEGLIGIBLE
-    return exact & (fit.lebesgue(middles, degree) <= MAX_LEBESGUE)
+    most = MAX_IN_SOLIDS if middles.shape[2] == 3 else MAX_LEBESGUE
+    return exact & (fit.lebesgue(middles, degree) <= most)

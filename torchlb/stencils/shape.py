@@ -205,6 +205,12 @@ def mesh_shape(
         candidates = nearest_neighbors(vertices, min(NEAREST, len(vertices)))
         sides = thin_sides(vertices, vertex_normals(vertices, faces), candidates)
     graph = mesh_graph(faces, len(vertices))
+    if (
+        faces.shape[1] == 2
+    ):  # derivatives jump where three and more curves meet: no neighbourhood goes on there
+        single = torch.bincount(faces.flatten(), minlength=len(vertices)) < 3
+        graph = sparse.csr_array(sparse.diags_array(single.numpy().astype(graph.dtype)) @ graph)
+        graph.eliminate_zeros()
     neighborhoods = GraphNeighborhoods(vertices, graph, mesh_frames(vertices, faces), sides)
     edge = None
     if shares is not None and boundary is not None:
