@@ -22,7 +22,7 @@ from torch import Tensor
 
 from torchlb.geometry.compatibility import plucker_coordinates
 from torchlb.geometry.thresholds import AROUND, CREASE, HALF_CREASE, WIDER
-from torchlb.geometry.vectors import Frames, Near, Points, at
+from torchlb.geometry.vectors import Frames, Mask, Near, Points, at
 
 
 def nearest_neighbors(points: Points, size: int) -> Near:
@@ -53,9 +53,21 @@ def mesh_graph(faces: Int[Tensor, "F v"], num_points: int) -> sparse.csr_array:
     return adjacency(i, j, num_points)
 
 
+def restricted(
+    graph: sparse.csr_array, starts: Mask, stops: Mask | None = None
+) -> sparse.csr_array:
+    """The edges of a graph from some of its points, and to some of them: a walk ends at the others."""
+    kept = sparse.diags_array(starts.astype(graph.dtype)) @ graph
+    if stops is not None:
+        kept = kept @ sparse.diags_array(stops.astype(graph.dtype))
+    kept = sparse.csr_array(kept)
+    kept.eliminate_zeros()
+    return kept
+
+
 @dataclass(frozen=True, eq=False)
 class GraphNeighborhoods:
-    """Nearest points of a k-hop neighbourhood in a symmetric graph, for any chunk of centres; results are kept.
+    """Nearest points of a k-hop neighbourhood in a graph, for any chunk of centres; results are kept.
 
     The tangent frames decide compatibility. Points on the other side of a thin shape are refused by their `sides`, from
     `thin_sides`, if these are known.

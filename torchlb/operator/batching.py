@@ -11,11 +11,9 @@ import torch
 from torchlb.errors import InputError
 from torchlb.galerkin.matrices import PairMatrices
 from torchlb.linalg.csr import Csr, Record, starts, tensors_of
-from torchlb.operator.storage import OperatorStorage
+from torchlb.operator.storage import BY_POINT, OperatorStorage
 
 Parts = dict[str, Any]
-BY_POINT = ("mass", "points", "frames", "normals", "_shape_operators", "_on_boundary")
-"""Tensors with a row for each point; some are empty: normals, shape operators, the mask of the boundary."""
 
 
 def check_alike(shapes: Sequence[OperatorStorage]) -> None:

@@ -225,16 +225,17 @@ def shape_operators(placed: Placed, rows: Rows, order: Int[Tensor, " N"]) -> Flo
     found, normals = placed.shape_operators, placed.normals
     assert found is not None
     assert normals is not None
-    rough = order < 2
-    if not rough.any():
+    rough = (order < 2).nonzero()[:, 0]
+    if len(rough) == 0:
         return found
+    some = rows[rough]
+    own, near = normals[rough][some.row], normals[some.col]
     # a neighbour's normal on the side of that of the row: surfaces without sides have curvatures, too
-    opposed = (normals[rows.row] * normals[rows.col]).sum(1) < -CREASE
-    near = torch.where(opposed[:, None], -normals[rows.col], normals[rows.col])
-    slopes = normals.new_zeros(*normals.shape, found.shape[1])
-    slopes = slopes.index_add(0, rows.row, near[..., None] * rows.gradient[:, None])
-    own = placed.frames.mT @ slopes
-    return torch.where(rough[:, None, None], (own + own.mT) / 2, found)
+    near = torch.where(((own * near).sum(1) < -CREASE)[:, None], -near, near)
+    slopes = normals.new_zeros(len(rough), normals.shape[1], found.shape[1])
+    slopes = slopes.index_add(0, some.row, near[..., None] * some.gradient[:, None])
+    slopes = placed.frames[rough].mT @ slopes
+    return found.index_copy(0, rough, (slopes + slopes.mT) / 2)
 
 
 def check_fit(plan: Plan, after: Points) -> None:

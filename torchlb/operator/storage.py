@@ -24,6 +24,9 @@ from torchlb.stencils.conditions import Condition, condition_of, kind_of
 
 Storage = TypeVar("Storage", bound="OperatorStorage")
 
+BY_POINT = ("mass", "points", "frames", "normals", "_shape_operators", "_on_boundary")
+"""Tensors with a row for each point; some are empty: normals, shape operators, the mask of the boundary."""
+
 
 class OperatorStorage(Tensors):
     """Tensors of any size, which an empty instance takes from any `state_dict`.
@@ -51,8 +54,7 @@ class OperatorStorage(Tensors):
 
     def __init__(self) -> None:
         none, whole = torch.zeros(0), torch.zeros(0, dtype=torch.int64)
-        names = ("mass", "points", "frames", "normals", "_shape_operators")
-        by_point = dict.fromkeys(names, none)
+        by_point = dict.fromkeys(BY_POINT, none)
         super().__init__(by_point | {"_on_boundary": whole.bool(), "faces": whole.view(0, 3)})
         self.source = "empty"
         self.options: dict[str, Any] = {}

@@ -8,7 +8,6 @@ from typing import NamedTuple
 
 import torch
 from jaxtyping import Bool, Float, Int
-from scipy import sparse
 from torch import Tensor
 from torch.nn.functional import normalize, pad
 from tqdm import tqdm
@@ -22,7 +21,12 @@ from torchlb.geometry.complex import consistently_wound
 from torchlb.geometry.fit_search import FitSearch
 from torchlb.geometry.frames import complete_frames, mesh_frames, normals_of_frames, vertex_normals
 from torchlb.geometry.local_fits import FitPlan, LocalFits
-from torchlb.geometry.neighbors import GraphNeighborhoods, mesh_graph, nearest_neighbors
+from torchlb.geometry.neighbors import (
+    GraphNeighborhoods,
+    mesh_graph,
+    nearest_neighbors,
+    restricted,
+)
 from torchlb.geometry.thresholds import NEAREST
 from torchlb.geometry.vectors import Frames, Points, dot
 from torchlb.linalg.precision import AT_ONCE, TINY
@@ -205,12 +209,9 @@ def mesh_shape(
         candidates = nearest_neighbors(vertices, min(NEAREST, len(vertices)))
         sides = thin_sides(vertices, vertex_normals(vertices, faces), candidates)
     graph = mesh_graph(faces, len(vertices))
-    if (
-        faces.shape[1] == 2
-    ):  # derivatives jump where three and more curves meet: no neighbourhood goes on there
-        single = torch.bincount(faces.flatten(), minlength=len(vertices)) < 3
-        graph = sparse.csr_array(sparse.diags_array(single.numpy().astype(graph.dtype)) @ graph)
-        graph.eliminate_zeros()
+    if faces.shape[1] == 2:  # derivatives jump where three and more curves meet
+        uses = torch.bincount(faces.flatten(), minlength=len(vertices))
+        graph = restricted(graph, uses.numpy() < 3)
     neighborhoods = GraphNeighborhoods(vertices, graph, mesh_frames(vertices, faces), sides)
     edge = None
     if shares is not None and boundary is not None:
@@ -241,9 +242,8 @@ def surface_shape(
     sides = None if normals is None else thin_sides(points, normals, surface.neighbors)
     graph = mesh_graph(triangles, len(points))
     if surface.lone.any():
-        others = sparse.diags_array((~surface.lone).numpy().astype(graph.dtype))
-        graph = sparse.csr_array(others @ graph @ others)
-        graph.eliminate_zeros()
+        others = ~surface.lone.numpy()
+        graph = restricted(graph, others, others)
     beside = Beside.of(given, surface.points, triangles, surface.neighbors[:, 1], surface.normals)
     points = beside.places(given, triangles)
     neighborhoods = GraphNeighborhoods(points, graph, beside.frames(points, triangles), sides)
