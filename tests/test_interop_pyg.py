@@ -10,7 +10,7 @@ from torch_geometric.data import Batch, Data
 from torch_geometric.loader import DataLoader
 from torch_geometric.nn import MessagePassing
 
-from torchlb import Diffusion, DiffusionNet, LaplaceBeltrami, implicit_step
+from torchlb import Diffusion, DiffusionNet, InputError, LaplaceBeltrami, implicit_step
 from torchlb.interop.pyg import LaplaceBeltramiTransform, to_operator
 from torchlb.surfaces import Circle, Ellipsoid, Sphere, Torus, UnitDisk
 
@@ -154,6 +154,11 @@ def test_clouds_their_normals_and_curves():
     ).min() > 0
     ignored = LaplaceBeltramiTransform(order=1, normals=None)(data)
     assert_same(to_operator(ignored), LaplaceBeltrami.from_points(points, order=1))
+    assert (to_operator(plain(data)).curvatures().mean < 0).all()
+    older = plain(data)
+    del older["lb_shape_operators"]
+    with pytest.raises(InputError, match="earlier version"):
+        to_operator(older).curvatures()
     curves = [data_of(Circle().points(n)) for n in (20, 30)]
     lb = to_operator(Batch.from_data_list([plain(curve) for curve in curves]))
     assert (lb.dim, lb.sizes) == (1, (20, 30))

@@ -211,6 +211,11 @@ class StencilMethods(OperatorStorage):
         True
         """
         check_surface(self, "curvatures")
+        if len(self._shape_operators) == 0:
+            raise InputError(
+                "curvatures: these data were written by an earlier version, without them; apply "
+                "LaplaceBeltramiTransform again"
+            )
         return Curvatures(self._shape_operators, self.frames)
 
     def _boundary_points(self) -> Bool[Tensor, " N"]:
