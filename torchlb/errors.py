@@ -104,8 +104,7 @@ def warn(
         frame, level = frame.f_back, level + 1
     kind = re.sub(r"\(.*?\)|\d", "", message)  # whatever the points and numbers
     place = frame.f_code.co_filename, frame.f_lineno, kind
-    if once is not None:
-        if place in once:
-            return
+    once = set() if once is None else once
+    if place not in once:
         once.add(place)
-    warnings.warn(message, category, stacklevel=level)
+        warnings.warn(message, category, stacklevel=level)

@@ -14,15 +14,8 @@ from torch.nn.functional import pad
 
 from torchlb.baseline.cotangent import cotangent_laplacian
 from torchlb.certified.certificate import certify
+from torchlb.cloud import doubts
 from torchlb.cloud.complexes import Complex
-from torchlb.cloud.doubts import (
-    on_rim,
-    warn_of_buried,
-    warn_of_doubts,
-    warn_of_joins,
-    warn_of_layers,
-    warn_of_near_duplicates,
-)
 from torchlb.cloud.reconstruction import reconstruct
 from torchlb.cloud.surface import CloudSurface
 from torchlb.errors import InputError, first_few, renumbered, warn
@@ -39,19 +32,10 @@ from torchlb.geometry.vectors import Points
 from torchlb.linalg.precision import LOW
 from torchlb.linalg.sparse import from_scipy
 from torchlb.linalg.threads import threads_for
-from torchlb.operator.checks import (
-    check_boundary,
-    check_dimension,
-    check_distinct,
-    check_faces,
-    check_normals,
-    check_scale,
-    mended_faces,
-)
+from torchlb.operator import checks
 from torchlb.operator.inputs import ArrayLike, check_points
 from torchlb.operator.plan import Parts, Plan, operator_parts
 from torchlb.stencils.assemble import Stencils, assemble
-from torchlb.stencils.conditions import Condition
 from torchlb.stencils.options import Options
 from torchlb.stencils.rows import Reason, Rows, matrix_rows
 from torchlb.stencils.shape import Shape, mesh_shape, surface_shape
@@ -77,21 +61,16 @@ def build_mesh(
     """Build an operator on a mesh; arguments as for `LaplaceBeltrami.from_mesh`."""
     vertices, corners = _checked(vertices, faces)
     options.check(len(vertices), vertices.shape[1], corners.shape[1] - 1)
-    corners = mended_faces(vertices, corners)
-    if isinstance(boundary, str) and boundary in Condition.known:
-        raise InputError(
-            f"boundary: expected where the condition holds, a mask of the vertices, got {boundary!r}; what holds there "
-            f"is condition={boundary!r}"
-        )
-    where = check_boundary(boundary, len(vertices))
+    corners = checks.mended_faces(vertices, corners)
+    where = checks.check_boundary(boundary, len(vertices))
     progress = progress and sys.stderr.isatty()
     return on_cells(vertices, vertices, corners, options, where, "mesh", progress)
 
 
 def _checked(vertices: ArrayLike, faces: ArrayLike) -> tuple[Tensor, Tensor]:
     vertices = check_points(vertices, "vertices")
-    check_scale(vertices)
-    return vertices, check_faces(faces, len(vertices))
+    checks.check_scale(vertices)
+    return vertices, checks.check_faces(faces, len(vertices))
 
 
 def build_cloud(
@@ -106,29 +85,29 @@ def build_cloud(
 ) -> Parts:
     """Build an operator on a point cloud; arguments as for `LaplaceBeltrami.from_points`."""
     points = check_points(points)
-    check_scale(points)
-    check_distinct(points)
+    checks.check_scale(points)
+    checks.check_distinct(points)
     ambient, found = points.shape[1], None
     if reconstruction is None:
-        d = check_dimension(points, dim, hypersurface=normals is not None)
+        d = checks.check_dimension(points, dim, hypersurface=normals is not None)
     else:
         found = _given_complex(points, reconstruction, dim)
         d = found.cells.shape[1] - 1
     options.check(len(points), ambient, d)
-    where = check_boundary(boundary, len(points))
+    where = checks.check_boundary(boundary, len(points))
     held = options.held
-    if where is None and held is not None and not held.conserves:
+    if boundary is None and held is not None and not held.conserves:
         raise InputError(
             f"boundary: condition={held!r} holds at boundary points; pass a mask of them, or 'detect'"
         )
     if normals is not None:
         if d != ambient - 1:
             raise InputError(f"normals: only hypersurfaces have them, not dim={d} in R^{ambient}")
-        normals = check_normals(normals, points)
+        normals = checks.check_normals(normals, points)
     index, progress = torch.arange(len(points)), progress and sys.stderr.isatty()
     numbering = Numbering.along_tree(points) if found is None else Numbering(index, index)
     here = numbering.sorted(points)
-    mask = numbering.sorted(where) if isinstance(where, Tensor) else None
+    mask = None if where is None else numbering.sorted(where)
     normals = None if normals is None else numbering.sorted(normals)
     with renumbered(numbering.given), threads_for(len(points)):
         if found is None:
@@ -139,14 +118,16 @@ def build_cloud(
                 "has no measure; 'neumann' and 'dirichlet' can hold there, and from_mesh takes every condition"
             )
         if mask is not None and found.shares is None:
-            warn_of_buried(found.cells, mask)
+            doubts.warn_of_buried(found.cells, mask)
         if isinstance(found, CloudSurface):
             return _on_surface(points, here, found, options, mask, numbering, progress)
         if d == 1:
-            warn_of_near_duplicates(here, nearest_neighbors(here, min(NEAREST, len(here))), 1)
+            doubts.warn_of_near_duplicates(
+                here, nearest_neighbors(here, min(NEAREST, len(here))), 1
+            )
     cells, edge = numbering.given[found.cells], None
-    if isinstance(where, Tensor):
-        edge = where if found.shares is not None else where & on_rim(cells, len(points))
+    if where is not None:
+        edge = where if found.shares is not None else where & doubts.on_rim(cells, len(points))
     rest = numbering.restored(found.points), cells, options, edge, "points", progress, found.shares
     return on_cells(points, *rest)
 
@@ -160,7 +141,7 @@ def _given_complex(points: Points, reconstruction: Reconstruction, dim: int | No
         return found
     places, cells = (found.points, found.cells) if isinstance(found, Complex) else (points, found)
     places = check_points(places)
-    cells = mended_faces(places, check_faces(cells, len(points)))
+    cells = checks.mended_faces(places, checks.check_faces(cells, len(points)))
     if places.shape != points.shape or dim not in (None, cells.shape[1] - 1):
         raise InputError(
             f"reconstruct: expected cells through the {len(points)} points, of dimension {dim or 'any'}, got some of "
@@ -180,9 +161,9 @@ def _on_surface(
 ) -> Parts:
     """Build an operator on a cloud in R² or R³, sorted `here`, by the surface through it."""
     placed = torch.where(surface.lone[:, None], surface.points[:, : here.shape[1]], here)
-    warn_of_near_duplicates(placed, surface.neighbors, 2)
+    doubts.warn_of_near_duplicates(placed, surface.neighbors, 2)
     if here.shape[1] == 3:
-        warn_of_layers(here)
+        doubts.warn_of_layers(here)
     surface = replace(surface, cells=flipped(surface.points, surface.cells))
     own = options.taken(numbering)
     shape = surface_shape(here, surface, own, boundary=boundary, progress=progress)
@@ -196,7 +177,7 @@ def on_cells(
     vertices: Points,
     cells: Int[Tensor, "F corners"],
     options: Options,
-    boundary: Bool[Tensor, " N"] | str | None,
+    boundary: Bool[Tensor, " N"] | None,
     source: str,
     progress: bool,
     shares: Float[Tensor, " F"] | None = None,
@@ -218,7 +199,7 @@ def on_cells(
             here,
             corners,
             options.taken(numbering),
-            boundary=numbering.sorted(boundary) if isinstance(boundary, Tensor) else None,
+            boundary=None if boundary is None else numbering.sorted(boundary),
             progress=progress,
             shares=None if shares is None else shares[order],
             on_mesh=source == "mesh",
@@ -252,8 +233,8 @@ def finished(
         plan, shape = replace(plan, pair=pair_plan), replace(shape, mass=mass)
     if surface is not None:
         if pair is not None:
-            warn_of_doubts(surface, fits, shape.areas)
-        warn_of_joins(surface)
+            doubts.warn_of_doubts(surface, fits, shape.areas)
+        doubts.warn_of_joins(surface)
     stencils = Stencils(shape, options)
     rows, certificate = assemble(stencils, progress=progress), None
     if options.certify:
@@ -299,7 +280,7 @@ def build_cotangent(vertices: ArrayLike, faces: ArrayLike) -> Parts:
         raise InputError(
             f"faces: the cotangent operator needs triangles, got {tuple(corners.shape)}"
         )
-    corners = mended_faces(vertices, corners)
+    corners = checks.mended_faces(vertices, corners)
     _warn_of_long_triangles(vertices, corners)
     matrix, mass = cotangent_laplacian(vertices, corners)
     options = Options(1, 0, condition=None, weak_form=False)
@@ -324,12 +305,12 @@ def _warn_of_long_triangles(vertices: Points, faces: Int[Tensor, "F 3"]) -> None
     """Warn where long triangles lie along much of the boundary."""
     nodes = lagrange_nodes(faces, len(vertices), 2)
     outer = nodes.sides[2].uses == 1
-    of = torch.zeros_like(outer)
-    of[nodes.edge[lying_triangles(vertices, nodes, outer)].flatten()] = True
+    sides = nodes.edge[lying_triangles(vertices, nodes, outer)].flatten()
+    of = outer & torch.isin(torch.arange(len(outer)), sides)
     length = (vertices[nodes.edges[:, 0]] - vertices[nodes.edges[:, 1]]).norm(dim=1)
-    long, whole = length[of & outer].sum(), length[outer].sum()
+    long, whole = length[of].sum(), length[outer].sum()
     if long > LOW * whole:
-        ends = nodes.edges[of & outer].unique()
+        ends = nodes.edges[of].unique()
         warn(
             f"cotangent operator: {long / whole:.0%} of the boundary ({first_few(ends)}) has long triangles along it, "
             "which tie the vertices there to straight lines, and eigenvalues may be far too large; "

@@ -15,14 +15,9 @@ from torchlb.errors import InputError, InputTypeError, first_few, warn
 from torchlb.geometry.boundary import folded_sides
 from torchlb.geometry.vectors import Points
 from torchlb.linalg.precision import NEGLIGIBLE, ROUNDING, SMALL
-from torchlb.operator.cleaning import (
-    are_quads,
-    coincident,
-    first_of_each,
-    proper_faces,
-    turned_faces,
-)
+from torchlb.operator import cleaning
 from torchlb.operator.inputs import ArrayLike, check_corners, check_mask, check_points
+from torchlb.stencils.conditions import Condition
 
 MAX_EXTENT = 1e30
 """Largest extent of the points, and inverse of the smallest, for which all libraries called keep their digits."""
@@ -51,7 +46,7 @@ def check_scale(points: Points) -> None:
 
 def check_distinct(points: Points) -> None:
     """Raise a ValueError that names coincident points."""
-    spacing, other, bad = coincident(points)
+    spacing, other, bad = cleaning.coincident(points)
     _warn_of_rounding(points, spacing)
     if len(bad):
         pair = sorted((int(bad[0]), int(other[bad[0]])))
@@ -108,7 +103,7 @@ def mended_faces(vertices: Points, faces: Int[Tensor, "F v"]) -> Int[Tensor, "G 
 
     Raises ValueError for quads, and for triangles none of which has an area.
     """
-    if faces.shape[1] == 4 and are_quads(faces):
+    if faces.shape[1] == 4 and cleaning.are_quads(faces):
         raise InputError(
             f"faces: shape {tuple(faces.shape)} is for tetrahedra, but these look like quads, since most share no "
             "three corners with another; split them with vertices, faces, kept = torchlb.clean_mesh(vertices, faces)"
@@ -130,7 +125,7 @@ def mended_faces(vertices: Points, faces: Int[Tensor, "F v"]) -> Int[Tensor, "G 
             )
     if faces.shape[1] == 4:
         _warn_of_flat_tetrahedra(vertices, faces)
-    first = first_of_each(faces)
+    first = cleaning.first_of_each(faces)
     if not first.all():
         again = (~first).nonzero()[:, 0]
         warn(
@@ -138,7 +133,7 @@ def mended_faces(vertices: Points, faces: Int[Tensor, "F v"]) -> Int[Tensor, "G 
             "torchlb.clean_mesh(vertices, faces) removes them"
         )
         faces = faces[first]
-    turned = turned_faces(faces)
+    turned = cleaning.turned_faces(faces)
     if turned.any():
         wrong = turned.nonzero()[:, 0]
         if vertices.shape[1] <= faces.shape[1]:  # else there are no normals
@@ -147,7 +142,7 @@ def mended_faces(vertices: Points, faces: Int[Tensor, "F v"]) -> Int[Tensor, "G 
                 "that the normals agree; torchlb.clean_mesh(vertices, faces) does it in the mesh"
             )
         faces = torch.where(turned[:, None], faces.flip(1), faces)
-    spacing, _, bad = coincident(vertices)
+    spacing, _, bad = cleaning.coincident(vertices)
     _warn_of_rounding(vertices, spacing)
     if len(bad):
         warn(
@@ -179,16 +174,14 @@ def _warn_of_flat_tetrahedra(vertices: Points, faces: Int[Tensor, "F 4"]) -> Non
 
 def check_faces(faces: ArrayLike, num_points: int) -> Int[Tensor, "F v"]:
     """Faces with distinct corners, checked as by `check_corners`; ValueError also for unreferenced vertices."""
-    faces = check_corners(faces, num_points)
-    used = torch.zeros(num_points, dtype=torch.bool)
-    used[proper_faces(faces).reshape(-1)] = True
-    lost = (~used).nonzero()[:, 0]
+    faces = cleaning.proper_faces(check_corners(faces, num_points))
+    lost = (faces.flatten().bincount(minlength=num_points) == 0).nonzero()[:, 0]
     if len(lost):
         raise InputError(
             f"faces: {len(lost)} vertices ({first_few(lost)}) belong to no face with distinct corners; drop them with "
             "vertices, faces, kept = torchlb.clean_mesh(vertices, faces)"
         )
-    return proper_faces(faces)
+    return faces
 
 
 def check_normals(normals: ArrayLike, points: Points) -> Points:
@@ -207,13 +200,14 @@ def check_normals(normals: ArrayLike, points: Points) -> Points:
     return normals / length[:, None]
 
 
-def check_boundary(boundary: Any, num_points: int) -> Bool[Tensor, " N"] | str | None:
-    """A mask of all points, "detect" or None; ValueError for anything else."""
+def check_boundary(boundary: Any, num_points: int) -> Bool[Tensor, " N"] | None:
+    """A mask of all points, or None, also for "detect"; ValueError for anything else."""
     if boundary is None or (isinstance(boundary, str) and boundary == "detect"):
-        return boundary
+        return None
     if isinstance(boundary, str):
+        hint = f"; what holds there is condition={boundary!r}" * (boundary in Condition.known)
         raise InputError(
-            f"boundary: expected a mask of the points, 'detect' or None, got {boundary!r}"
+            f"boundary: expected a mask of the points, 'detect' or None, got {boundary!r}{hint}"
         )
     return check_mask(boundary, num_points, "boundary")
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
@@ -20,14 +22,13 @@ from torchlb.operator.inputs import ArrayLike, as_tensor, check_corners, check_m
 
 def coincident(points: Points) -> tuple[Float[Tensor, " N"], Int[Tensor, " N"], Int[Tensor, " T"]]:
     """Nearest other point of each: (distance, its index, indices of the points that coincide with it to rounding)."""
-    tree = KDTree(points.numpy())
-    distance, nearest = tree.query(points.numpy(), k=min(2, len(points)))
-    distance = torch.from_numpy(distance).view(len(points), -1)[:, -1]
-    nearest = torch.from_numpy(nearest).view(len(points), -1)
+    tree: Any = KDTree(points.numpy())
+    found = tree.query(points.numpy(), k=[1, min(2, len(points))])
+    distance, nearest = (torch.from_numpy(each.T) for each in found)
     index = torch.arange(len(points))
-    other = torch.where(nearest[:, 0] == index, nearest[:, -1], nearest[:, 0])
-    close = (distance <= ROUNDING * points.abs().max()) & (other != index)
-    return distance, other, close.nonzero()[:, 0]
+    other = torch.where(nearest[0] == index, nearest[1], nearest[0])
+    close = (distance[1] <= ROUNDING * points.abs().max()) & (other != index)
+    return distance[1], other, close.nonzero()[:, 0]
 
 
 def clean_points(points: ArrayLike, tolerance: float = 0.0) -> tuple[Tensor, Tensor]:

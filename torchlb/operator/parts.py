@@ -73,9 +73,8 @@ class Modes(Tensors):
         parts = zip(vectors.split(sizes), free.split(sizes), strict=True)
         counts = [(int((modes != 0).any(0).sum()), int(inside.sum())) for modes, inside in parts]
         most = max(sizes)
-        self._counts = torch.empty(
-            min([held for held, all_ in counts if held < all_] + [most]), most
-        )
+        known = min((held for held, every in counts if held < every), default=most)
+        self._counts = torch.empty(known, most)
 
 
 class OperatorCache:

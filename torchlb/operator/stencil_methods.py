@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Any
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from torch import Tensor
 
 from torchlb.errors import InputError
@@ -16,6 +17,7 @@ from torchlb.operator.report import StencilReport
 from torchlb.operator.storage import OperatorStorage
 
 
+@dataclass(frozen=True, eq=False, repr=False)
 class Curvatures:
     """Curvatures of a surface in R³ at its points, positive where it bends away from its normals, as a sphere does.
 
@@ -29,10 +31,8 @@ class Curvatures:
         (N, 3, 2), orthonormal tangent vectors in columns.
     """
 
-    def __init__(
-        self, shape_operator: Float[Tensor, "N 2 2"], frames: Float[Tensor, "N 3 2"]
-    ) -> None:
-        self.shape_operator, self._frames = shape_operator, frames
+    shape_operator: Float[Tensor, "N 2 2"]
+    frames: Float[Tensor, "N 3 2"]
 
     @property
     def k1(self) -> Float[Tensor, " N"]:
@@ -47,7 +47,7 @@ class Curvatures:
     @property
     def directions(self) -> Float[Tensor, "N 3 2"]:
         """Unit tangent vectors of space of κ₁ and κ₂, up to their sign; any where both are equal."""
-        return self._frames @ torch.linalg.eigh(self.shape_operator).eigenvectors.flip(2)
+        return self.frames @ torch.linalg.eigh(self.shape_operator).eigenvectors.flip(2)
 
     @property
     def mean(self) -> Float[Tensor, " N"]:
@@ -189,11 +189,14 @@ class StencilMethods(OperatorStorage):
 
         In rows that contain a boundary point, and so a condition that x does not satisfy, it is computed as div ∇x.
         """
-        normal, on_boundary = self(self.points), self._boundary_points()
-        if not on_boundary.any():
+        normal, sides = self(self.points), boundary_faces(self.faces.cpu()).flatten()
+        edge = torch.zeros_like(self.mass, dtype=torch.bool)
+        edge = edge.index_fill(0, sides.to(edge.device), True)
+        edge = edge if self.boundary is None else edge | self.boundary  # held there or not
+        if not edge.any():
             return normal
-        row = self.stencil.row[on_boundary[self.stencil.col]]
-        free = torch.ones_like(on_boundary).index_fill(0, row, False)[:, None]
+        row = self.stencil.row[edge[self.stencil.col]]
+        free = torch.ones_like(edge).index_fill(0, row, False)[:, None]
         return torch.where(free, normal, self.divergence(self.gradient(self.points)))
 
     def curvatures(self) -> Curvatures:
@@ -217,14 +220,6 @@ class StencilMethods(OperatorStorage):
                 "LaplaceBeltramiTransform again"
             )
         return Curvatures(self._shape_operators, self.frames)
-
-    def _boundary_points(self) -> Bool[Tensor, " N"]:
-        """Mask of the boundary points, whether or not a condition holds there."""
-        on_boundary = torch.zeros_like(self.mass, dtype=torch.bool)
-        if self.boundary is not None:
-            on_boundary |= self.boundary
-        sides = boundary_faces(self.faces.cpu()).flatten()
-        return on_boundary.index_fill(0, sides.to(on_boundary.device), True)
 
 
 def turned_frames(lb: Any) -> Float[Tensor, "N 3 2"]:

@@ -146,7 +146,7 @@ class PairSystem:
             right, time = right * (longest / time).clamp_max(1.0), time.clamp_max(longest)
         near = partial(self.near, self.levels(time, b.shape[1]))
         x = near(right) if tolerance == "P1" else self._solved(right, time, tolerance, near)
-        shift = -self._mean(self.ones_mass, x)
+        shift = -self.mean(x, self.ones_mass)
         return x.add_(shift if time is None else shift + mean)
 
     def solve_beyond(
@@ -232,7 +232,12 @@ class PairSystem:
 
         The cycle is of K alone where M is small for the shortest time.
         """
-        coarse = partial(self._coarse, unit, near, centered)
+
+        def coarse(r: Tensor) -> Tensor:
+            x = near(r.double()).mul_(unit)
+            # where K is singular rounding adds large constants
+            return (x - self.mean(x, self.ones_mass) if centered else x).to(r)
+
         if not self.smooths:
             return coarse
         shares = [share.float() for share in shares]
@@ -242,11 +247,6 @@ class PairSystem:
             terms = terms[:1]
         cycle = two_grid(partial(self._product, terms), sum(sums[1:], sums[0]), coarse)
         return lambda r: cycle(r.float()).to(r)
-
-    def _coarse(self, unit: Tensor, near: Linear, centered: bool, r: Tensor) -> Tensor:
-        """The factors' solve, less the large constants that rounding adds where K is singular."""
-        x = near(r.double()).mul_(unit)
-        return (x - self._mean(self.ones_mass, x) if centered else x).to(r)
 
     def _product(self, terms: list[tuple[Tensor, Matrix]], x: Tensor) -> Tensor:
         """Product of every column with its shares of the matrices."""
@@ -270,7 +270,7 @@ class PairSystem:
         """The solution by P1 elements."""
         blocks = r.split([count for _, count in levels], dim=1)
         solved = [self.factor(t).solve(block) for (t, _), block in zip(levels, blocks, strict=True)]
-        return self.inside(solved[0] if len(solved) == 1 else torch.cat(solved, dim=1))
+        return self.inside(torch.cat(solved, dim=1))
 
     def factor(self, t: float | None) -> Factor:
         """The factor of M₁ + tK₁, or of K₁ with a small multiple of M₁ that makes it definite."""
@@ -301,13 +301,10 @@ class PairSystem:
                 "from where its plan was made (lb.at); build the operator anew"
             ) from error
 
-    def mean(self, b: Float[Tensor, "N C"]) -> Float[Tensor, "_ C"]:
-        """1ᵀb over the area of each component where K1 = 0, one row if there is one component."""
-        return self._mean(self.one, b)
-
-    def _mean(self, weights: Tensor, x: Tensor) -> Tensor:
-        """Weighted sums over components where K1 = 0, divided by their areas; 0 on the others."""
-        return torch.where(self.unheld, self._sums(weights, x) / self.area, 0.0)
+    def mean(self, b: Float[Tensor, "N C"], weights: Tensor | None = None) -> Float[Tensor, "_ C"]:
+        """Weighted sums over components where K1 = 0, over their areas, as `_sums`; 0 on the others."""
+        sums = self._sums(self.one if weights is None else weights, b)
+        return torch.where(self.unheld, sums / self.area, 0.0)
 
     def inside(self, x: Tensor) -> Tensor:
         """x, set to zero at Dirichlet points."""

@@ -166,18 +166,6 @@ def _following(
     return _Known.apply(gradient, len(given), *given, *variables)  # pyright: ignore[reportReturnType]
 
 
-def refused(value: Tensor, what: str, *variables: Tensor) -> Tensor:
-    """The value, which raises DerivativeError where its derivative in the variables is asked for."""
-
-    def gradient(g: Tensor) -> list[Tensor]:
-        raise DerivativeError(
-            f"{what}: no derivative in the points or in the medium; eigenpairs, flows, solves, the mass, "
-            "lb.product(name, f), Δf and ∇f have one. For derivatives in f, take an operator at points.detach()"
-        )
-
-    return _following([value], gradient, *variables)[0]
-
-
 def known(lb: Any, results: Sequence[Tensor], forms: Forms) -> Sequence[Tensor]:
     """Results with their derivatives in the operator's variables, by the forms that gradients make."""
     found = origins(lb)
@@ -192,8 +180,14 @@ def known(lb: Any, results: Sequence[Tensor], forms: Forms) -> Sequence[Tensor]:
 
 def without(lb: Any, x: Tensor, what: str) -> Tensor:
     """x, by which nothing is differentiable in points or medium: DerivativeError where that is asked for."""
-    found = origins(lb)
-    return x if found is None else x + refused(torch.zeros_like(x), what, *found.variables)
+
+    def refused(g: Tensor) -> list[BilinearForm]:
+        raise DerivativeError(
+            f"{what}: no derivative in the points or in the medium; eigenpairs, flows, solves, the mass, "
+            "lb.product(name, f), Δf and ∇f have one. For derivatives in f, take an operator at points.detach()"
+        )
+
+    return x if origins(lb) is None else x + known(lb, [torch.zeros_like(x)], refused)[0]
 
 
 def carrying(lb: Any, points: Any) -> Any:
@@ -224,9 +218,8 @@ def carrying(lb: Any, points: Any) -> Any:
 
     (lb.mass,) = known(lb, [lb.mass], of_mass)
     mass = lb.mass.detach().cpu().double()
-    variables = (
-        [own, lb.mass] if lb.weak.near.values[3:4].any() else [own]
-    )  # Robin's low-order rows
+    of_robin = lb.weak.near.values[3:4].any()  # whose low-order rows have the mass in them
+    variables = [own, lb.mass] if of_robin else [own]
     rows = [lb.stencil.values, lb.frames]
     rows += [lb.normals, lb._shape_operators] if len(lb.normals) else []
     lb.stencil.values, lb.frames, *rest = _following(rows, of_rows, *variables)
@@ -264,11 +257,10 @@ def through_eigenpairs(lb: Any, whole: Eigenbasis, k: int) -> Eigenbasis:
         grads = values.view(len(shapes), -1), vectors.split(sizes), left.split(sizes)
         parts = [_of_shape(*row) for row in zip(shapes, wholes, *grads, strict=True)]
         most = max(part[0].shape[1] for part in parts)
-        joined = (
+        w, of_mass, u = (
             torch.cat([pad(own, (0, most - own.shape[1])) for own in column])
             for column in zip(*parts, strict=True)
         )
-        w, of_mass, u = joined
         one = torch.ones(most, dtype=torch.float64)
         return [BilinearForm("energy", w, u, one), BilinearForm("mass", of_mass, u, one)]
 
