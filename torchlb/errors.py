@@ -96,7 +96,7 @@ def shown(value: object, longest: int = 80) -> str:
 
 
 def warn(
-    message: str, category: type[Warning] = TorchlbWarning, *, once: set[Any] | None = None
+    message: str, category: type[Warning] = TorchlbWarning, *, once: set | None = None
 ) -> None:
     """Issue a warning at the line outside torchlb from which the call came; with `once` one kind once for each line."""
     frame, level = sys._getframe(), 1

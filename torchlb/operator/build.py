@@ -51,12 +51,7 @@ REMEDIES = {
 
 
 def build_mesh(
-    vertices: ArrayLike,
-    faces: ArrayLike,
-    options: Options,
-    *,
-    boundary: ArrayLike | str | None,
-    progress: bool,
+    vertices: ArrayLike, faces: ArrayLike, options: Options, *, boundary: Any, progress: bool
 ) -> Parts:
     """Build an operator on a mesh; arguments as for `LaplaceBeltrami.from_mesh`."""
     vertices, corners = _checked(vertices, faces)
@@ -122,9 +117,8 @@ def build_cloud(
         if isinstance(found, CloudSurface):
             return _on_surface(points, here, found, options, mask, numbering, progress)
         if d == 1:
-            doubts.warn_of_near_duplicates(
-                here, nearest_neighbors(here, min(NEAREST, len(here))), 1
-            )
+            near = nearest_neighbors(here, min(NEAREST, len(here)))
+            doubts.warn_of_near_duplicates(here, near, 1)
     cells, edge = numbering.given[found.cells], None
     if where is not None:
         edge = where if found.shares is not None else where & doubts.on_rim(cells, len(points))
@@ -135,9 +129,7 @@ def build_cloud(
 def _given_complex(points: Points, reconstruction: Reconstruction, dim: int | None) -> Complex:
     """The complex that a user's function makes of the points, checked."""
     found = reconstruction(points.clone())
-    if isinstance(found, CloudSurface):
-        return found
-    if isinstance(found, Complex) and found.shares is not None:
+    if isinstance(found, Complex) and (isinstance(found, CloudSurface) or found.shares is not None):
         return found
     places, cells = (found.points, found.cells) if isinstance(found, Complex) else (points, found)
     places = check_points(places)
@@ -169,7 +161,7 @@ def _on_surface(
     shape = surface_shape(here, surface, own, boundary=boundary, progress=progress)
     faces, order = numbering.given[surface.cells], torch.arange(len(surface.cells))
     plan = _plan(shape, numbering, points, faces, order, order[:0], "points", options)
-    return finished(plan, shape, surface.cells, progress, surface)
+    return finished(plan, shape, progress, surface)
 
 
 def on_cells(
@@ -195,18 +187,15 @@ def on_cells(
         if here.shape[1] <= 3:
             corners = flipped(pad(here, (0, 3 - here.shape[1])), corners)
     with renumbered(numbering.given), threads_for(len(vertices)):
+        part = None if boundary is None else numbering.sorted(boundary)
+        own, on_mesh = options.taken(numbering), source == "mesh"
+        shares = None if shares is None else shares[order]
         shape = mesh_shape(
-            here,
-            corners,
-            options.taken(numbering),
-            boundary=None if boundary is None else numbering.sorted(boundary),
-            progress=progress,
-            shares=None if shares is None else shares[order],
-            on_mesh=source == "mesh",
+            here, corners, own, boundary=part, progress=progress, shares=shares, on_mesh=on_mesh
         )
         moved = (vertices != given).any(1).nonzero()[:, 0]
         plan = _plan(shape, numbering, given, cells, order, moved, source, options)
-        return finished(plan, shape, corners, progress)
+        return finished(plan, shape, progress)
 
 
 def _plan(shape: Shape, numbering: Numbering, points: Tensor, *rest: Any) -> Plan:
@@ -216,16 +205,12 @@ def _plan(shape: Shape, numbering: Numbering, points: Tensor, *rest: Any) -> Pla
 
 
 def finished(
-    plan: Plan,
-    shape: Shape,
-    cells: Int[Tensor, "G corners"],
-    progress: bool,
-    surface: CloudSurface | None = None,
+    plan: Plan, shape: Shape, progress: bool, surface: CloudSurface | None = None
 ) -> Parts:
     """The operator of a shape of cells: weak pair, rows, certified if asked for, and the rest of the plan."""
     options, pair, fits = plan.options.taken(plan.numbering), None, plan.shape.fits
     if options.weak_form:
-        stars = None if surface is None else surface.stars
+        cells, stars = (surface.cells, surface.stars) if surface else (plan.shape.cells, None)
         rest = stars, shape.held, plan.shape.shares, plan.numbering
         assert shape.fits is not None
         own = fits, shape.fits, *options.elements
@@ -262,9 +247,8 @@ def _warn_of_low_order(rows: Rows, plan: Plan) -> None:
     if share < MANY:
         return
     reason = Reason(int(rows.reason[low].mode().values)).text
-    reason += (
-        f". {REMEDIES[plan.source].format(plan.faces.shape[1] - 1)}; `print(lb.report)` says more"
-    )
+    remedy = REMEDIES[plan.source].format(plan.faces.shape[1] - 1)
+    reason += f". {remedy}; `print(lb.report)` says more"
     if plan.pair is not None:
         _, _, edges, curved = plan.pair.counts.sum(1).tolist()
         share_curved = f"{curved / max(edges, 1):.0%} of its edges curved"
@@ -275,16 +259,14 @@ def _warn_of_low_order(rows: Rows, plan: Plan) -> None:
 
 def build_cotangent(vertices: ArrayLike, faces: ArrayLike) -> Parts:
     """Build the cotangent operator with its mass; arguments as for `LaplaceBeltrami.from_cotangent`."""
-    vertices, corners = _checked(vertices, faces)
-    if corners.shape[1] != 3:
-        raise InputError(
-            f"faces: the cotangent operator needs triangles, got {tuple(corners.shape)}"
-        )
-    corners = checks.mended_faces(vertices, corners)
-    _warn_of_long_triangles(vertices, corners)
-    matrix, mass = cotangent_laplacian(vertices, corners)
+    vertices, cells = _checked(vertices, faces)
+    if cells.shape[1] != 3:
+        raise InputError(f"faces: the cotangent operator needs triangles, got {tuple(cells.shape)}")
+    cells = checks.mended_faces(vertices, cells)
+    _warn_of_long_triangles(vertices, cells)
+    matrix, mass = cotangent_laplacian(vertices, cells)
     options = Options(1, 0, condition=None, weak_form=False)
-    shape = replace(mesh_shape(vertices, corners, options), mass=mass)
+    shape = replace(mesh_shape(vertices, cells, options), mass=mass)
     centers = torch.arange(len(vertices))
     crow, col, laplacian = from_scipy(matrix)
     entries = col, laplacian, torch.ones_like(col, dtype=torch.bool)
@@ -292,12 +274,12 @@ def build_cotangent(vertices: ArrayLike, faces: ArrayLike) -> Parts:
     row = centers.repeat_interleave(rows.length)
     diagonal = row == rows.col
     weak = [-mass[row] * rows.laplacian, mass[row] * diagonal]
-    _, length = outward_sums(vertices, *open_sides(corners))
+    _, length = outward_sums(vertices, *open_sides(cells))
     if length.any():  # lumped, as the mass is
         weak.append(length[row] / 2 * diagonal)
     pair = PairMatrices(rows.crow, rows.col, torch.stack(weak))
-    every, same = torch.arange(len(corners)), Numbering(centers, centers)
-    plan = _plan(shape, same, vertices, corners, every, every[:0], "cotangent", options)
+    every, same = torch.arange(len(cells)), Numbering(centers, centers)
+    plan = _plan(shape, same, vertices, cells, every, every[:0], "cotangent", options)
     return operator_parts(plan, vertices, rows, shape, pair)
 
 

@@ -117,8 +117,8 @@ def mended_faces(vertices: Points, faces: Int[Tensor, "F v"]) -> Int[Tensor, "G 
                 "the vertices of a surface, or a curve by its edges, (F, 2)"
             )
     if faces.shape[1] == 2:
-        none = (vertices[faces[:, 0]] == vertices[faces[:, 1]]).all(1).nonzero()[:, 0]
-        if len(none):
+        ends = vertices[faces]
+        if len(none := (ends[:, 0] == ends[:, 1]).all(1).nonzero()[:, 0]):
             raise InputError(
                 f"faces: {len(none)} segments ({first_few(none)}) have no length, their ends share a place; make one "
                 "vertex of the two with vertices, faces, kept = torchlb.clean_mesh(vertices, faces, merge=True)"
@@ -126,16 +126,14 @@ def mended_faces(vertices: Points, faces: Int[Tensor, "F v"]) -> Int[Tensor, "G 
     if faces.shape[1] == 4:
         _warn_of_flat_tetrahedra(vertices, faces)
     first = cleaning.first_of_each(faces)
-    if not first.all():
-        again = (~first).nonzero()[:, 0]
+    if len(again := (~first).nonzero()[:, 0]):
         warn(
             f"faces: {len(again)} have the corners of an earlier one ({first_few(again)}) and are left out; "
             "torchlb.clean_mesh(vertices, faces) removes them"
         )
         faces = faces[first]
     turned = cleaning.turned_faces(faces)
-    if turned.any():
-        wrong = turned.nonzero()[:, 0]
+    if len(wrong := turned.nonzero()[:, 0]):
         if vertices.shape[1] <= faces.shape[1]:  # else there are no normals
             warn(
                 f"faces: {len(wrong)} are wound against their neighbours ({first_few(wrong)}) and are turned round, so "
@@ -157,14 +155,12 @@ def _warn_of_flat_tetrahedra(vertices: Points, faces: Int[Tensor, "F 4"]) -> Non
     edges = vertices[faces[:, 1:]] - vertices[faces[:, :1]]
     longest = (vertices[faces[:, None]] - vertices[faces[:, :, None]]).norm(dim=-1).amax((1, 2))
     flat = torch.linalg.svdvals(edges)[:, :3].prod(1) <= NEGLIGIBLE * longest**3
-    if flat.any():
-        none = flat.nonzero()[:, 0]
+    if len(none := flat.nonzero()[:, 0]):
         warn(
             f"faces: {len(none)} tetrahedra have no volume ({first_few(none)}) and count for nothing; that is "
             "right of slivers between others, as Delaunay's of a grid"
         )
-    within = folded_sides(vertices, faces).unique()
-    if len(within):
+    if len(within := folded_sides(vertices, faces).unique()):
         warn(
             f"faces: at {len(within)} vertices ({first_few(within)}) sides of tetrahedra lie on one another, not "
             "one and the same, as where slivers between them were removed: they are a boundary within, where "
@@ -175,8 +171,7 @@ def _warn_of_flat_tetrahedra(vertices: Points, faces: Int[Tensor, "F 4"]) -> Non
 def check_faces(faces: ArrayLike, num_points: int) -> Int[Tensor, "F v"]:
     """Faces with distinct corners, checked as by `check_corners`; ValueError also for unreferenced vertices."""
     faces = cleaning.proper_faces(check_corners(faces, num_points))
-    lost = (faces.flatten().bincount(minlength=num_points) == 0).nonzero()[:, 0]
-    if len(lost):
+    if len(lost := (faces.flatten().bincount(minlength=num_points) == 0).nonzero()[:, 0]):
         raise InputError(
             f"faces: {len(lost)} vertices ({first_few(lost)}) belong to no face with distinct corners; drop them with "
             "vertices, faces, kept = torchlb.clean_mesh(vertices, faces)"
@@ -192,8 +187,7 @@ def check_normals(normals: ArrayLike, points: Points) -> Points:
             f"normals: expected the shape of points {tuple(points.shape)}, got {tuple(normals.shape)}"
         )
     length = normals.norm(dim=1)
-    bad = (length == 0).nonzero()[:, 0]
-    if len(bad):
+    if len(bad := (length == 0).nonzero()[:, 0]):
         raise InputError(
             f"normals: {len(bad)} are zero ({first_few(bad)}); leave `normals` out to have them estimated"
         )
@@ -205,7 +199,7 @@ def check_boundary(boundary: Any, num_points: int) -> Bool[Tensor, " N"] | None:
     if boundary is None or (isinstance(boundary, str) and boundary == "detect"):
         return None
     if isinstance(boundary, str):
-        hint = f"; what holds there is condition={boundary!r}" * (boundary in Condition.known)
+        hint = f"; pass condition={boundary!r}" if boundary in Condition.known else ""
         raise InputError(
             f"boundary: expected a mask of the points, 'detect' or None, got {boundary!r}{hint}"
         )

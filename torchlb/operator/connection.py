@@ -120,7 +120,7 @@ def connection_of(lb: Any) -> Connection:
     if lb.cache.connection is None:
         check_pair(lb)
         with torch.inference_mode(False):
-            lb.cache.connection = _of_batch(lb) if lb.sizes is not None else _of_shape(lb)
+            lb.cache.connection = _of_shape(lb) if lb.sizes is None else _of_batch(lb)
     return lb.cache.connection
 
 

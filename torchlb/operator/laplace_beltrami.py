@@ -58,8 +58,6 @@ class LaplaceBeltrami(StencilMethods, PairMethods):
     source, options
         "points", "mesh", "cotangent" or "batch", and the options of the constructor, as passed.
 
-    Examples
-    --------
     >>> theta = torch.arange(36, dtype=torch.float64) * torch.pi / 18
     >>> circle = torch.stack([theta.cos(), theta.sin()], dim=1)
     >>> lb = LaplaceBeltrami.from_points(circle, order=3)

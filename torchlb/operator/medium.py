@@ -36,11 +36,7 @@ def elements_of(lb: Any) -> Any:
 
 
 def checked_fields(lb: OperatorStorage, given: Given) -> MediumFields:
-    """The fields that are given, on the device of the operator, which carry gradients.
-
-    Raises InputError for a wrong shape, values that are not positive (of a potential: negative), tensors that are not
-    symmetric, and an operator without a weak pair.
-    """
+    """The fields that are given, on the device of the operator, which carry gradients; InputError for bad ones."""
     fields = {name: x for name, x in given.items() if x is not None}
     if not fields:
         raise InputError("with_medium: expected a conductivity, a density or a potential, got none")
@@ -100,8 +96,7 @@ def _check_values(name: str, x: Tensor) -> None:
     elif name == "potential":
         what, bad = "nonnegative", ~(x >= 0)
         remedy = "; with c + μρ in place of c the eigenvalues are λ + μ"
-    bad = (bad | ~least.isfinite()).nonzero()[:, 0]
-    if len(bad):
+    if len(bad := (bad | ~least.isfinite()).nonzero()[:, 0]):
         raise InputError(
             f"{name}: expected finite, {what} values, got {x[bad[0]].tolist()}, … at {len(bad)} of {len(x)} vertices "
             f"or faces ({first_few(bad)}){remedy}"

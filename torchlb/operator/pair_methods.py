@@ -131,9 +131,7 @@ class PairMethods(OperatorStorage):
     def inner(self, f: Tensor, g: Tensor) -> Tensor:
         """∫fg = fᵀMg for equal shapes, as for `integral`, with the density of a medium; by component for fields."""
         if f.shape != g.shape:
-            raise InputError(
-                f"inner: expected equal shapes, got {tuple(f.shape)}, {tuple(g.shape)}"
-            )
+            raise InputError(f"inner: expected equal shapes, got {(*f.shape,)}, {(*g.shape,)}")
         return self._summed(f * self.product("mass", g))
 
     def _summed(self, x: Tensor) -> Tensor:
@@ -181,12 +179,7 @@ class PairMethods(OperatorStorage):
         store
             Whether `state_dict` holds the basis from now on; it then loads into any operator.
 
-        Raises
-        ------
-        EigenbasisError
-            Where the solver does not converge.
-        InputError
-            Without a weak pair.
+        Raises EigenbasisError where the solver does not converge, InputError without a weak pair.
         """
         k = check_num_pairs(k)
         count = k + (0 if origins(self) is None else BEYOND)

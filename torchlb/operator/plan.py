@@ -226,18 +226,13 @@ def shape_operators(placed: Placed, rows: Rows, order: Int[Tensor, " N"]) -> Flo
 
 
 def check_fit(plan: Plan, after: Points) -> None:
-    """Warn where edges changed by more than `FACTOR` against all others, as what was decided may not fit there.
-
-    It warns once for each line of a program. Raises InputError where triangles of the plane, or tetrahedra of space,
-    were turned inside out.
-    """
+    """Warn, once a line of a program, of edges that changed by more than `FACTOR`; InputError for inverted cells."""
     before, cells = plan.points, plan.faces
     edges = cells[:, torch.tensor(subsets(cells.shape[1] - 1, 2))]
     one, two = (edge_lengths(x, cells) for x in (before, after))
     stretch = torch.where(one > 0, two / one, 1.0)
     change = stretch / stretch.median()
-    changed = edges[(change > FACTOR) | (change < 1 / FACTOR)].unique()
-    if len(changed):
+    if len(changed := edges[(change > FACTOR) | (change < 1 / FACTOR)].unique()):
         warn(
             f"at: {len(changed)} points ({first_few(changed)}) have edges that grew or shrank by more than "
             f"{FACTOR:.0f} times against the others since neighbours, degrees and cells were decided; build the "
@@ -247,8 +242,7 @@ def check_fit(plan: Plan, after: Points) -> None:
     if cells.shape[1] == before.shape[1] + 1:
         corners = torch.stack([before, after])[:, cells]
         turned = torch.linalg.det(corners[:, :, 1:] - corners[:, :, :1]).sign().prod(0)
-        inverted = cells[turned * turned.sum().sign() < 0].unique()
-        if len(inverted):
+        if len(inverted := cells[turned * turned.sum().sign() < 0].unique()):
             raise InputError(
                 f"points: cells at {len(inverted)} of them ({first_few(inverted)}) are turned inside out; smaller "
                 "steps, or other cells, are needed"

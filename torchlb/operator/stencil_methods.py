@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from torchlb.errors import InputError
@@ -189,14 +189,11 @@ class StencilMethods(OperatorStorage):
 
         In rows that contain a boundary point, and so a condition that x does not satisfy, it is computed as div ∇x.
         """
-        normal, sides = self(self.points), boundary_faces(self.faces.cpu()).flatten()
-        edge = torch.zeros_like(self.mass, dtype=torch.bool)
-        edge = edge.index_fill(0, sides.to(edge.device), True)
-        edge = edge if self.boundary is None else edge | self.boundary  # held there or not
-        if not edge.any():
+        normal, on_boundary = self(self.points), self._boundary_points()
+        if not on_boundary.any():
             return normal
-        row = self.stencil.row[edge[self.stencil.col]]
-        free = torch.ones_like(edge).index_fill(0, row, False)[:, None]
+        row = self.stencil.row[on_boundary[self.stencil.col]]
+        free = torch.ones_like(on_boundary).index_fill(0, row, False)[:, None]
         return torch.where(free, normal, self.divergence(self.gradient(self.points)))
 
     def curvatures(self) -> Curvatures:
@@ -220,6 +217,12 @@ class StencilMethods(OperatorStorage):
                 "LaplaceBeltramiTransform again"
             )
         return Curvatures(self._shape_operators, self.frames)
+
+    def _boundary_points(self) -> Bool[Tensor, " N"]:
+        """Mask of the boundary points, whether or not a condition holds there."""
+        sides = boundary_faces(self.faces.cpu()).flatten().to(self.mass.device)
+        found = torch.zeros_like(self.mass, dtype=torch.bool).index_fill(0, sides, True)
+        return found if self.boundary is None else found | self.boundary
 
 
 def turned_frames(lb: Any) -> Float[Tensor, "N 3 2"]:

@@ -88,8 +88,7 @@ class OperatorStorage(Tensors):
 
     def _save_to_state_dict(self, destination: Any, prefix: str, keep_vars: bool) -> None:
         super()._save_to_state_dict(destination, prefix, keep_vars)
-        plans = self._packed_plans()
-        if len(plans):
+        if len(plans := self._packed_plans()):
             destination[f"{prefix}plans"] = plans
 
     @property

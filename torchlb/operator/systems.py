@@ -14,12 +14,12 @@ import math
 from collections import OrderedDict
 from collections.abc import Callable
 from functools import cached_property, partial
-from typing import Any, Literal
+from typing import Literal
 from weakref import finalize
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from scipy import sparse
 from scipy.sparse import csgraph
 from torch import Tensor
@@ -92,7 +92,15 @@ class PairSystem:
         crow, col, linear = lb.weak.linear_pair
         first, second = (to_scipy(crow, col, v.double(), lb.shape) for v in linear)
         losing = lb.weak.losing(lb.fixed)
-        self._find_components(first, losing)
+        # the connected components, those where K1 = 0, and their areas
+        pattern = np.ones(first.nnz), first.indices, first.indptr
+        graph = sparse.csr_array(pattern, shape=first.shape)  # with entries that are zero
+        self.count, number = csgraph.connected_components(graph, directed=False)
+        self.component = torch.from_numpy(number.astype(np.int64)).to(losing.device)
+        held = losing.new_zeros(self.count, dtype=torch.float32)
+        held = held.index_add(0, self.component, losing.float())
+        self.unheld = ((held if self.count == 1 else held[self.component]) == 0)[:, None]
+        self.area = self._sums(self.one, self.ones_mass)
         if lb.weak.of_functions:
             sums = first.sum(1)  # negative row sums (float32) would make it indefinite
             sums = np.where(losing.cpu().numpy(), np.minimum(sums, 0.0), sums)
@@ -101,22 +109,8 @@ class PairSystem:
         self.factors: OrderedDict[float | None, Factor] = OrderedDict()
         finalize(self, self.factors.clear)  # cholespy reports factors that outlive Python as leaks
 
-    def _find_components(self, linear: Any, losing: Bool[Tensor, " N"]) -> None:
-        """Find the connected components, those where K1 = 0, and their areas.
-
-        Results have a row for each point, or one row where there is one component.
-        """
-        pattern = np.ones(linear.nnz), linear.indices, linear.indptr
-        graph = sparse.csr_array(pattern, shape=linear.shape)  # with entries that are zero
-        self.count, number = csgraph.connected_components(graph, directed=False)
-        self.component = torch.from_numpy(number.astype(np.int64)).to(losing.device)
-        held = torch.zeros(self.count, device=losing.device)
-        held = held.index_add(0, self.component, losing.float())
-        self.unheld = ((held if self.count == 1 else held[self.component]) == 0)[:, None]
-        self.area = self._sums(self.one, self.ones_mass)
-
     def _sums(self, weights: Float[Tensor, "N 1"], x: Float[Tensor, "N C"]) -> Float[Tensor, "_ C"]:
-        """Weighted sums over the component of each point."""
+        """Weighted sums over the component of each point, one row where there is one component."""
         if self.count == 1:
             return weights.T @ x
         found = x.new_zeros(self.count, x.shape[1])

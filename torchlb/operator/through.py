@@ -52,11 +52,16 @@ class _Origin(NamedTuple):
     def gradient(self, forms: Sequence[BilinearForm]) -> list[Tensor]:
         """The derivative of a sum of forms in the variables; DerivativeError where it is not finite."""
         medium, root = plain(self.medium), _root_of_absorption(self.weak)
-        forms = [part for form in forms for part in self._parts(form, root)]
+        energies = [form for form in forms if form.name == "energy"]
+        forms = [form for form in forms if form.name != "energy"]
+        forms += [form._replace(name="stiffness") for form in energies]
+        if "potential" in medium:
+            forms += [form._replace(name="potential") for form in energies]
+        if root is not None:
+            forms += [BilinearForm("boundary", root * w, root * u, c) for _, w, u, c, _ in energies]
         leaves = [f.values for name, f in medium.items() if self.medium[name].values.requires_grad]
-        moved = []
-        if self.points.requires_grad:
-            moved = [self.points.detach().cpu().double().requires_grad_()]
+        points = self.points.detach().cpu().double().requires_grad_()
+        moved = [points] if self.points.requires_grad else []
         with torch.enable_grad():
             assert self.bilinear is not None
             total = self.bilinear(*moved, forms, medium)
@@ -65,22 +70,10 @@ class _Origin(NamedTuple):
                 found = torch.autograd.grad(total, [*moved, *leaves], materialize_grads=True)
         return [_finite(g).to(v) for g, v in zip(found, self.variables, strict=True)]
 
-    def _parts(self, form: BilinearForm, root: Tensor | None) -> list[BilinearForm]:
-        """The forms that a form is the sum of; of a Robin condition `root` has √a at the vertices, (N, 1)."""
-        if form.name != "energy":
-            return [form]
-        parts = [form._replace(name="stiffness")]
-        if "potential" in self.medium:
-            parts.append(form._replace(name="potential"))
-        if root is not None:
-            parts.append(BilinearForm("boundary", root * form.w, root * form.u, form.c))
-        return parts
-
 
 def _finite(gradient: Tensor) -> Tensor:
     """The gradient in points or faces; DerivativeError where it is not finite."""
-    bad = (~gradient.isfinite()).nonzero()[:, 0].unique()
-    if len(bad):
+    if len(bad := (~gradient.isfinite()).nonzero()[:, 0].unique()):
         raise DerivativeError(
             f"points or medium: the derivative at {len(bad)} points or faces ({first_few(bad)}) is not finite, as "
             "where all cells of a point are degenerate, which can be removed or merged, or where they meet at a right "
@@ -114,10 +107,7 @@ class Origins(list[_Origin]):
 
 
 def origins(lb: Any) -> Origins | None:
-    """What the weak pair of an operator is differentiable in; None if nothing of it requires a gradient.
-
-    Raises DerivativeError for a batch whose shapes are no longer known.
-    """
+    """What an operator's weak pair is differentiable in, if anything; DerivativeError where a batch lost its shapes."""
     held = [lb.points, *tensors_of(lb._medium).values()]
     carries = lb._carries or any(t.requires_grad for t in held)
     if not (carries and torch.is_grad_enabled()):
