@@ -195,30 +195,27 @@ def triangles_of(vertices: Points, polygons: Int[Tensor, "F c"]) -> Int[Tensor, 
 
     >>> dart = torch.tensor([[0.0, 0.0], [1.0, 0.2], [0.0, 1.0], [0.4, 0.3]])
     >>> triangles_of(dart, torch.tensor([[0, 1, 2, 3]])).tolist()
-    [[[3, 0, 1], [1, 2, 3]]]
+    [[[1, 2, 3], [1, 3, 0]]]
     """
     places = pad(vertices, (0, max(3 - vertices.shape[1], 0)))
     around = (places[polygons] - places[polygons[:, :1]])[..., :3]
     normal = torch.linalg.cross(around, around.roll(-1, 1)).sum(1)[:, None, None]
-
-    def on_left(start: Tensor, end: Tensor, points: Tensor) -> Tensor:
-        area = torch.linalg.cross((end - start)[..., :3], (points - start)[..., :3])
-        return (area * normal).sum(-1)
-
     left, triangles = polygons, []
     for size in range(polygons.shape[1], 3, -1):
-        ears = torch.stack([left.roll(1, 1), left, left.roll(-1, 1)], -1)
-        a, b, c = places[ears].unsqueeze(3).unbind(2)
-        cut = (c - a).norm(dim=-1)[..., 0]
+        after = torch.stack([left.roll(-i, 1) for i in range(size)], -1)
+        ear, rest = places[after].split([3, size - 3], 2)
+        across = ear[:, :, 2] - ear[:, :, 0]
+        cut = across.norm(dim=-1)
         if places.shape[1] == 3:  # in higher dimensions a polygon has no interior side
-            rest = places[torch.stack([left.roll(-i, 1) for i in range(2, size - 1)], -1)]
-            sides = torch.stack([on_left(p, q, rest) for p, q in ((a, b), (b, c), (c, a))])
-            apart = torch.stack([(rest != x).any(-1) for x in (a, b, c)]).all(0)
-            within = ((sides >= 0).all(0) & apart).any(-1)
-            cut = torch.where((on_left(a, b, c)[..., 0] > 0) & ~within, cut, 1e30 * cut)
-        best = cut.argmin(1)
-        triangles.append(ears[torch.arange(len(ears)), best])
-        left = left[torch.arange(size) != best[:, None]].view(-1, size - 1)
+            inward = torch.linalg.cross(normal, ear.roll(-1, 2) - ear)
+            offset = rest[:, :, None] - ear[..., None, :]
+            sides = (offset * inward[..., None, :]).sum(-1)
+            within = ((sides >= 0) & (offset != 0).any(-1)).all(2).any(-1)
+            convex = (across * inward[:, :, 0]).sum(-1) > 0
+            cut = torch.where(convex & ~within, cut, 1e30 * cut)
+        left = after[torch.arange(len(left)), cut.argmin(1)]
+        triangles.append(left[:, :3])
+        left = torch.cat([left[:, :1], left[:, 2:]], 1)
     return torch.stack([*triangles, left], 1)
 
 
