@@ -57,6 +57,9 @@ def test_a_torus_of_2000_points(source, bound):
     along = torch.nn.functional.normalize(around)
     turn = torch.linalg.cross(found.directions[..., 1], along).norm(dim=1).asin().rad2deg()
     assert turn.max() < 0.5 if source != "random" else turn.median() < 0.5
+    bending = found.frames @ found.shape_operator @ found.frames.mT
+    bent = found.directions * torch.stack([found.k1, found.k2], -1)[:, None]
+    torch.testing.assert_close(bending @ found.directions, bent)
 
 
 @pytest.mark.usefixtures("unchecked")

@@ -57,68 +57,20 @@ from torchlb.spectral.signatures import (
 from torchlb.stencils.conditions import Robin
 from torchlb.version import __version__
 
-__all__ = [
-    "CacheWarning",
-    "Certificate",
-    "Connection",
-    "Curvatures",
-    "DerivativeError",
-    "Diffusion",
-    "DiffusionError",
-    "DiffusionNet",
-    "DiffusionNetBlock",
-    "Eigenbasis",
-    "EigenbasisError",
-    "GradientFeatures",
-    "HodgeParts",
-    "ImplicitDiffusion",
-    "InputError",
-    "InputTypeError",
-    "LaplaceBeltrami",
-    "OperatorFileError",
-    "PoissonBlock",
-    "PoissonFeatures",
-    "PrecomputeReport",
-    "Robin",
-    "ShapeResult",
-    "SpectralConv",
-    "StabilityError",
-    "StabilityWarning",
-    "StencilError",
-    "StencilReport",
-    "TangentBlock",
-    "TangentDiffusion",
-    "TorchlbError",
-    "TorchlbWarning",
-    "__version__",
-    "clean_mesh",
-    "clean_points",
-    "collate",
-    "diffusion_distance",
-    "diffusion_map",
-    "geodesic_distance",
-    "heat_flow",
-    "heat_kernel_signature",
-    "hodge_decomposition",
-    "implicit_step",
-    "load_operator",
-    "load_or_build",
-    "logarithmic_map",
-    "operator_key",
-    "parallel_transport",
-    "poisson_solve",
-    "precompute_operators",
-    "read_point_data",
-    "read_shape",
-    "save_operator",
-    "smooth",
-    "spectral_wavelets",
-    "submesh",
-    "surfaces",
-    "vector_heat_flow",
-    "wave_kernel_signature",
-    "write_shape",
-]
+__all__ = ["Certificate", "Connection", "Curvatures", "LaplaceBeltrami", "Robin", "StencilReport"]
+__all__ += ["__version__", "clean_mesh", "clean_points", "collate", "submesh", "surfaces"]
+__all__ += ["Eigenbasis", "diffusion_distance", "diffusion_map", "heat_kernel_signature"]
+__all__ += ["spectral_wavelets", "wave_kernel_signature"]
+__all__ += ["HodgeParts", "geodesic_distance", "heat_flow", "hodge_decomposition", "implicit_step"]
+__all__ += ["logarithmic_map", "parallel_transport", "poisson_solve", "smooth", "vector_heat_flow"]
+__all__ += ["Diffusion", "DiffusionNet", "DiffusionNetBlock", "GradientFeatures"]
+__all__ += ["ImplicitDiffusion", "PoissonBlock", "PoissonFeatures", "SpectralConv"]
+__all__ += ["TangentBlock", "TangentDiffusion"]
+__all__ += ["PrecomputeReport", "ShapeResult", "load_operator", "load_or_build", "operator_key"]
+__all__ += ["precompute_operators", "read_point_data", "read_shape", "save_operator", "write_shape"]
+__all__ += ["CacheWarning", "DerivativeError", "DiffusionError", "EigenbasisError", "InputError"]
+__all__ += ["InputTypeError", "OperatorFileError", "StabilityError", "StabilityWarning"]
+__all__ += ["StencilError", "TorchlbError", "TorchlbWarning"]
 
 
 def __getattr__(name: str) -> Any:

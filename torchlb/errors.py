@@ -96,7 +96,7 @@ def shown(value: object, longest: int = 80) -> str:
 
 
 def warn(
-    message: str, category: type[Warning] = TorchlbWarning, *, once: set[Any] | None = None
+    message: str, category: type[Warning] = TorchlbWarning, *, once: set | None = None
 ) -> None:
     """Issue a warning at the line outside torchlb from which the call came; with `once` one kind once for each line."""
     frame, level = sys._getframe(), 1
@@ -104,8 +104,7 @@ def warn(
         frame, level = frame.f_back, level + 1
     kind = re.sub(r"\(.*?\)|\d", "", message)  # whatever the points and numbers
     place = frame.f_code.co_filename, frame.f_lineno, kind
-    if once is not None:
-        if place in once:
-            return
+    once = set() if once is None else once
+    if place not in once:
         once.add(place)
-    warnings.warn(message, category, stacklevel=level)
+        warnings.warn(message, category, stacklevel=level)

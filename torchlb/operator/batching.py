@@ -11,9 +11,8 @@ import torch
 from torchlb.errors import InputError
 from torchlb.galerkin.matrices import PairMatrices
 from torchlb.linalg.csr import Csr, Record, starts, tensors_of
+from torchlb.operator.plan import Parts
 from torchlb.operator.storage import BY_POINT, OperatorStorage
-
-Parts = dict[str, Any]
 
 
 def check_alike(shapes: Sequence[OperatorStorage]) -> None:
@@ -50,18 +49,17 @@ def joined_parts(shapes: Sequence[OperatorStorage]) -> Parts:
 def split_parts(batch: OperatorStorage, sizes: Sequence[int]) -> list[Parts]:
     """Inverse of `joined_parts`."""
     whole = Record({n: getattr(batch, n) for n in BY_POINT if len(getattr(batch, n))})
-    by_point = [tensors_of(part) for part in whole.split(sizes)]
-    columns: dict[str, Any] = {n: [part[n] for part in by_point] for n in by_point[0]}
+    shapes: list[Parts] = [tensors_of(part) for part in whole.split(sizes)]
     first = batch.faces.new_tensor(starts(sizes))
     of_shape = torch.bucketize(batch.faces[:, 0].contiguous(), first[1:], right=True)
     faces = batch.faces.split(torch.bincount(of_shape, minlength=len(sizes)).tolist())
+    columns = {"stencil": batch.stencil.split(sizes), "weak": batch.weak.split(sizes)}
     columns["faces"] = [own - start for own, start in zip(faces, first, strict=True)]
-    columns["stencil"], columns["weak"] = batch.stencil.split(sizes), batch.weak.split(sizes)
     if len(batch._record.order):  # PyG data carry no report
         columns["_record"] = batch._record.split(sizes)
     columns["_plans"] = [[plan] for plan in batch._known_plans]
-    shapes = [dict(zip(columns, row, strict=True)) for row in zip(*columns.values(), strict=True)]
-    for shape in shapes:
+    for shape, *row in zip(shapes, *columns.values(), strict=True):
+        shape.update(zip(columns, row, strict=True))
         if "_on_boundary" in shape and not shape["_on_boundary"].any():
             del shape["_on_boundary"]
     return shapes
@@ -85,8 +83,7 @@ def shapes_of(batch: Any) -> tuple[Any, ...]:
 
 def join_states(states: Sequence[dict[str, Any]], sizes: Sequence[int]) -> dict[str, Any]:
     """The extra state of a batch, with those of its shapes and the options that all shapes share."""
-    options = [state["options"] for state in states]
-    first = options[0]
+    first, *options = (state["options"] for state in states)
     parts = [part for state in states for part in state.get("parts") or [state]]
     return {
         "source": "batch",
@@ -103,10 +100,5 @@ def _joined_certificate(certificates: Sequence[dict[str, Any] | None]) -> dict[s
     known = [each for each in certificates if each is not None]
     if len(known) < len(certificates):
         return None
-    how: dict[str, Any] = {
-        "holds": all,
-        "min_pi": min,
-        "max_s": lambda x: float(np.max(x)),
-        "rounds": max,
-    }
+    how: Any = {"holds": all, "min_pi": min, "max_s": lambda x: float(np.max(x)), "rounds": max}
     return {key: how.get(key, sum)([each[key] for each in known]) for key in known[0]}

@@ -14,15 +14,8 @@ from torch.nn.functional import pad
 
 from torchlb.baseline.cotangent import cotangent_laplacian
 from torchlb.certified.certificate import certify
+from torchlb.cloud import doubts
 from torchlb.cloud.complexes import Complex
-from torchlb.cloud.doubts import (
-    on_rim,
-    warn_of_buried,
-    warn_of_doubts,
-    warn_of_joins,
-    warn_of_layers,
-    warn_of_near_duplicates,
-)
 from torchlb.cloud.reconstruction import reconstruct
 from torchlb.cloud.surface import CloudSurface
 from torchlb.errors import InputError, first_few, renumbered, warn
@@ -39,19 +32,10 @@ from torchlb.geometry.vectors import Points
 from torchlb.linalg.precision import LOW
 from torchlb.linalg.sparse import from_scipy
 from torchlb.linalg.threads import threads_for
-from torchlb.operator.checks import (
-    check_boundary,
-    check_dimension,
-    check_distinct,
-    check_faces,
-    check_normals,
-    check_scale,
-    mended_faces,
-)
+from torchlb.operator import checks
 from torchlb.operator.inputs import ArrayLike, check_points
 from torchlb.operator.plan import Parts, Plan, operator_parts
 from torchlb.stencils.assemble import Stencils, assemble
-from torchlb.stencils.conditions import Condition
 from torchlb.stencils.options import Options
 from torchlb.stencils.rows import Reason, Rows, matrix_rows
 from torchlb.stencils.shape import Shape, mesh_shape, surface_shape
@@ -67,31 +51,21 @@ REMEDIES = {
 
 
 def build_mesh(
-    vertices: ArrayLike,
-    faces: ArrayLike,
-    options: Options,
-    *,
-    boundary: ArrayLike | str | None,
-    progress: bool,
+    vertices: ArrayLike, faces: ArrayLike, options: Options, *, boundary: Any, progress: bool
 ) -> Parts:
     """Build an operator on a mesh; arguments as for `LaplaceBeltrami.from_mesh`."""
     vertices, corners = _checked(vertices, faces)
     options.check(len(vertices), vertices.shape[1], corners.shape[1] - 1)
-    corners = mended_faces(vertices, corners)
-    if isinstance(boundary, str) and boundary in Condition.known:
-        raise InputError(
-            f"boundary: expected where the condition holds, a mask of the vertices, got {boundary!r}; what holds there "
-            f"is condition={boundary!r}"
-        )
-    where = check_boundary(boundary, len(vertices))
+    corners = checks.mended_faces(vertices, corners)
+    where = checks.check_boundary(boundary, len(vertices))
     progress = progress and sys.stderr.isatty()
     return on_cells(vertices, vertices, corners, options, where, "mesh", progress)
 
 
 def _checked(vertices: ArrayLike, faces: ArrayLike) -> tuple[Tensor, Tensor]:
     vertices = check_points(vertices, "vertices")
-    check_scale(vertices)
-    return vertices, check_faces(faces, len(vertices))
+    checks.check_scale(vertices)
+    return vertices, checks.check_faces(faces, len(vertices))
 
 
 def build_cloud(
@@ -106,29 +80,29 @@ def build_cloud(
 ) -> Parts:
     """Build an operator on a point cloud; arguments as for `LaplaceBeltrami.from_points`."""
     points = check_points(points)
-    check_scale(points)
-    check_distinct(points)
+    checks.check_scale(points)
+    checks.check_distinct(points)
     ambient, found = points.shape[1], None
     if reconstruction is None:
-        d = check_dimension(points, dim, hypersurface=normals is not None)
+        d = checks.check_dimension(points, dim, hypersurface=normals is not None)
     else:
         found = _given_complex(points, reconstruction, dim)
         d = found.cells.shape[1] - 1
     options.check(len(points), ambient, d)
-    where = check_boundary(boundary, len(points))
+    where = checks.check_boundary(boundary, len(points))
     held = options.held
-    if where is None and held is not None and not held.conserves:
+    if boundary is None and held is not None and not held.conserves:
         raise InputError(
             f"boundary: condition={held!r} holds at boundary points; pass a mask of them, or 'detect'"
         )
     if normals is not None:
         if d != ambient - 1:
             raise InputError(f"normals: only hypersurfaces have them, not dim={d} in R^{ambient}")
-        normals = check_normals(normals, points)
+        normals = checks.check_normals(normals, points)
     index, progress = torch.arange(len(points)), progress and sys.stderr.isatty()
     numbering = Numbering.along_tree(points) if found is None else Numbering(index, index)
     here = numbering.sorted(points)
-    mask = numbering.sorted(where) if isinstance(where, Tensor) else None
+    mask = None if where is None else numbering.sorted(where)
     normals = None if normals is None else numbering.sorted(normals)
     with renumbered(numbering.given), threads_for(len(points)):
         if found is None:
@@ -139,14 +113,15 @@ def build_cloud(
                 "has no measure; 'neumann' and 'dirichlet' can hold there, and from_mesh takes every condition"
             )
         if mask is not None and found.shares is None:
-            warn_of_buried(found.cells, mask)
+            doubts.warn_of_buried(found.cells, mask)
         if isinstance(found, CloudSurface):
             return _on_surface(points, here, found, options, mask, numbering, progress)
         if d == 1:
-            warn_of_near_duplicates(here, nearest_neighbors(here, min(NEAREST, len(here))), 1)
+            near = nearest_neighbors(here, min(NEAREST, len(here)))
+            doubts.warn_of_near_duplicates(here, near, 1)
     cells, edge = numbering.given[found.cells], None
-    if isinstance(where, Tensor):
-        edge = where if found.shares is not None else where & on_rim(cells, len(points))
+    if where is not None:
+        edge = where if found.shares is not None else where & doubts.on_rim(cells, len(points))
     rest = numbering.restored(found.points), cells, options, edge, "points", progress, found.shares
     return on_cells(points, *rest)
 
@@ -154,13 +129,11 @@ def build_cloud(
 def _given_complex(points: Points, reconstruction: Reconstruction, dim: int | None) -> Complex:
     """The complex that a user's function makes of the points, checked."""
     found = reconstruction(points.clone())
-    if isinstance(found, CloudSurface):
-        return found
-    if isinstance(found, Complex) and found.shares is not None:
+    if isinstance(found, Complex) and (isinstance(found, CloudSurface) or found.shares is not None):
         return found
     places, cells = (found.points, found.cells) if isinstance(found, Complex) else (points, found)
     places = check_points(places)
-    cells = mended_faces(places, check_faces(cells, len(points)))
+    cells = checks.mended_faces(places, checks.check_faces(cells, len(points)))
     if places.shape != points.shape or dim not in (None, cells.shape[1] - 1):
         raise InputError(
             f"reconstruct: expected cells through the {len(points)} points, of dimension {dim or 'any'}, got some of "
@@ -180,15 +153,15 @@ def _on_surface(
 ) -> Parts:
     """Build an operator on a cloud in R² or R³, sorted `here`, by the surface through it."""
     placed = torch.where(surface.lone[:, None], surface.points[:, : here.shape[1]], here)
-    warn_of_near_duplicates(placed, surface.neighbors, 2)
+    doubts.warn_of_near_duplicates(placed, surface.neighbors, 2)
     if here.shape[1] == 3:
-        warn_of_layers(here)
+        doubts.warn_of_layers(here)
     surface = replace(surface, cells=flipped(surface.points, surface.cells))
     own = options.taken(numbering)
     shape = surface_shape(here, surface, own, boundary=boundary, progress=progress)
     faces, order = numbering.given[surface.cells], torch.arange(len(surface.cells))
     plan = _plan(shape, numbering, points, faces, order, order[:0], "points", options)
-    return finished(plan, shape, surface.cells, progress, surface)
+    return finished(plan, shape, progress, surface)
 
 
 def on_cells(
@@ -196,7 +169,7 @@ def on_cells(
     vertices: Points,
     cells: Int[Tensor, "F corners"],
     options: Options,
-    boundary: Bool[Tensor, " N"] | str | None,
+    boundary: Bool[Tensor, " N"] | None,
     source: str,
     progress: bool,
     shares: Float[Tensor, " F"] | None = None,
@@ -214,18 +187,15 @@ def on_cells(
         if here.shape[1] <= 3:
             corners = flipped(pad(here, (0, 3 - here.shape[1])), corners)
     with renumbered(numbering.given), threads_for(len(vertices)):
+        part = None if boundary is None else numbering.sorted(boundary)
+        own, on_mesh = options.taken(numbering), source == "mesh"
+        shares = None if shares is None else shares[order]
         shape = mesh_shape(
-            here,
-            corners,
-            options.taken(numbering),
-            boundary=numbering.sorted(boundary) if isinstance(boundary, Tensor) else None,
-            progress=progress,
-            shares=None if shares is None else shares[order],
-            on_mesh=source == "mesh",
+            here, corners, own, boundary=part, progress=progress, shares=shares, on_mesh=on_mesh
         )
         moved = (vertices != given).any(1).nonzero()[:, 0]
         plan = _plan(shape, numbering, given, cells, order, moved, source, options)
-        return finished(plan, shape, corners, progress)
+        return finished(plan, shape, progress)
 
 
 def _plan(shape: Shape, numbering: Numbering, points: Tensor, *rest: Any) -> Plan:
@@ -235,16 +205,12 @@ def _plan(shape: Shape, numbering: Numbering, points: Tensor, *rest: Any) -> Pla
 
 
 def finished(
-    plan: Plan,
-    shape: Shape,
-    cells: Int[Tensor, "G corners"],
-    progress: bool,
-    surface: CloudSurface | None = None,
+    plan: Plan, shape: Shape, progress: bool, surface: CloudSurface | None = None
 ) -> Parts:
     """The operator of a shape of cells: weak pair, rows, certified if asked for, and the rest of the plan."""
     options, pair, fits = plan.options.taken(plan.numbering), None, plan.shape.fits
     if options.weak_form:
-        stars = None if surface is None else surface.stars
+        cells, stars = (surface.cells, surface.stars) if surface else (plan.shape.cells, None)
         rest = stars, shape.held, plan.shape.shares, plan.numbering
         assert shape.fits is not None
         own = fits, shape.fits, *options.elements
@@ -252,8 +218,8 @@ def finished(
         plan, shape = replace(plan, pair=pair_plan), replace(shape, mass=mass)
     if surface is not None:
         if pair is not None:
-            warn_of_doubts(surface, fits, shape.areas)
-        warn_of_joins(surface)
+            doubts.warn_of_doubts(surface, fits, shape.areas)
+        doubts.warn_of_joins(surface)
     stencils = Stencils(shape, options)
     rows, certificate = assemble(stencils, progress=progress), None
     if options.certify:
@@ -281,9 +247,8 @@ def _warn_of_low_order(rows: Rows, plan: Plan) -> None:
     if share < MANY:
         return
     reason = Reason(int(rows.reason[low].mode().values)).text
-    reason += (
-        f". {REMEDIES[plan.source].format(plan.faces.shape[1] - 1)}; `print(lb.report)` says more"
-    )
+    remedy = REMEDIES[plan.source].format(plan.faces.shape[1] - 1)
+    reason += f". {remedy}; `print(lb.report)` says more"
     if plan.pair is not None:
         _, _, edges, curved = plan.pair.counts.sum(1).tolist()
         share_curved = f"{curved / max(edges, 1):.0%} of its edges curved"
@@ -294,16 +259,14 @@ def _warn_of_low_order(rows: Rows, plan: Plan) -> None:
 
 def build_cotangent(vertices: ArrayLike, faces: ArrayLike) -> Parts:
     """Build the cotangent operator with its mass; arguments as for `LaplaceBeltrami.from_cotangent`."""
-    vertices, corners = _checked(vertices, faces)
-    if corners.shape[1] != 3:
-        raise InputError(
-            f"faces: the cotangent operator needs triangles, got {tuple(corners.shape)}"
-        )
-    corners = mended_faces(vertices, corners)
-    _warn_of_long_triangles(vertices, corners)
-    matrix, mass = cotangent_laplacian(vertices, corners)
+    vertices, cells = _checked(vertices, faces)
+    if cells.shape[1] != 3:
+        raise InputError(f"faces: the cotangent operator needs triangles, got {tuple(cells.shape)}")
+    cells = checks.mended_faces(vertices, cells)
+    _warn_of_long_triangles(vertices, cells)
+    matrix, mass = cotangent_laplacian(vertices, cells)
     options = Options(1, 0, condition=None, weak_form=False)
-    shape = replace(mesh_shape(vertices, corners, options), mass=mass)
+    shape = replace(mesh_shape(vertices, cells, options), mass=mass)
     centers = torch.arange(len(vertices))
     crow, col, laplacian = from_scipy(matrix)
     entries = col, laplacian, torch.ones_like(col, dtype=torch.bool)
@@ -311,12 +274,12 @@ def build_cotangent(vertices: ArrayLike, faces: ArrayLike) -> Parts:
     row = centers.repeat_interleave(rows.length)
     diagonal = row == rows.col
     weak = [-mass[row] * rows.laplacian, mass[row] * diagonal]
-    _, length = outward_sums(vertices, *open_sides(corners))
+    _, length = outward_sums(vertices, *open_sides(cells))
     if length.any():  # lumped, as the mass is
         weak.append(length[row] / 2 * diagonal)
     pair = PairMatrices(rows.crow, rows.col, torch.stack(weak))
-    every, same = torch.arange(len(corners)), Numbering(centers, centers)
-    plan = _plan(shape, same, vertices, corners, every, every[:0], "cotangent", options)
+    every, same = torch.arange(len(cells)), Numbering(centers, centers)
+    plan = _plan(shape, same, vertices, cells, every, every[:0], "cotangent", options)
     return operator_parts(plan, vertices, rows, shape, pair)
 
 
@@ -324,12 +287,12 @@ def _warn_of_long_triangles(vertices: Points, faces: Int[Tensor, "F 3"]) -> None
     """Warn where long triangles lie along much of the boundary."""
     nodes = lagrange_nodes(faces, len(vertices), 2)
     outer = nodes.sides[2].uses == 1
-    of = torch.zeros_like(outer)
-    of[nodes.edge[lying_triangles(vertices, nodes, outer)].flatten()] = True
+    sides = nodes.edge[lying_triangles(vertices, nodes, outer)].flatten()
+    of = outer & torch.isin(torch.arange(len(outer)), sides)
     length = (vertices[nodes.edges[:, 0]] - vertices[nodes.edges[:, 1]]).norm(dim=1)
-    long, whole = length[of & outer].sum(), length[outer].sum()
+    long, whole = length[of].sum(), length[outer].sum()
     if long > LOW * whole:
-        ends = nodes.edges[of & outer].unique()
+        ends = nodes.edges[of].unique()
         warn(
             f"cotangent operator: {long / whole:.0%} of the boundary ({first_few(ends)}) has long triangles along it, "
             "which tie the vertices there to straight lines, and eigenvalues may be far too large; "

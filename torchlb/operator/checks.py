@@ -15,14 +15,9 @@ from torchlb.errors import InputError, InputTypeError, first_few, warn
 from torchlb.geometry.boundary import folded_sides
 from torchlb.geometry.vectors import Points
 from torchlb.linalg.precision import NEGLIGIBLE, ROUNDING, SMALL
-from torchlb.operator.cleaning import (
-    are_quads,
-    coincident,
-    first_of_each,
-    proper_faces,
-    turned_faces,
-)
+from torchlb.operator import cleaning
 from torchlb.operator.inputs import ArrayLike, check_corners, check_mask, check_points
+from torchlb.stencils.conditions import Condition
 
 MAX_EXTENT = 1e30
 """Largest extent of the points, and inverse of the smallest, for which all libraries called keep their digits."""
@@ -51,7 +46,7 @@ def check_scale(points: Points) -> None:
 
 def check_distinct(points: Points) -> None:
     """Raise a ValueError that names coincident points."""
-    spacing, other, bad = coincident(points)
+    spacing, other, bad = cleaning.coincident(points)
     _warn_of_rounding(points, spacing)
     if len(bad):
         pair = sorted((int(bad[0]), int(other[bad[0]])))
@@ -108,7 +103,7 @@ def mended_faces(vertices: Points, faces: Int[Tensor, "F v"]) -> Int[Tensor, "G 
 
     Raises ValueError for quads, and for triangles none of which has an area.
     """
-    if faces.shape[1] == 4 and are_quads(faces):
+    if faces.shape[1] == 4 and cleaning.are_quads(faces):
         raise InputError(
             f"faces: shape {tuple(faces.shape)} is for tetrahedra, but these look like quads, since most share no "
             "three corners with another; split them with vertices, faces, kept = torchlb.clean_mesh(vertices, faces)"
@@ -122,32 +117,30 @@ def mended_faces(vertices: Points, faces: Int[Tensor, "F v"]) -> Int[Tensor, "G 
                 "the vertices of a surface, or a curve by its edges, (F, 2)"
             )
     if faces.shape[1] == 2:
-        none = (vertices[faces[:, 0]] == vertices[faces[:, 1]]).all(1).nonzero()[:, 0]
-        if len(none):
+        ends = vertices[faces]
+        if len(none := (ends[:, 0] == ends[:, 1]).all(1).nonzero()[:, 0]):
             raise InputError(
                 f"faces: {len(none)} segments ({first_few(none)}) have no length, their ends share a place; make one "
                 "vertex of the two with vertices, faces, kept = torchlb.clean_mesh(vertices, faces, merge=True)"
             )
     if faces.shape[1] == 4:
         _warn_of_flat_tetrahedra(vertices, faces)
-    first = first_of_each(faces)
-    if not first.all():
-        again = (~first).nonzero()[:, 0]
+    first = cleaning.first_of_each(faces)
+    if len(again := (~first).nonzero()[:, 0]):
         warn(
             f"faces: {len(again)} have the corners of an earlier one ({first_few(again)}) and are left out; "
             "torchlb.clean_mesh(vertices, faces) removes them"
         )
         faces = faces[first]
-    turned = turned_faces(faces)
-    if turned.any():
-        wrong = turned.nonzero()[:, 0]
+    turned = cleaning.turned_faces(faces)
+    if len(wrong := turned.nonzero()[:, 0]):
         if vertices.shape[1] <= faces.shape[1]:  # else there are no normals
             warn(
                 f"faces: {len(wrong)} are wound against their neighbours ({first_few(wrong)}) and are turned round, so "
                 "that the normals agree; torchlb.clean_mesh(vertices, faces) does it in the mesh"
             )
         faces = torch.where(turned[:, None], faces.flip(1), faces)
-    spacing, _, bad = coincident(vertices)
+    spacing, _, bad = cleaning.coincident(vertices)
     _warn_of_rounding(vertices, spacing)
     if len(bad):
         warn(
@@ -162,14 +155,12 @@ def _warn_of_flat_tetrahedra(vertices: Points, faces: Int[Tensor, "F 4"]) -> Non
     edges = vertices[faces[:, 1:]] - vertices[faces[:, :1]]
     longest = (vertices[faces[:, None]] - vertices[faces[:, :, None]]).norm(dim=-1).amax((1, 2))
     flat = torch.linalg.svdvals(edges)[:, :3].prod(1) <= NEGLIGIBLE * longest**3
-    if flat.any():
-        none = flat.nonzero()[:, 0]
+    if len(none := flat.nonzero()[:, 0]):
         warn(
             f"faces: {len(none)} tetrahedra have no volume ({first_few(none)}) and count for nothing; that is "
             "right of slivers between others, as Delaunay's of a grid"
         )
-    within = folded_sides(vertices, faces).unique()
-    if len(within):
+    if len(within := folded_sides(vertices, faces).unique()):
         warn(
             f"faces: at {len(within)} vertices ({first_few(within)}) sides of tetrahedra lie on one another, not "
             "one and the same, as where slivers between them were removed: they are a boundary within, where "
@@ -179,16 +170,13 @@ def _warn_of_flat_tetrahedra(vertices: Points, faces: Int[Tensor, "F 4"]) -> Non
 
 def check_faces(faces: ArrayLike, num_points: int) -> Int[Tensor, "F v"]:
     """Faces with distinct corners, checked as by `check_corners`; ValueError also for unreferenced vertices."""
-    faces = check_corners(faces, num_points)
-    used = torch.zeros(num_points, dtype=torch.bool)
-    used[proper_faces(faces).reshape(-1)] = True
-    lost = (~used).nonzero()[:, 0]
-    if len(lost):
+    faces = cleaning.proper_faces(check_corners(faces, num_points))
+    if len(lost := (faces.flatten().bincount(minlength=num_points) == 0).nonzero()[:, 0]):
         raise InputError(
             f"faces: {len(lost)} vertices ({first_few(lost)}) belong to no face with distinct corners; drop them with "
             "vertices, faces, kept = torchlb.clean_mesh(vertices, faces)"
         )
-    return proper_faces(faces)
+    return faces
 
 
 def check_normals(normals: ArrayLike, points: Points) -> Points:
@@ -199,21 +187,21 @@ def check_normals(normals: ArrayLike, points: Points) -> Points:
             f"normals: expected the shape of points {tuple(points.shape)}, got {tuple(normals.shape)}"
         )
     length = normals.norm(dim=1)
-    bad = (length == 0).nonzero()[:, 0]
-    if len(bad):
+    if len(bad := (length == 0).nonzero()[:, 0]):
         raise InputError(
             f"normals: {len(bad)} are zero ({first_few(bad)}); leave `normals` out to have them estimated"
         )
     return normals / length[:, None]
 
 
-def check_boundary(boundary: Any, num_points: int) -> Bool[Tensor, " N"] | str | None:
-    """A mask of all points, "detect" or None; ValueError for anything else."""
+def check_boundary(boundary: Any, num_points: int) -> Bool[Tensor, " N"] | None:
+    """A mask of all points, or None, also for "detect"; ValueError for anything else."""
     if boundary is None or (isinstance(boundary, str) and boundary == "detect"):
-        return boundary
+        return None
     if isinstance(boundary, str):
+        hint = f"; pass condition={boundary!r}" if boundary in Condition.known else ""
         raise InputError(
-            f"boundary: expected a mask of the points, 'detect' or None, got {boundary!r}"
+            f"boundary: expected a mask of the points, 'detect' or None, got {boundary!r}{hint}"
         )
     return check_mask(boundary, num_points, "boundary")
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
@@ -20,14 +22,13 @@ from torchlb.operator.inputs import ArrayLike, as_tensor, check_corners, check_m
 
 def coincident(points: Points) -> tuple[Float[Tensor, " N"], Int[Tensor, " N"], Int[Tensor, " T"]]:
     """Nearest other point of each: (distance, its index, indices of the points that coincide with it to rounding)."""
-    tree = KDTree(points.numpy())
-    distance, nearest = tree.query(points.numpy(), k=min(2, len(points)))
-    distance = torch.from_numpy(distance).view(len(points), -1)[:, -1]
-    nearest = torch.from_numpy(nearest).view(len(points), -1)
+    tree: Any = KDTree(points.numpy())
+    found = tree.query(points.numpy(), k=[1, min(2, len(points))])
+    distance, nearest = (torch.from_numpy(each.T) for each in found)
     index = torch.arange(len(points))
-    other = torch.where(nearest[:, 0] == index, nearest[:, -1], nearest[:, 0])
-    close = (distance <= ROUNDING * points.abs().max()) & (other != index)
-    return distance, other, close.nonzero()[:, 0]
+    other = torch.where(nearest[0] == index, nearest[1], nearest[0])
+    close = (distance[1] <= ROUNDING * points.abs().max()) & (other != index)
+    return distance[1], other, close.nonzero()[:, 0]
 
 
 def clean_points(points: ArrayLike, tolerance: float = 0.0) -> tuple[Tensor, Tensor]:
@@ -47,8 +48,6 @@ def clean_points(points: ArrayLike, tolerance: float = 0.0) -> tuple[Tensor, Ten
     kept
         (N',), their indices in the input: `values[kept]` carries data over.
 
-    Examples
-    --------
     >>> points, kept = clean_points([[0.0, 0.0], [1.0, 0.0], [0.0, 0.0]])
     >>> kept.tolist()
     [0, 1]
@@ -88,8 +87,6 @@ def clean_mesh(
     kept
         (N',), indices of the vertices in the input: `values[kept]` carries data over.
 
-    Examples
-    --------
     >>> vertices, faces, kept = clean_mesh(torch.eye(4), torch.tensor([[0, 1, 3], [0, 0, 1], [3, 1, 0]]))
     >>> faces.tolist(), kept.tolist()
     ([[0, 1, 2]], [0, 1, 3])
@@ -124,13 +121,10 @@ def submesh(
     (tensor([[0, 1, 2]]), tensor([0, 2, 3]))
     """
     count = len(check_points(vertices, "vertices"))
-    corners = check_corners(faces, count)
-    inside = check_mask(mask, count)
-    whole = inside[corners].all(1)
+    kept = check_mask(mask, count)
+    whole = kept[check_corners(faces, count)].all(1)
     if not whole.any():
-        raise InputError(
-            f"mask: no face has all its corners among its {int(inside.sum())} vertices"
-        )
+        raise InputError(f"mask: no face has all its corners among its {int(kept.sum())} vertices")
     return clean_mesh(vertices, as_tensor(faces)[whole])
 
 
@@ -193,68 +187,36 @@ def merged(
     return torch.from_numpy(first[back.reshape(-1)])
 
 
-def triangles_of(vertices: Points, polygons: Int[Tensor, "F c"]) -> Tensor:
+def triangles_of(vertices: Points, polygons: Int[Tensor, "F c"]) -> Int[Tensor, "F t 3"]:
     """Triangles (F, c − 2, 3) of polygons with c corners each, in space or in the plane.
 
-    A polygon becomes a fan around the corner whose longest diagonal is shortest, among corners from which all triangles
-    have the orientation of the polygon. A polygon that is star-shaped from none of its corners is cut by ears.
+    Ears are cut off (Meisters 1975), the one with the shortest cut first; rounding and polygons without area may leave
+    no ear, and then the shortest cut is made.
 
     >>> dart = torch.tensor([[0.0, 0.0], [1.0, 0.2], [0.0, 1.0], [0.4, 0.3]])
     >>> triangles_of(dart, torch.tensor([[0, 1, 2, 3]])).tolist()
     [[[1, 2, 3], [1, 3, 0]]]
     """
-    count, size = polygons.shape
-    places = pad(vertices, (0, max(3 - vertices.shape[1], 0)))[polygons]
-    space = places.shape[-1] == 3  # in higher dimensions a polygon has no interior side
-    offset = (places - places[:, :1])[..., :3]
-    normal = torch.linalg.cross(offset, offset.roll(-1, 1)).sum(1, keepdim=True)
-    costs, diagonals = [], []
-    for start in range(size):
-        ray = (places.roll(-start, 1) - places[:, start, None])[:, 1:]
-        up = (torch.linalg.cross(ray[:, :-1, :3], ray[:, 1:, :3]) * normal).sum(-1)
-        length = ray[:, 1:-1].norm(dim=-1)
-        diagonals.append(length.amax(1) if size > 3 else length.sum(1))
-        inside = (up > 0).all(1) | (not space)
-        costs.append(torch.where(inside, diagonals[-1], torch.inf))
-    cost = torch.stack(costs, 1)
-    none = cost.isinf().all(1)
-    if size == 4:  # a quad without area is split by its shorter diagonal
-        cost, none = torch.where(none[:, None], torch.stack(diagonals, 1), cost), none & False
-    order = (cost.argmin(1, keepdim=True) + torch.arange(size)) % size
-    turned = polygons.gather(1, order)
-    first = turned[:, :1].expand(count, size - 2)
-    result = torch.stack([first, turned[:, 1:-1], turned[:, 2:]], -1)
-    for i in none.nonzero()[:, 0].tolist():
-        result[i] = polygons[i][_ears(places[i].numpy(), normal[i, 0].numpy())]
-    return result
-
-
-def _ears(corners: Float[np.ndarray, "c 3"], normal: Float[np.ndarray, " 3"]) -> Tensor:
-    """Triangles of a polygon by ear clipping (Meisters 1975), the shortest cut first."""
-    axes = np.delete(np.arange(3), np.abs(normal).argmax())
-    flat = corners[:, axes]
-    if _left_of(flat[0], flat, np.roll(flat, -1, 0)).sum() < 0:
-        flat = flat[:, ::-1]
-    left, triangles = list(range(len(flat))), []
-    while len(left) > 3:
-        best, cut = torch.inf, 0
-        for k in range(len(left)):
-            a, b, c = (flat[left[(k + s) % len(left)]] for s in (-1, 0, 1))
-            others = flat[[i for i in left if not (flat[i] == (a, b, c)).all(1).any()]]
-            sides = np.stack([_left_of(p, q, others) for p, q in ((a, b), (b, c), (c, a))])
-            ear = _left_of(a, b, c[None])[0] > 0 and not (sides >= 0).all(0).any()
-            length = np.linalg.norm(c - a) * (1.0 if ear else 1e30)  # rounding may leave no ear
-            if length < best:
-                best, cut = length, k
-        triangles.append([left[cut - 1], left[cut], left[(cut + 1) % len(left)]])
-        del left[cut]
-    return torch.tensor([*triangles, left])
-
-
-def _left_of(start: np.ndarray, end: np.ndarray, points: np.ndarray) -> np.ndarray:
-    """Twice the signed area of the triangles over an edge in the plane, positive on its left."""
-    (x, y), (u, v) = (end - start).T, (points - start).T
-    return x * v - y * u
+    places = pad(vertices, (0, max(3 - vertices.shape[1], 0)))
+    around = (places[polygons] - places[polygons[:, :1]])[..., :3]
+    normal = torch.linalg.cross(around, around.roll(-1, 1)).sum(1)[:, None, None]
+    left, triangles = polygons, []
+    for size in range(polygons.shape[1], 3, -1):
+        after = torch.stack([left.roll(-i, 1) for i in range(size)], -1)
+        ear, rest = places[after].split([3, size - 3], 2)
+        across = ear[:, :, 2] - ear[:, :, 0]
+        cut = across.norm(dim=-1)
+        if places.shape[1] == 3:  # in higher dimensions a polygon has no interior side
+            inward = torch.linalg.cross(normal, ear.roll(-1, 2) - ear)
+            offset = rest[:, :, None] - ear[..., None, :]
+            sides = (offset * inward[..., None, :]).sum(-1)
+            within = ((sides >= 0) & (offset != 0).any(-1)).all(2).any(-1)
+            convex = (across * inward[:, :, 0]).sum(-1) > 0
+            cut = torch.where(convex & ~within, cut, 1e30 * cut)
+        left = after[torch.arange(len(left)), cut.argmin(1)]
+        triangles.append(left[:, :3])
+        left = torch.cat([left[:, :1], left[:, 2:]], 1)
+    return torch.stack([*triangles, left], 1)
 
 
 def turned_faces(faces: Int[Tensor, "F v"]) -> Bool[Tensor, " F"]:

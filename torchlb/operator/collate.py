@@ -25,10 +25,7 @@ def collate(samples: Sequence[Any]) -> Any:
     indices moved by ``lb.offsets``, and so are tensors with a row for each of their rows. The rest is torch's
     `default_collate`: a label for each shape, for example.
 
-    Raises
-    ------
-    InputError
-        For samples without an operator, and where `default_collate` fails; the key is named.
+    Raises InputError for samples without an operator, and where `default_collate` fails; the key is named.
 
     >>> from torchlb.surfaces import Sphere
     >>> samples = [(LaplaceBeltrami.from_points(Sphere().points(n), order=1), torch.zeros(n, 3), n) for n in (40, 50)]

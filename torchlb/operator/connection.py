@@ -102,10 +102,10 @@ class Connection(PairMethods):
         return torch.einsum("ind,id...->in...", self.frames.to(c), c.unflatten(0, (-1, self.dim)))
 
     @classmethod
-    def _of(cls, lb: Any, weak: PairMatrices) -> Connection:
+    def _of(cls, lb: Any, weak: PairMatrices, hodge: bool = False) -> Connection:
         """The tangent fields of an operator with their matrices."""
         own, dim = cls(), lb.dim
-        own.source, own.options = "connection", lb.options
+        own.source, own.options, own._is_hodge = "connection", lb.options, hodge
         own.mass, own.points, own.frames = lb.mass.repeat_interleave(dim), lb.points, lb.frames
         own._on_boundary = lb._on_boundary.repeat_interleave(dim)
         own.weak, own.stencil = weak, Csr(values=lb.stencil.values[:, :0].detach())
@@ -120,7 +120,7 @@ def connection_of(lb: Any) -> Connection:
     if lb.cache.connection is None:
         check_pair(lb)
         with torch.inference_mode(False):
-            lb.cache.connection = _of_batch(lb) if lb.sizes is not None else _of_shape(lb)
+            lb.cache.connection = _of_shape(lb) if lb.sizes is None else _of_batch(lb)
     return lb.cache.connection
 
 
@@ -145,9 +145,7 @@ def _of_shape(lb: Any, *, hodge: bool = False) -> Connection:
         found = tangent_matrices(elements, kappa, frames, others, hodge=hodge)
     whole, *near = (each.to(lb.weak.values) for each in found)
     weak = PairMatrices(whole.crow, whole.col, whole.values, *near, of_functions=False)
-    own = Connection._of(lb, weak)
-    own._is_hodge = hodge
-    return own
+    return Connection._of(lb, weak, hodge)
 
 
 def _of_batch(lb: Any) -> Connection:

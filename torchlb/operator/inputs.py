@@ -62,8 +62,7 @@ def check_points(points: ArrayLike, what: str = "points") -> Float[Tensor, "N n"
     if points.is_complex() or points.dtype == torch.bool:
         raise InputError(f"{what}: expected real numbers, got {points.dtype}")
     points = points.detach().to("cpu", torch.float64, copy=True)  # the operator keeps it
-    bad = (~points.isfinite()).any(1).nonzero()[:, 0]
-    if len(bad):
+    if len(bad := (~points.isfinite()).any(1).nonzero()[:, 0]):
         raise InputError(
             f"{what}: {len(bad)} are NaN or infinite ({first_few(bad)}); remove or repair them"
         )
@@ -105,13 +104,9 @@ def check_corners(faces: ArrayLike, num_points: int) -> Int[Tensor, "F v"]:
     if faces.is_floating_point() or faces.is_complex() or faces.dtype == torch.bool:
         raise InputError(f"faces: expected integers, got {faces.dtype}; vertices come first")
     faces = faces.detach().to("cpu", torch.int64)
-    bad = ((faces < 0) | (faces >= num_points)).any(1).nonzero()[:, 0]
-    if len(bad):
-        hint = (
-            "; they count from 1: subtract 1"
-            if faces.min() == 1 and faces.max() == num_points
-            else ""
-        )
+    if len(bad := ((faces < 0) | (faces >= num_points)).any(1).nonzero()[:, 0]):
+        from_one = faces.min() == 1 and faces.max() == num_points
+        hint = "; they count from 1: subtract 1" if from_one else ""
         raise InputError(
             f"faces: {len(bad)} of them ({first_few(bad)}) have indices outside 0 … {num_points - 1}: "
             f"face {int(bad[0])} is {faces[bad[0]].tolist()}{hint}"

@@ -14,24 +14,11 @@ from torchlb.fits.rules import WeightsName
 from torchlb.galerkin.matrices import PairMatrices
 from torchlb.geometry.frames import Projection
 from torchlb.linalg.csr import Csr, Record, tensors_of
-from torchlb.operator.batching import (
-    check_alike,
-    join_states,
-    joined_parts,
-    remember_shapes,
-    shapes_of,
-    split_parts,
-)
+from torchlb.operator import batching, inputs
 from torchlb.operator.build import Reconstruction, build_cloud, build_cotangent, build_mesh
 from torchlb.operator.checks import check_none
 from torchlb.operator.connection import Connection, connection_of
-from torchlb.operator.inputs import (
-    ArrayLike,
-    as_tensor,
-    check_points,
-    float_type,
-    warn_of_gradients,
-)
+from torchlb.operator.inputs import ArrayLike
 from torchlb.operator.medium import checked_fields, pair_in, split_fields
 from torchlb.operator.pair_methods import PairMethods
 from torchlb.operator.parts import MediumFields, Modes
@@ -71,8 +58,6 @@ class LaplaceBeltrami(StencilMethods, PairMethods):
     source, options
         "points", "mesh", "cotangent" or "batch", and the options of the constructor, as passed.
 
-    Examples
-    --------
     >>> theta = torch.arange(36, dtype=torch.float64) * torch.pi / 18
     >>> circle = torch.stack([theta.cos(), theta.sin()], dim=1)
     >>> lb = LaplaceBeltrami.from_points(circle, order=3)
@@ -203,10 +188,10 @@ class LaplaceBeltrami(StencilMethods, PairMethods):
         triangles along a boundary tie its vertices to lines: a warning says so, and `from_mesh` is right there. Raises
         InputError for bad input and for vertices without area.
         """
-        warn_of_gradients(vertices, "vertices")
+        inputs.warn_of_gradients(vertices, "vertices")
         with torch.inference_mode(False):
             built = build_cotangent(vertices, faces)
-        return cls._stored(built, as_tensor(vertices).detach())
+        return cls._stored(built, inputs.as_tensor(vertices).detach())
 
     @classmethod
     def batch(cls, shapes: Sequence[LaplaceBeltrami]) -> LaplaceBeltrami:
@@ -217,20 +202,19 @@ class LaplaceBeltrami(StencilMethods, PairMethods):
         over; others are solved when asked for. Raises InputError for shapes of different dimension, floating type or
         device, or for none; InputTypeError for anything but a sequence of operators.
         """
-        if isinstance(shapes, LaplaceBeltrami) or not all(
-            isinstance(shape, LaplaceBeltrami) for shape in shapes
-        ):
+        alone = isinstance(shapes, LaplaceBeltrami)
+        if alone or not all(isinstance(shape, LaplaceBeltrami) for shape in shapes):
             raise InputTypeError("batch: expected a sequence of operators, [lb, …]")
         if len(shapes) == 0:
             raise InputError("batch: got no shapes")
-        check_alike(shapes)
+        batching.check_alike(shapes)
         sizes = [n for shape in shapes for n in shape.sizes or (shape.num_points,)]
-        state = join_states([shape.get_extra_state() for shape in shapes], sizes)
+        state = batching.join_states([shape.get_extra_state() for shape in shapes], sizes)
         bases = [shape._basis for shape in shapes if shape._basis and not shape.sizes]
         with torch.inference_mode(False):
             basis = stack_eigenbases(bases) if len(bases) == len(shapes) else None
-            joined = cls._of_parts(joined_parts(shapes), state, basis)
-        remember_shapes(joined, shapes)
+            joined = cls._of_parts(batching.joined_parts(shapes), state, basis)
+        batching.remember_shapes(joined, shapes)
         joined._carries = any(origins(shape) is not None for shape in shapes)
         return joined
 
@@ -275,7 +259,7 @@ class LaplaceBeltrami(StencilMethods, PairMethods):
         >>> ratio[1:].round(decimals=6).tolist()
         [0.25, 0.25, 0.25]
         """
-        there = check_points(points)
+        there = inputs.check_points(points)
         if there.shape != self.points.shape:
             raise InputError(
                 f"points: expected {tuple(self.points.shape)}, as the operator has, got {tuple(there.shape)}"
@@ -319,7 +303,7 @@ class LaplaceBeltrami(StencilMethods, PairMethods):
         """
         given = {"conductivity": conductivity, "density": density, "potential": potential}
         if self.sizes is not None:
-            shapes = shapes_of(self) or self.unbatch()
+            shapes = batching.shapes_of(self) or self.unbatch()
             parts = zip(shapes, split_fields(self, shapes, given), strict=True)
             return self.batch([shape.with_medium(**own) for shape, own in parts])
         with torch.inference_mode(False):
@@ -346,9 +330,8 @@ class LaplaceBeltrami(StencilMethods, PairMethods):
         """The operators of the shapes of a `batch`, with weak pairs only if all shapes of the batch had one."""
         if self.sizes is None or self._states is None:
             raise InputError(f"unbatch: expected a batch of operators, got one from {self.source}")
-        basis = self._basis
-        bases = [None] * len(self.sizes) if basis is None else unstack_eigenbases(basis)
-        shapes = zip(split_parts(self, self.sizes), self._states, bases, strict=True)
+        bases = unstack_eigenbases(self._basis) if self._basis else [None] * len(self.sizes)
+        shapes = zip(batching.split_parts(self, self.sizes), self._states, bases, strict=True)
         return [type(self)._of_parts(*shape) for shape in shapes]
 
     @classmethod
@@ -357,7 +340,7 @@ class LaplaceBeltrami(StencilMethods, PairMethods):
     ) -> LaplaceBeltrami:
         """Store a finished operator, in the floating type of the input, whose gradient it carries."""
         with torch.inference_mode(False):
-            lb = cls._of_parts(parts).to(device, float_type(given))
+            lb = cls._of_parts(parts).to(device, inputs.float_type(given))
         return carrying(lb, given)
 
 

@@ -28,20 +28,15 @@ Given = Mapping[str, ArrayLike | float | None]
 def elements_of(lb: Any) -> Any:
     """The elements of the weak pair of one shape or its fields, in the user's numbering, cached with the operator."""
     if lb.cache.elements is None:
-        points = lb.points.detach().cpu().double()
+        points, mass = (x.detach().cpu().double() for x in (lb.points, lb.mass))
         linear = lb.source == "cotangent"
-        mass = lb.mass.detach().cpu().double()
         made = Forms.flat(points, lb.faces.cpu(), mass) if linear else lb.plan.forms(points)
         lb.cache.elements = made
     return lb.cache.elements
 
 
 def checked_fields(lb: OperatorStorage, given: Given) -> MediumFields:
-    """The fields that are given, on the device of the operator, which carry gradients.
-
-    Raises InputError for a wrong shape, values that are not positive (of a potential: negative), tensors that are not
-    symmetric, and an operator without a weak pair.
-    """
+    """The fields that are given, on the device of the operator, which carry gradients; InputError for bad ones."""
     fields = {name: x for name, x in given.items() if x is not None}
     if not fields:
         raise InputError("with_medium: expected a conductivity, a density or a potential, got none")
@@ -68,49 +63,40 @@ def checked_fields(lb: OperatorStorage, given: Given) -> MediumFields:
 
 def split_fields(batch: Any, shapes: Sequence[Any], given: Given) -> list[dict[str, Any]]:
     """What of the fields of a batch is given to each of its shapes; numbers are given to all of them."""
-    found: list[dict[str, Any]] = [{} for _ in shapes]
+    found: dict[str, Sequence[Any]] = {}
     counts = {len(batch.faces): [len(shape.faces) for shape in shapes]}
     counts[batch.num_points] = [shape.num_points for shape in shapes]
     for name, x in given.items():
         x = torch.from_numpy(x) if isinstance(x, np.ndarray) else x
-        parts: Any = [x] * len(shapes)
+        found[name] = [x] * len(shapes)
         if isinstance(x, Tensor) and x.ndim:
             if len(x) not in counts:
                 raise InputError(
                     f"{name}: expected one of each vertex or face of the shapes, {' or '.join(map(str, counts))}, got "
                     f"{tuple(x.shape)}"
                 )
-            parts = x.split(counts[len(x)])
-            if len(x) != batch.num_points and any(
-                len(p) == s.num_points for p, s in zip(parts, shapes, strict=True)
-            ):
+            if len(x) != batch.num_points and any(len(s.faces) == s.num_points for s in shapes):
                 raise InputError(
                     f"{name}: a shape has as many faces as vertices; give the field at the vertices"
                 )
-        for own, part in zip(found, parts, strict=True):
-            own[name] = part
-    return found
+            found[name] = x.split(counts[len(x)])
+    return [dict(zip(found, row, strict=True)) for row in zip(*found.values(), strict=True)]
 
 
 def _check_values(name: str, x: Tensor) -> None:
     """Raise InputError unless a field is finite, and positive as it has to be."""
-    least, what, remedy = x, "positive", ""
+    least, what, bad, remedy = x, "positive", ~(x > 0), ""
     if x.ndim == 3:
         size = x.abs().amax((1, 2))
         skew = (x - x.mT).abs().amax((1, 2)) > ROOT_EPS * size
         safe = torch.where((x.isfinite().all(2).all(1) & ~skew)[:, None, None], x, 0.0)
         least, what = torch.linalg.eigvalsh(safe)[:, 0], "symmetric, positive"
-        bad, remedy = (
-            least <= ROUNDING * size,
-            "; tensors of tangent directions alone need nnᵀ, too, n the normal",
-        )
+        bad = least <= ROUNDING * size
+        remedy = "; tensors of tangent directions alone need nnᵀ, too, n the normal"
     elif name == "potential":
         what, bad = "nonnegative", ~(x >= 0)
         remedy = "; with c + μρ in place of c the eigenvalues are λ + μ"
-    else:
-        bad = ~(x > 0)
-    bad = (bad | ~least.isfinite()).nonzero()[:, 0]
-    if len(bad):
+    if len(bad := (bad | ~least.isfinite()).nonzero()[:, 0]):
         raise InputError(
             f"{name}: expected finite, {what} values, got {x[bad[0]].tolist()}, … at {len(bad)} of {len(x)} vertices "
             f"or faces ({first_few(bad)}){remedy}"
@@ -136,25 +122,22 @@ def pair_in(lb: OperatorStorage, medium: Medium) -> PairMatrices:
             )
     with torch.no_grad():
         values = {name: elements.values(field) for name, field in plain(medium).items()}
-        kappa, rho, c = (values.get(name) for name in ("conductivity", "density", "potential"))
-        whole = elements.matrix(kappa, rho)
-        potential = None if c is None else elements.matrix(None, c).imag
+        whole = _stored(elements.matrix, values, lb.weak, elements.given)
         linear = None
         if lb.weak.linear.num_rows:
-            near = None if c is None else elements.near(None, c).imag
-            linear = _stored(elements, lb.weak.linear, elements.near(kappa, rho), near)
-    whole = _stored(elements, lb.weak, whole, potential)
+            linear = _stored(elements.near, values, lb.weak.linear, elements.given)
     return PairMatrices(whole.crow, whole.col, whole.values, linear)
 
 
-def _stored(elements: Forms, pair: Csr, upper: Any, potential: Any) -> Csr:
-    """K and M in a medium from the upper triangle, with B and what a condition and the potential add to K."""
-    pattern = Pattern.of(upper, elements.given)
+def _stored(matrix: Any, fields: dict[str, list[Tensor]], pair: Csr, given: Tensor) -> Csr:
+    """K and M in a medium from upper triangles, with B and what a condition and the potential add to K."""
+    kappa, rho, c = (fields.get(name) for name in ("conductivity", "density", "potential"))
+    upper = matrix(kappa, rho)
+    pattern = Pattern.of(upper, given)
     rest = [pair.to_scipy(channel) for channel in range(2, min(len(pair.values), 4))]
     found = pattern.pair(upper).beside(rest)
     values = found.values
-    if potential is not None:
-        values = pad(values, (0, 0, 0, 4 - len(values)))
-        whole = torch.from_numpy(pattern.whole(potential.data))
-        values = torch.cat([values, whole[None]])
+    if c is not None:
+        potential = torch.from_numpy(pattern.whole(matrix(None, c).data.imag))
+        values = torch.cat([pad(values, (0, 0, 0, 4 - len(values))), potential[None]])
     return Csr(found.crow, found.col, values).to(pair.values)

@@ -30,16 +30,15 @@ from torchlb.spectral.pencil import pencil_eigenbasis
 
 MatrixName = Literal["laplacian", "stiffness", "mass", "boundary_mass"]
 FieldMatrixName = Literal["connection", "vector_mass"]
-NO_PAIR = (
-    "{}: this operator has no weak pair, as it was built with weak_form=False, or is a batch of which one was; the "
-    "stencil is lb.matrix"
-)
 
 
-def check_pair(lb: Any) -> None:
+def check_pair(lb: Any, what: str = "eigenpairs, flows and solves") -> None:
     """Raise InputError for an operator without a weak pair, on which eigenpairs, flows and solves rest."""
     if not lb._has_weak_form:
-        raise InputError(NO_PAIR.format("eigenpairs, flows and solves"))
+        raise InputError(
+            f"{what}: this operator has no weak pair, as it was built with weak_form=False, or is a batch of which one "
+            "was; the stencil is lb.matrix"
+        )
 
 
 class PairMethods(OperatorStorage):
@@ -87,8 +86,7 @@ class PairMethods(OperatorStorage):
         check_choice("name", name, MatrixName)
         if name == "laplacian":
             return self.stencil, 0
-        if not self._has_weak_form:
-            raise InputError(NO_PAIR.format(name))
+        check_pair(self, name)
         if name == "boundary_mass" and not self.weak.has_boundary:
             raise InputError("boundary_mass: the shape is closed")
         return self.weak, get_args(MatrixName).index(name) - 1
@@ -111,8 +109,7 @@ class PairMethods(OperatorStorage):
         Raises InputError for another name or shape, and where there is no such matrix.
         """
         matrices, channel = self._channel(name)
-        result = matrices.product(channel, f)
-        return through_product(self, name, f, result)
+        return through_product(self, name, f, matrices.product(channel, f))
 
     @takes_arrays
     def integral(self, f: Tensor) -> Tensor:
@@ -134,9 +131,7 @@ class PairMethods(OperatorStorage):
     def inner(self, f: Tensor, g: Tensor) -> Tensor:
         """∫fg = fᵀMg for equal shapes, as for `integral`, with the density of a medium; by component for fields."""
         if f.shape != g.shape:
-            raise InputError(
-                f"inner: expected equal shapes, got {tuple(f.shape)}, {tuple(g.shape)}"
-            )
+            raise InputError(f"inner: expected equal shapes, got {(*f.shape,)}, {(*g.shape,)}")
         return self._summed(f * self.product("mass", g))
 
     def _summed(self, x: Tensor) -> Tensor:
@@ -184,12 +179,7 @@ class PairMethods(OperatorStorage):
         store
             Whether `state_dict` holds the basis from now on; it then loads into any operator.
 
-        Raises
-        ------
-        EigenbasisError
-            Where the solver does not converge.
-        InputError
-            Without a weak pair.
+        Raises EigenbasisError where the solver does not converge, InputError without a weak pair.
         """
         k = check_num_pairs(k)
         count = k + (0 if origins(self) is None else BEYOND)
@@ -228,28 +218,20 @@ class PairMethods(OperatorStorage):
             for v in values
         ]
         fixed = torch.zeros_like(self.mass, dtype=torch.bool) if self.fixed is None else self.fixed
-        losing = self.weak.losing(fixed).cpu().numpy()
-        fixed = fixed.cpu().numpy()
+        losing, fixed = (mask.cpu().numpy() for mask in (self.weak.losing(fixed), fixed))
         order = self.options.get("order") or 3
         if tolerance is None and order > 3:
             tolerance = 10.0 ** -(2 * min(order, 5) + 1)
         bases = []
         for start, end in zip(self.offsets[:-1], self.offsets[1:], strict=True):
             block = slice(start, end)
-            (k_of, m_of, *near), shift = [m[block, block] for m in matrices], 0.0
+            k_of, m_of, *near = (m[block, block] for m in matrices)
+            mass, shift = self.mass[block].detach().double(), 0.0
             if not self.weak.of_functions:  # fields may be parallel
-                shift = float(self.mass[block].detach().sum() / self.dim) ** (-2 / self.dim)
+                shift = float(mass.sum() / self.dim) ** (-2 / self.dim)
                 k_of, near[0] = k_of + shift * m_of, near[0] + shift * near[1]
-            basis = pencil_eigenbasis(
-                k_of,
-                m_of,
-                self.mass[block].detach().double(),
-                k,
-                dim=self.dim,
-                linear=(near[0], near[1]) if self.weak.linear.num_rows else None,
-                fixed=fixed[block],
-                losing=losing[block],
-                tolerance=tolerance,
-            )
+            rest: Any = {"linear": (near[0], near[1]) if self.weak.linear.num_rows else None}
+            rest |= {"fixed": fixed[block], "losing": losing[block], "tolerance": tolerance}
+            basis = pencil_eigenbasis(k_of, m_of, mass, k, dim=self.dim, **rest)
             bases.append(replace(basis, eigenvalues=(basis.eigenvalues - shift).clamp_min(0.0)))
         return bases[0] if self.sizes is None else stack_eigenbases(bases)

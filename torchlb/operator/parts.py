@@ -66,16 +66,14 @@ class Modes(Tensors):
     def set_count(
         self, vectors: Float[Tensor, "N k"], free: Bool[Tensor, " N"], sizes: tuple[int, ...]
     ) -> None:
-        """Set `count`, the pairs known of every shape, all that the free points allow where these are fewer.
-
-        Columns of the eigenvectors that are zero on a shape are padding there.
-        """
-        parts = zip(vectors.split(sizes), free.split(sizes), strict=True)
+        """Set `count`, the pairs known of every shape, all that the free points allow where these are fewer."""
+        parts = zip(
+            vectors.split(sizes), free.split(sizes), strict=True
+        )  # zero columns are padding
         counts = [(int((modes != 0).any(0).sum()), int(inside.sum())) for modes, inside in parts]
         most = max(sizes)
-        self._counts = torch.empty(
-            min([held for held, all_ in counts if held < all_] + [most]), most
-        )
+        known = min((held for held, every in counts if held < every), default=most)
+        self._counts = torch.empty(known, most)
 
 
 class OperatorCache:

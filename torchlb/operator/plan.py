@@ -72,11 +72,6 @@ class Plan:
     options: Options
     warned: set[Any] = field(default_factory=set)
 
-    @property
-    def num_points(self) -> int:
-        """N."""
-        return len(self.numbering.given)
-
     def forms(self, points: Points) -> Forms:
         """The elements of the weak pair at the user's points, in the user's numbering."""
         here = self._sorted(points)
@@ -93,14 +88,13 @@ class Plan:
     ) -> Float[Tensor, ""]:
         """The sum of bilinear forms of functions at the user's points, differentiable in points and medium.
 
-        The forms are of tangent fields if `tangent`, given by their components in the frames, (N d, C).
-
-        Raises DerivativeError for a medium on the faces of coarse triangles, which flips mix.
+        The forms are of tangent fields if `tangent`, given by their components in the frames, (N d, C). Raises
+        DerivativeError for a medium on the faces of coarse triangles, which flips mix.
         """
 
         @cache  # a function that stands in two forms is one
         def sort(f: Tensor) -> Tensor:
-            return self.numbering.sorted(f.view(self.num_points, -1)).view_as(f)
+            return self.numbering.sorted(f.view(len(self.points), -1)).view_as(f)
 
         forms = [form._replace(w=sort(form.w), u=sort(form.u)) for form in forms]
         if any(f.on_faces for f in medium.values()) and bool(self.pair.curving.coarse.any()):
@@ -108,20 +102,14 @@ class Plan:
                 "points: some triangles are too coarse to be curved, and the medium on the faces is mixed there in a "
                 "way that is not differentiated in the points; give it at the vertices"
             )
-        medium = {
-            name: f._replace(
-                values=f.values[self.order] if f.on_faces else self.numbering.sorted(f.values)
-            )
-            for name, f in medium.items()
-        }
+        order = self.numbering.given, self.order
+        medium = {n: f._replace(values=f.values[order[f.on_faces]]) for n, f in medium.items()}
         placed, fits = self.shape.at(self._sorted(points))
         if not tangent:
             return self.pair.bilinear(fits, forms, medium)
         own = self.pair.curving.nodes.faces, self.creased(), placed.frames
         forms = in_space(forms, placed.frames)
-        return self.pair.bilinear(
-            fits, forms, medium, lambda elements: across_creases(elements, *own)
-        )
+        return self.pair.bilinear(fits, forms, medium, lambda x: across_creases(x, *own))
 
     def creased(self) -> Bool[Tensor, " G"]:
         """Cells at a crease of the shape that the plan was made of, for the derivatives of tangent fields."""
@@ -213,9 +201,8 @@ def operator_parts(
     if pair is not None:
         condition = options.held
         if condition is not None and condition.share is not None and "_on_boundary" in parts:
-            pair = pair.absorbing(
-                points, plan.faces, condition.share * parts["_on_boundary"].to(points)
-            )
+            a = condition.share * parts["_on_boundary"].to(points)
+            pair = pair.absorbing(points, plan.faces, a)
         parts["weak"] = pair
     return parts
 
@@ -239,18 +226,13 @@ def shape_operators(placed: Placed, rows: Rows, order: Int[Tensor, " N"]) -> Flo
 
 
 def check_fit(plan: Plan, after: Points) -> None:
-    """Warn where edges changed by more than `FACTOR` against all others, as what was decided may not fit there.
-
-    It warns once for each line of a program. Raises InputError where triangles of the plane, or tetrahedra of space,
-    were turned inside out.
-    """
+    """Warn, once a line of a program, of edges that changed by more than `FACTOR`; InputError for inverted cells."""
     before, cells = plan.points, plan.faces
     edges = cells[:, torch.tensor(subsets(cells.shape[1] - 1, 2))]
     one, two = (edge_lengths(x, cells) for x in (before, after))
     stretch = torch.where(one > 0, two / one, 1.0)
     change = stretch / stretch.median()
-    changed = edges[(change > FACTOR) | (change < 1 / FACTOR)].unique()
-    if len(changed):
+    if len(changed := edges[(change > FACTOR) | (change < 1 / FACTOR)].unique()):
         warn(
             f"at: {len(changed)} points ({first_few(changed)}) have edges that grew or shrank by more than "
             f"{FACTOR:.0f} times against the others since neighbours, degrees and cells were decided; build the "
@@ -258,12 +240,9 @@ def check_fit(plan: Plan, after: Points) -> None:
             once=plan.warned,
         )
     if cells.shape[1] == before.shape[1] + 1:
-        sides = [
-            torch.linalg.det(x[cells[:, 1:]] - x[cells[:, :1]]).sign() for x in (before, after)
-        ]
-        turned = sides[0] * sides[1]
-        inverted = cells[turned * turned.sum().sign() < 0].unique()
-        if len(inverted):
+        corners = torch.stack([before, after])[:, cells]
+        turned = torch.linalg.det(corners[:, :, 1:] - corners[:, :, :1]).sign().prod(0)
+        if len(inverted := cells[turned * turned.sum().sign() < 0].unique()):
             raise InputError(
                 f"points: cells at {len(inverted)} of them ({first_few(inverted)}) are turned inside out; smaller "
                 "steps, or other cells, are needed"
@@ -279,10 +258,7 @@ PARTS = [
 
 def packed(plans: Sequence[Plan | None]) -> Tensor:
     """The plans as bytes, (B,), on the CPU."""
-    plain = [
-        plan and replace(plan, options=Options(**plan.options.plain), warned=set())
-        for plan in plans
-    ]
+    plain = [p and replace(p, options=Options(**p.options.plain), warned=set()) for p in plans]
     file = BytesIO()
     torch.save((__version__, plain), file)
     return torch.frombuffer(bytearray(file.getvalue()), dtype=torch.uint8)

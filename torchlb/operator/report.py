@@ -144,9 +144,8 @@ class StencilReport:
             for degree, count in self.fit_counts.items():
                 lines.append(counted(f"surface of degree {degree}" if degree else "flat", count))
             below = torch.bincount(self.fit_reason, minlength=len(REASONS)).tolist()
-            for text, count in zip(REASONS[1:], below[1:], strict=True):
-                if count:
-                    lines.append(f"  {text:<39}{count:>8}")
+            reasons = list(zip(REASONS, below, strict=True))[1:]
+            lines += [f"  {text:<39}{count:>8}" for text, count in reasons if count]
         if self.surface is not None:
             lines.append(str(self.surface))
         return "\n".join(lines)

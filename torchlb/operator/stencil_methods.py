@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Any
 
 import torch
@@ -16,6 +17,7 @@ from torchlb.operator.report import StencilReport
 from torchlb.operator.storage import OperatorStorage
 
 
+@dataclass(frozen=True, eq=False, repr=False)
 class Curvatures:
     """Curvatures of a surface in R³ at its points, positive where it bends away from its normals, as a sphere does.
 
@@ -29,10 +31,8 @@ class Curvatures:
         (N, 3, 2), orthonormal tangent vectors in columns.
     """
 
-    def __init__(
-        self, shape_operator: Float[Tensor, "N 2 2"], frames: Float[Tensor, "N 3 2"]
-    ) -> None:
-        self.shape_operator, self._frames = shape_operator, frames
+    shape_operator: Float[Tensor, "N 2 2"]
+    frames: Float[Tensor, "N 3 2"]
 
     @property
     def k1(self) -> Float[Tensor, " N"]:
@@ -47,7 +47,7 @@ class Curvatures:
     @property
     def directions(self) -> Float[Tensor, "N 3 2"]:
         """Unit tangent vectors of space of κ₁ and κ₂, up to their sign; any where both are equal."""
-        return self._frames @ torch.linalg.eigh(self.shape_operator).eigenvectors.flip(2)
+        return self.frames @ torch.linalg.eigh(self.shape_operator).eigenvectors.flip(2)
 
     @property
     def mean(self) -> Float[Tensor, " N"]:
@@ -220,11 +220,9 @@ class StencilMethods(OperatorStorage):
 
     def _boundary_points(self) -> Bool[Tensor, " N"]:
         """Mask of the boundary points, whether or not a condition holds there."""
-        on_boundary = torch.zeros_like(self.mass, dtype=torch.bool)
-        if self.boundary is not None:
-            on_boundary |= self.boundary
-        sides = boundary_faces(self.faces.cpu()).flatten()
-        return on_boundary.index_fill(0, sides.to(on_boundary.device), True)
+        sides = boundary_faces(self.faces.cpu()).flatten().to(self.mass.device)
+        found = torch.zeros_like(self.mass, dtype=torch.bool).index_fill(0, sides, True)
+        return found if self.boundary is None else found | self.boundary
 
 
 def turned_frames(lb: Any) -> Float[Tensor, "N 3 2"]:

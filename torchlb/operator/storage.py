@@ -63,9 +63,7 @@ class OperatorStorage(Tensors):
         self._sizes: list[Tensor] | None = None
         self._states: list[dict[str, Any]] | None = None  # of the shapes of a batch
         self._in_medium = self._carries = False  # whether shapes of a batch require gradients
-        self._plans: (
-            list[Any] | Tensor
-        ) = []  # one for each shape; in a state packed, until asked for
+        self._plans: list[Any] | Tensor = []  # one a shape; in a state packed, until asked for
         self._cache: OperatorCache | None = None
         self._medium = MediumFields({})
         self.stencil, self.weak, self.modes = Csr(order_t=whole), PairMatrices(), Modes(None, none)
@@ -90,8 +88,7 @@ class OperatorStorage(Tensors):
 
     def _save_to_state_dict(self, destination: Any, prefix: str, keep_vars: bool) -> None:
         super()._save_to_state_dict(destination, prefix, keep_vars)
-        plans = self._packed_plans()
-        if len(plans):
+        if len(plans := self._packed_plans()):
             destination[f"{prefix}plans"] = plans
 
     @property
@@ -161,9 +158,8 @@ class OperatorStorage(Tensors):
         if len(self._on_boundary) == 0 or not any(holds):
             return None
         sizes = torch.tensor(self.sizes or (self.num_points,))
-        return (
-            torch.tensor(holds).repeat_interleave(sizes).to(self._on_boundary) & self._on_boundary
-        )
+        held = torch.tensor(holds).repeat_interleave(sizes)
+        return held.to(self._on_boundary) & self._on_boundary
 
     @property
     def shape(self) -> tuple[int, int]:

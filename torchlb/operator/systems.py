@@ -14,12 +14,12 @@ import math
 from collections import OrderedDict
 from collections.abc import Callable
 from functools import cached_property, partial
-from typing import Any, Literal
+from typing import Literal
 from weakref import finalize
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from scipy import sparse
 from scipy.sparse import csgraph
 from torch import Tensor
@@ -92,7 +92,15 @@ class PairSystem:
         crow, col, linear = lb.weak.linear_pair
         first, second = (to_scipy(crow, col, v.double(), lb.shape) for v in linear)
         losing = lb.weak.losing(lb.fixed)
-        self._find_components(first, losing)
+        # the connected components, those where K1 = 0, and their areas
+        pattern = np.ones(first.nnz), first.indices, first.indptr
+        graph = sparse.csr_array(pattern, shape=first.shape)  # with entries that are zero
+        self.count, number = csgraph.connected_components(graph, directed=False)
+        self.component = torch.from_numpy(number.astype(np.int64)).to(losing.device)
+        held = losing.new_zeros(self.count, dtype=torch.float32)
+        held = held.index_add(0, self.component, losing.float())
+        self.unheld = ((held if self.count == 1 else held[self.component]) == 0)[:, None]
+        self.area = self._sums(self.one, self.ones_mass)
         if lb.weak.of_functions:
             sums = first.sum(1)  # negative row sums (float32) would make it indefinite
             sums = np.where(losing.cpu().numpy(), np.minimum(sums, 0.0), sums)
@@ -101,22 +109,8 @@ class PairSystem:
         self.factors: OrderedDict[float | None, Factor] = OrderedDict()
         finalize(self, self.factors.clear)  # cholespy reports factors that outlive Python as leaks
 
-    def _find_components(self, linear: Any, losing: Bool[Tensor, " N"]) -> None:
-        """Find the connected components, those where K1 = 0, and their areas.
-
-        Results have a row for each point, or one row where there is one component.
-        """
-        pattern = np.ones(linear.nnz), linear.indices, linear.indptr
-        graph = sparse.csr_array(pattern, shape=linear.shape)  # with entries that are zero
-        self.count, number = csgraph.connected_components(graph, directed=False)
-        self.component = torch.from_numpy(number.astype(np.int64)).to(losing.device)
-        held = torch.zeros(self.count, device=losing.device)
-        held = held.index_add(0, self.component, losing.float())
-        self.unheld = ((held if self.count == 1 else held[self.component]) == 0)[:, None]
-        self.area = self._sums(self.one, self.ones_mass)
-
     def _sums(self, weights: Float[Tensor, "N 1"], x: Float[Tensor, "N C"]) -> Float[Tensor, "_ C"]:
-        """Weighted sums over the component of each point."""
+        """Weighted sums over the component of each point, one row where there is one component."""
         if self.count == 1:
             return weights.T @ x
         found = x.new_zeros(self.count, x.shape[1])
@@ -146,7 +140,7 @@ class PairSystem:
             right, time = right * (longest / time).clamp_max(1.0), time.clamp_max(longest)
         near = partial(self.near, self.levels(time, b.shape[1]))
         x = near(right) if tolerance == "P1" else self._solved(right, time, tolerance, near)
-        shift = -self._mean(self.ones_mass, x)
+        shift = -self.mean(x, self.ones_mass)
         return x.add_(shift if time is None else shift + mean)
 
     def solve_beyond(
@@ -232,7 +226,12 @@ class PairSystem:
 
         The cycle is of K alone where M is small for the shortest time.
         """
-        coarse = partial(self._coarse, unit, near, centered)
+
+        def coarse(r: Tensor) -> Tensor:
+            x = near(r.double()).mul_(unit)
+            # where K is singular rounding adds large constants
+            return (x - self.mean(x, self.ones_mass) if centered else x).to(r)
+
         if not self.smooths:
             return coarse
         shares = [share.float() for share in shares]
@@ -242,11 +241,6 @@ class PairSystem:
             terms = terms[:1]
         cycle = two_grid(partial(self._product, terms), sum(sums[1:], sums[0]), coarse)
         return lambda r: cycle(r.float()).to(r)
-
-    def _coarse(self, unit: Tensor, near: Linear, centered: bool, r: Tensor) -> Tensor:
-        """The factors' solve, less the large constants that rounding adds where K is singular."""
-        x = near(r.double()).mul_(unit)
-        return (x - self._mean(self.ones_mass, x) if centered else x).to(r)
 
     def _product(self, terms: list[tuple[Tensor, Matrix]], x: Tensor) -> Tensor:
         """Product of every column with its shares of the matrices."""
@@ -270,7 +264,7 @@ class PairSystem:
         """The solution by P1 elements."""
         blocks = r.split([count for _, count in levels], dim=1)
         solved = [self.factor(t).solve(block) for (t, _), block in zip(levels, blocks, strict=True)]
-        return self.inside(solved[0] if len(solved) == 1 else torch.cat(solved, dim=1))
+        return self.inside(torch.cat(solved, dim=1))
 
     def factor(self, t: float | None) -> Factor:
         """The factor of M₁ + tK₁, or of K₁ with a small multiple of M₁ that makes it definite."""
@@ -301,13 +295,10 @@ class PairSystem:
                 "from where its plan was made (lb.at); build the operator anew"
             ) from error
 
-    def mean(self, b: Float[Tensor, "N C"]) -> Float[Tensor, "_ C"]:
-        """1ᵀb over the area of each component where K1 = 0, one row if there is one component."""
-        return self._mean(self.one, b)
-
-    def _mean(self, weights: Tensor, x: Tensor) -> Tensor:
-        """Weighted sums over components where K1 = 0, divided by their areas; 0 on the others."""
-        return torch.where(self.unheld, self._sums(weights, x) / self.area, 0.0)
+    def mean(self, b: Float[Tensor, "N C"], weights: Tensor | None = None) -> Float[Tensor, "_ C"]:
+        """Weighted sums over components where K1 = 0, over their areas, as `_sums`; 0 on the others."""
+        sums = self._sums(self.one if weights is None else weights, b)
+        return torch.where(self.unheld, sums / self.area, 0.0)
 
     def inside(self, x: Tensor) -> Tensor:
         """x, set to zero at Dirichlet points."""

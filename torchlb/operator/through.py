@@ -52,11 +52,16 @@ class _Origin(NamedTuple):
     def gradient(self, forms: Sequence[BilinearForm]) -> list[Tensor]:
         """The derivative of a sum of forms in the variables; DerivativeError where it is not finite."""
         medium, root = plain(self.medium), _root_of_absorption(self.weak)
-        forms = [part for form in forms for part in self._parts(form, root)]
+        energies = [form for form in forms if form.name == "energy"]
+        forms = [form for form in forms if form.name != "energy"]
+        forms += [form._replace(name="stiffness") for form in energies]
+        if "potential" in medium:
+            forms += [form._replace(name="potential") for form in energies]
+        if root is not None:
+            forms += [BilinearForm("boundary", root * w, root * u, c) for _, w, u, c, _ in energies]
         leaves = [f.values for name, f in medium.items() if self.medium[name].values.requires_grad]
-        moved = []
-        if self.points.requires_grad:
-            moved = [self.points.detach().cpu().double().requires_grad_()]
+        points = self.points.detach().cpu().double().requires_grad_()
+        moved = [points] if self.points.requires_grad else []
         with torch.enable_grad():
             assert self.bilinear is not None
             total = self.bilinear(*moved, forms, medium)
@@ -65,22 +70,10 @@ class _Origin(NamedTuple):
                 found = torch.autograd.grad(total, [*moved, *leaves], materialize_grads=True)
         return [_finite(g).to(v) for g, v in zip(found, self.variables, strict=True)]
 
-    def _parts(self, form: BilinearForm, root: Tensor | None) -> list[BilinearForm]:
-        """The forms that a form is the sum of; of a Robin condition `root` has √a at the vertices, (N, 1)."""
-        if form.name != "energy":
-            return [form]
-        parts = [form._replace(name="stiffness")]
-        if "potential" in self.medium:
-            parts.append(form._replace(name="potential"))
-        if root is not None:
-            parts.append(BilinearForm("boundary", root * form.w, root * form.u, form.c))
-        return parts
-
 
 def _finite(gradient: Tensor) -> Tensor:
     """The gradient in points or faces; DerivativeError where it is not finite."""
-    bad = (~gradient.isfinite()).nonzero()[:, 0].unique()
-    if len(bad):
+    if len(bad := (~gradient.isfinite()).nonzero()[:, 0].unique()):
         raise DerivativeError(
             f"points or medium: the derivative at {len(bad)} points or faces ({first_few(bad)}) is not finite, as "
             "where all cells of a point are degenerate, which can be removed or merged, or where they meet at a right "
@@ -114,10 +107,7 @@ class Origins(list[_Origin]):
 
 
 def origins(lb: Any) -> Origins | None:
-    """What the weak pair of an operator is differentiable in; None if nothing of it requires a gradient.
-
-    Raises DerivativeError for a batch whose shapes are no longer known.
-    """
+    """What an operator's weak pair is differentiable in, if anything; DerivativeError where a batch lost its shapes."""
     held = [lb.points, *tensors_of(lb._medium).values()]
     carries = lb._carries or any(t.requires_grad for t in held)
     if not (carries and torch.is_grad_enabled()):
@@ -166,18 +156,6 @@ def _following(
     return _Known.apply(gradient, len(given), *given, *variables)  # pyright: ignore[reportReturnType]
 
 
-def refused(value: Tensor, what: str, *variables: Tensor) -> Tensor:
-    """The value, which raises DerivativeError where its derivative in the variables is asked for."""
-
-    def gradient(g: Tensor) -> list[Tensor]:
-        raise DerivativeError(
-            f"{what}: no derivative in the points or in the medium; eigenpairs, flows, solves, the mass, "
-            "lb.product(name, f), Δf and ∇f have one. For derivatives in f, take an operator at points.detach()"
-        )
-
-    return _following([value], gradient, *variables)[0]
-
-
 def known(lb: Any, results: Sequence[Tensor], forms: Forms) -> Sequence[Tensor]:
     """Results with their derivatives in the operator's variables, by the forms that gradients make."""
     found = origins(lb)
@@ -192,8 +170,14 @@ def known(lb: Any, results: Sequence[Tensor], forms: Forms) -> Sequence[Tensor]:
 
 def without(lb: Any, x: Tensor, what: str) -> Tensor:
     """x, by which nothing is differentiable in points or medium: DerivativeError where that is asked for."""
-    found = origins(lb)
-    return x if found is None else x + refused(torch.zeros_like(x), what, *found.variables)
+
+    def refused(g: Tensor) -> list[BilinearForm]:
+        raise DerivativeError(
+            f"{what}: no derivative in the points or in the medium; eigenpairs, flows, solves, the mass, "
+            "lb.product(name, f), Δf and ∇f have one. For derivatives in f, take an operator at points.detach()"
+        )
+
+    return x if origins(lb) is None else x + known(lb, [torch.zeros_like(x)], refused)[0]
 
 
 def carrying(lb: Any, points: Any) -> Any:
@@ -224,9 +208,8 @@ def carrying(lb: Any, points: Any) -> Any:
 
     (lb.mass,) = known(lb, [lb.mass], of_mass)
     mass = lb.mass.detach().cpu().double()
-    variables = (
-        [own, lb.mass] if lb.weak.near.values[3:4].any() else [own]
-    )  # Robin's low-order rows
+    of_robin = lb.weak.near.values[3:4].any()  # whose low-order rows have the mass in them
+    variables = [own, lb.mass] if of_robin else [own]
     rows = [lb.stencil.values, lb.frames]
     rows += [lb.normals, lb._shape_operators] if len(lb.normals) else []
     lb.stencil.values, lb.frames, *rest = _following(rows, of_rows, *variables)
@@ -264,11 +247,10 @@ def through_eigenpairs(lb: Any, whole: Eigenbasis, k: int) -> Eigenbasis:
         grads = values.view(len(shapes), -1), vectors.split(sizes), left.split(sizes)
         parts = [_of_shape(*row) for row in zip(shapes, wholes, *grads, strict=True)]
         most = max(part[0].shape[1] for part in parts)
-        joined = (
+        w, of_mass, u = (
             torch.cat([pad(own, (0, most - own.shape[1])) for own in column])
             for column in zip(*parts, strict=True)
         )
-        w, of_mass, u = joined
         one = torch.ones(most, dtype=torch.float64)
         return [BilinearForm("energy", w, u, one), BilinearForm("mass", of_mass, u, one)]
 
