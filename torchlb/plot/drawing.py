@@ -10,8 +10,10 @@ from typing import Any
 
 import numpy as np
 import torch
+from scipy.spatial.transform import Rotation
 
 from torchlb.errors import InputError, InputTypeError, shown
+from torchlb.operator.inputs import check_corners
 
 Eye = tuple[float, float]
 """Elevation of the eye above the plane of x and y, and azimuth from x, in degrees."""
@@ -65,13 +67,9 @@ def shape_of(points: Any, faces: Any) -> tuple[np.ndarray, np.ndarray | None]:
     points = cloud_of(points)
     if faces is None:
         return points, None
-    corners = torch.as_tensor(faces).detach().cpu().numpy()
-    if corners.ndim != 2 or corners.shape[1] != 3 or len(corners) == 0:
-        raise InputError(f"faces: expected (F, 3), at least one, got {corners.shape}")
-    if corners.min() < 0 or corners.max() >= len(points):
-        raise InputError(
-            f"faces: expected indices 0 … {len(points) - 1}, got {corners.min()} … {corners.max()}"
-        )
+    corners = check_corners(faces, len(points)).numpy()
+    if corners.shape[1] != 3:
+        raise InputError(f"faces: expected (F, 3), got {corners.shape}")
     return points, corners
 
 
@@ -89,8 +87,8 @@ def color_map(
     symmetric: bool | None,
     limits: tuple[float, float] | None = None,
     diverging: str = "RdBu_r",
-) -> tuple[Any, str]:
-    """The map from values to colours, and the ends at which values exceed its range."""
+) -> Any:
+    """The map from values to colours; its bar is pointed at the ends at which values exceed its range."""
     from matplotlib import cm, colormaps, colors
 
     finite = values[np.isfinite(values)]
@@ -106,9 +104,9 @@ def color_map(
         low, high = limits
     slack = 0.02 * (high - low)  # point an end only where values are cut off
     beyond = finite.min() < low - slack, finite.max() > high + slack
-    extend = ("neither", "min", "max", "both")[beyond[0] + 2 * beyond[1]]
     table = colormaps[cmap or (diverging if symmetric else "viridis")].with_extremes(bad=MISSING)
-    return cm.ScalarMappable(colors.Normalize(low, high), table), extend
+    table.colorbar_extend = ("neither", "min", "max", "both")[beyond[0] + 2 * beyond[1]]
+    return cm.ScalarMappable(colors.Normalize(low, high), table)
 
 
 def plain(color: str, count: int) -> np.ndarray:
@@ -118,27 +116,23 @@ def plain(color: str, count: int) -> np.ndarray:
     return np.tile(to_rgba(color), (count, 1))
 
 
-def _project(points: np.ndarray, view: Eye) -> np.ndarray:
+def _project(points: np.ndarray, view: Any) -> np.ndarray:
     """Coordinates (N, 3) in the picture: right, up, towards the eye."""
-    elevation, azimuth = np.radians(view)
-    right = np.array([-np.sin(azimuth), np.cos(azimuth), 0.0])
-    ahead = np.array([np.cos(azimuth), np.sin(azimuth), 0.0])
-    eye = np.cos(elevation) * ahead + np.sin(elevation) * np.array([0.0, 0.0, 1.0])
-    return points @ np.stack([right, np.cross(eye, right), eye], axis=1)
+    elevation, azimuth = view
+    turn = Rotation.from_euler("ZX", [azimuth + 90, 90 - elevation], degrees=True)
+    return points @ turn.as_matrix()
 
 
-def _stacked(points: np.ndarray, view: Views) -> Iterator[tuple[np.ndarray, Eye]]:
+def _stacked(points: np.ndarray, view: Views) -> Iterator[tuple[np.ndarray, Any]]:
     """The projections for all eyes, one below the other. A shape in the plane z = 0 is seen from above."""
     if not points[:, 2].any():
         view = (90.0, -90.0)
-    views: Any = [view] if isinstance(view[0], int | float) else view
     floor = 0.0
-    for eye in views:
+    for eye in np.reshape(view, (-1, 2)):
         flat = _project(points - points.mean(axis=0), eye)
-        height = np.ptp(flat[:, 1])
         flat[:, 1] += floor - flat[:, 1].max()
         flat[:, 0] -= (flat[:, 0].max() + flat[:, 0].min()) / 2
-        floor -= 1.08 * height
+        floor -= 1.08 * np.ptp(flat[:, 1])
         yield flat, eye
 
 
@@ -197,16 +191,14 @@ def isolines_of(
 
     Each end is given by its edge, (S, 2, 2), and its fraction of the edge, (S, 2, 1) in 0 … 1.
     """
-    finite = faces[np.isfinite(values[faces]).all(axis=1)]
+    finite, levels = faces[np.isfinite(values[faces]).all(axis=1)], np.asarray(levels)
     edges = np.stack([finite, np.roll(finite, -1, axis=1)], axis=-1)  # (F, 3, 2)
-    start, end = values[edges[..., 0]], values[edges[..., 1]]
-    found, shares = [], []
-    for level in levels:
-        crossed = (start > level) != (end > level)  # two edges of a triangle, or none
-        found.append(edges[crossed].reshape(-1, 2, 2))
-        share = (level - start[crossed]) / (end[crossed] - start[crossed])
-        shares.append(share.reshape(-1, 2, 1))
-    return np.concatenate(found), np.concatenate(shares)
+    start, end = np.moveaxis(values[edges] > levels[:, None, None, None], -1, 0)
+    level, *place = np.nonzero(start != end)  # two edges of a triangle, or none
+    crossed = edges[tuple(place)]
+    start, end = values[crossed].T
+    share = (levels[level] - start) / (end - start)
+    return crossed.reshape(-1, 2, 2), share.reshape(-1, 2, 1)
 
 
 def _faded(colors: np.ndarray, flat: np.ndarray) -> np.ndarray:
@@ -272,19 +264,13 @@ def _visible(flat: np.ndarray, faces: np.ndarray, chosen: np.ndarray) -> np.ndar
     return visible
 
 
-def finish(
-    ax: Any,
-    title: str | None,
-    shades: Any = None,
-    extend: str = "neither",
-    label: str | None = None,
-) -> Any:
+def finish(ax: Any, title: str | None, shades: Any = None, label: str | None = None) -> Any:
     """Give the axes equal aspect, no frame, a title and a colour bar, and return them."""
     ax.autoscale_view()
     ax.set_aspect("equal")
     ax.set_axis_off()
     if shades is not None:
-        ax.figure.colorbar(shades, ax=ax, shrink=0.6, pad=0.03, extend=extend, label=label or "")
+        ax.figure.colorbar(shades, ax=ax, shrink=0.6, pad=0.03, label=label or "")
     if title:
         ax.set_title(title)
     return ax

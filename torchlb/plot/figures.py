@@ -61,16 +61,10 @@ def plot_surface(
 
     Parameters
     ----------
-    vertices
-        (N, 3) tensor or array.
-    faces
-        (F, 3) indices.
-    values
-        (N,); a triangle has the mean of its corners. Grey where not finite.
-    ax
-        Matplotlib axes; new ones by default.
-    title
-        Title above the axes.
+    vertices, faces, values
+        (N, 3), (F, 3) and (N,), tensors or arrays; a triangle has the mean of its corners. Grey where not finite.
+    ax, title
+        Matplotlib axes, new ones by default, and the title above them.
     cmap
         matplotlib's name; by default "RdBu_r" around zero, "viridis" otherwise, which the colour-blind can read.
     symmetric
@@ -91,11 +85,11 @@ def plot_surface(
     ax = axes_of(ax)
     points, corners = shape_of(vertices, faces)
     numbers = values_of(values, points)
-    shades, extend = color_map(numbers, cmap, symmetric, limits)
+    shades = color_map(numbers, cmap, symmetric, limits)
     assert corners is not None
-    isolines = isolines_of(numbers, corners, levels) if len(levels) else None
+    isolines = isolines_of(numbers, corners, levels)
     paint(ax, points, corners, shades.to_rgba(numbers[corners].mean(axis=1)), view, isolines)
-    return finish(ax, title, shades, extend, label)
+    return finish(ax, title, shades, label)
 
 
 def plot_points(
@@ -115,10 +109,8 @@ def plot_points(
 
     Parameters
     ----------
-    points
-        (N, 2) or (N, 3) tensor or array.
-    values
-        (N,).
+    points, values
+        (N, 2) or (N, 3), and (N,), tensors or arrays.
     size
         Area of a disk, in square points (1/72 inch); by default smaller the more there are.
     ax, title, cmap, symmetric, limits, view, label
@@ -130,9 +122,9 @@ def plot_points(
     places = cloud_of(points)
     numbers = values_of(values, places)
     # The middle of "coolwarm" is not white.
-    shades, extend = color_map(numbers, cmap, symmetric, limits, "coolwarm")
+    shades = color_map(numbers, cmap, symmetric, limits, "coolwarm")
     paint(ax, places, None, shades.to_rgba(numbers), view, size=size)
-    return finish(ax, title, shades, extend, label)
+    return finish(ax, title, shades, label)
 
 
 def plot_vectors(
@@ -156,10 +148,8 @@ def plot_vectors(
 
     Parameters
     ----------
-    vertices
-        (N, 3); also (N, 2) for a cloud.
-    faces
-        (F, 3), or None for a cloud.
+    vertices, faces
+        (N, 3) and (F, 3); (N, 2) or (N, 3) and None for a cloud.
     vectors
         (N, 3), or (N, 2) in the plane. Vectors that are zero or not finite are not drawn.
     values
@@ -177,13 +167,13 @@ def plot_vectors(
         raise InputError(f"vectors: expected {places.shape}, one a point, got {field.shape}")
     lengths = np.linalg.norm(field, axis=1)
     numbers = lengths if values is None else values_of(values, places)
-    shades, extend = color_map(numbers, cmap, symmetric, limits)
+    shades = color_map(numbers, cmap, symmetric, limits)
     painted = numbers if corners is None else numbers[corners].mean(axis=1)  # by dot or triangle
     ground = plain(PALE, len(painted)) if values is None else shades.to_rgba(painted)
     paint(ax, places, corners, ground, view)
     inks = shades.to_rgba(lengths) if values is None else plain(INK, len(places))
     draw_arrows(ax, places, corners, field, inks, view, count)
-    return finish(ax, title, shades, extend, label)
+    return finish(ax, title, shades, label)
 
 
 def plot_orders(
@@ -199,12 +189,10 @@ def plot_orders(
 
     Parameters
     ----------
-    vertices
-        (N, 3); also (N, 2) for a cloud.
-    faces
-        (F, 3), or None for a cloud. A triangle takes the lowest order of its corners.
+    vertices, faces
+        As for `plot_vectors`.
     order
-        (N,), 0 for a low-order row. Darker is higher.
+        (N,), 0 for a low-order row. Darker is higher. A triangle takes the lowest order of its corners.
     ax, title, view
         As for `plot_surface`.
 
@@ -244,16 +232,12 @@ def plot_convergence(
 
     Parameters
     ----------
-    sizes
-        Numbers of points N, ascending.
-    errors
-        Errors at these sizes, by method; zeros and NaN are left out.
+    sizes, errors
+        Numbers of points N, ascending, and the errors at these, by method; zeros and NaN are left out.
     dim
         d of the manifold. The measured order is the slope against h over the three finest sizes.
-    ax, title
-        As for `plot_surface`.
-    ylabel
-        Label of the vertical axis.
+    ax, title, ylabel
+        As for `plot_surface`, and the label of the vertical axis.
 
     Returns the axes. Raises ValueError if no error is positive, or if their number is not that of the sizes.
     """
@@ -262,8 +246,9 @@ def plot_convergence(
     for i, (name, line) in enumerate(errors.items()):
         n, error = np.asarray(sizes, dtype=float), np.asarray(line, dtype=float)
         if n.shape != error.shape:
-            expected = f"expected {len(n)}, one for a size"
-            raise InputError(f"errors[{name!r}]: {expected}, got {len(error)}")
+            raise InputError(
+                f"errors[{name!r}]: expected {len(n)}, one for a size, got {len(error)}"
+            )
         good = np.isfinite(error) & (error > 0)
         n, error = n[good], error[good]
         label = name
