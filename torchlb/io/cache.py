@@ -155,10 +155,7 @@ def save_operator(lb: LaplaceBeltrami, path: str | Path, *, key: str = "") -> No
     key
         Its `operator_key`, for a file of a cache.
 
-    Raises
-    ------
-    OSError
-        Where the file cannot be written; no part of it remains.
+    Raises OSError where the file cannot be written; no part of it remains.
     """
     check_operator(lb)
     path = check_path(path)
@@ -198,12 +195,8 @@ def _compact(tensor: Tensor) -> Tensor:
 def load_operator(path: str | Path) -> LaplaceBeltrami:
     """Read the operator in the file `path`, by `save_operator` or of a cache, bit for bit, on the CPU.
 
-    Raises
-    ------
-    FileNotFoundError
-        If there is no such file.
-    OperatorFileError
-        If it is something else, damaged, or of a version with another format.
+    Raises FileNotFoundError if there is no such file, and OperatorFileError if it is something else, damaged, or of a
+    version with another format.
     """
     return load_with_header(path)[0]
 
