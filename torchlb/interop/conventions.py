@@ -37,15 +37,9 @@ def weak_matrices(
 
     Parameters
     ----------
-    lb
-        Operator.
-    convention
-        "igl" (C ≤ 0), or "potpourri3d", "robust_laplacian", "lapy", "diffusion_net" (C ≥ 0).
-
-    Raises
-    ------
-    ValueError
-        For another library.
+    lb, convention
+        Operator, and "igl" (C ≤ 0), or "potpourri3d", "robust_laplacian", "lapy", "diffusion_net" (C ≥ 0), else an
+        InputError.
 
     Examples
     --------
@@ -71,16 +65,9 @@ def edge_weights(
 
     Parameters
     ----------
-    lb
-        Operator.
-    normalization
-        None for the weak matrix, "rw" for the strong one, Δ itself. PyG's "sym" presumes a symmetric weak matrix, which
-        the stencil does not have.
-
-    Raises
-    ------
-    ValueError
-        For another normalization.
+    lb, normalization
+        Operator, and None for the weak matrix, "rw" for the strong one, Δ itself, else an InputError. PyG's "sym"
+        presumes a symmetric weak matrix, which the stencil does not have.
     """
     check_operator(lb)
     if normalization not in (None, "rw"):
