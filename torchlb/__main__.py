@@ -66,10 +66,8 @@ def _show(message: Warning | str, category: type[Warning], *_: Any) -> None:
 def _stencil_options(command: Callable[..., Any]) -> Callable[..., Any]:
     """Add the options that the commands share."""
     for name, (kind, default, text) in OF_THE_OPERATOR.items():
-        option = click.option(
-            f"--{name}", type=kind, is_flag=kind is bool, default=default, help=text
-        )
-        command = option(command)
+        add = click.option(f"--{name}", type=kind, is_flag=kind is bool, default=default, help=text)
+        command = add(command)
     return command
 
 
@@ -84,9 +82,8 @@ def _built(shape: Path, settings: dict[str, Any]) -> tuple[LaplaceBeltrami, Any]
 
 def _stability(lb: LaplaceBeltrami) -> str:
     """What is known of an operator's stability."""
-    pair = "stable: symmetric, positive by its weak pair" if lb._has_weak_form else ""
-    known = [pair, "" if lb.certificate is None else str(lb.certificate)]
-    return "\n".join(filter(None, known)) or "no certificate"
+    pair = "stable: symmetric, positive by its weak pair" if lb._has_weak_form else None
+    return "\n".join(str(known) for known in (pair, lb.certificate) if known) or "no certificate"
 
 
 @click.group(cls=_Commands, context_settings=SETTINGS)
@@ -194,8 +191,7 @@ def info(file: Path) -> None:
             click.echo(f"{loose} vertices belong to no face with distinct corners")
         return
     click.echo(f"{lb}\n\n{lb.report}\n{_stability(lb)}")
-    pairs = lb.modes.left.shape[-1]
-    click.echo(f"{pairs} eigenpairs stored")
+    click.echo(f"{lb.modes.left.shape[-1]} eigenpairs stored")
     click.echo(f"{file.stat().st_size / 1e6:.1f} MB, written by torchlb {header['version']}")
 
 
@@ -212,9 +208,7 @@ def _to_file(compute: Callable[..., dict[str, Any]]) -> Callable[..., None]:
         found = compute(lb, **settings)
         taken = found.keys() & {"path", "points", "cells"}
         if taken:
-            raise InputError(
-                f"{', '.join(taken)}: rename these data, a shape has parts of that name"
-            )
+            raise InputError(f"{', '.join(taken)}: rename these data, a shape has parts so named")
         write_shape(out, lb.points, lb.faces, **found)
         click.echo(f"{out}: {_size(lb.points, faces)}")
 

@@ -32,10 +32,8 @@ class PoissonFeatures(nn.Module):
 
     Parameters
     ----------
-    channels
-        C.
-    fields
-        Whether there are fields; they make a training step a third longer.
+    channels, fields
+        C, and whether there are fields, which make a training step a third longer.
     rotations
         Whether A is complex, see `TangentMap`.
     tolerance
@@ -76,14 +74,8 @@ class PoissonBlock(GradientBlock):
 
     Parameters
     ----------
-    width
-        Channels in and out.
-    hidden
-        Widths of the hidden layers of the pointwise network; [width, width] by default.
-    dropout
-        Whether that network drops half of its hidden values in training.
-    gradient_features, rotations
-        Whether there are gradient features, and whether they rotate gradients: see `GradientFeatures`.
+    width, hidden, dropout, gradient_features, rotations
+        As for `DiffusionNetBlock`.
     fields, tolerance
         Arguments of `PoissonFeatures`.
 

@@ -33,10 +33,7 @@ def limit_surface(
     faces
         Triangles of the levels 0 to `levels`; `points[: faces[i].max() + 1]` are the vertices of level i.
 
-    Raises
-    ------
-    InputError
-        For meshes that are not closed.
+    Raises InputError for meshes that are not closed.
 
     References
     ----------
