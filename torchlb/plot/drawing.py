@@ -1,7 +1,4 @@
-"""Drawing in three dimensions with matplotlib, for `plot`: projection, the painter's algorithm, colours, axes.
-
-The functions take checked input, as `cloud_of`, `shape_of` and `values_of` return it: NumPy arrays of float64.
-"""
+"""Drawing in three dimensions with matplotlib, of input that `figures` checks: projection, the painter's algorithm."""
 
 from __future__ import annotations
 
@@ -9,11 +6,7 @@ from collections.abc import Iterator, Sequence
 from typing import Any
 
 import numpy as np
-import torch
 from scipy.spatial.transform import Rotation
-
-from torchlb.errors import InputError, InputTypeError, shown
-from torchlb.operator.inputs import check_corners
 
 Eye = tuple[float, float]
 """Elevation of the eye above the plane of x and y, and azimuth from x, in degrees."""
@@ -23,90 +16,8 @@ VIEW: Eye = (25.0, -55.0)
 """Default view of a surface: elevation and azimuth, °."""
 LIGHT = (-0.35, 0.45, 0.82)
 """Direction of the light in the picture's coordinates: right, up, towards the eye."""
-MISSING = "0.6"
-"""Colour of values that are NaN or infinite: grey."""
 INK = "0.1"
 """Colour of isolines, and of arrows on a coloured shape."""
-
-
-def axes_of(ax: Any) -> Any:
-    """Return the given axes, or new ones of `matplotlib.pyplot`; ImportError without matplotlib."""
-    try:
-        import matplotlib as mpl  # noqa: F401
-    except ImportError as error:
-        raise ImportError('pictures need matplotlib: pip install ".[plot]" in a clone') from error
-    if ax is not None:
-        return ax
-    import matplotlib.pyplot as plt
-
-    return plt.subplots(figsize=(6.4, 4.8), layout="constrained")[1]
-
-
-def _numpy(values: Any) -> np.ndarray:
-    try:
-        return torch.as_tensor(values).detach().cpu().double().numpy()
-    except (TypeError, ValueError, RuntimeError) as error:
-        raise InputTypeError(
-            f"expected a tensor or array, got {shown(values)}; an operator has lb.points and lb.faces"
-        ) from error
-
-
-def cloud_of(points: Any, name: str = "points") -> np.ndarray:
-    """Points as (N, 3), with z = 0 for points of the plane."""
-    places = _numpy(points)
-    if places.ndim != 2 or places.shape[1] not in (2, 3):
-        raise InputError(
-            f"{name}: expected (N, 2) or (N, 3), got {places.shape}; choose the coordinates to draw, "
-            "for example points[:, :3]"
-        )
-    return np.pad(places, ((0, 0), (0, 3 - places.shape[1])))
-
-
-def shape_of(points: Any, faces: Any) -> tuple[np.ndarray, np.ndarray | None]:
-    """Points as (N, 3), and the indices of their triangles (F, 3), None for a cloud; InputError for what is neither."""
-    points = cloud_of(points)
-    if faces is None:
-        return points, None
-    corners = check_corners(faces, len(points)).numpy()
-    if corners.shape[1] != 3:
-        raise InputError(f"faces: expected (F, 3), got {corners.shape}")
-    return points, corners
-
-
-def values_of(values: Any, points: np.ndarray) -> np.ndarray:
-    """One number for each point, (N,); ValueError for another count."""
-    numbers = _numpy(values)
-    if numbers.shape != points.shape[:1]:
-        raise InputError(f"values: expected {points.shape[:1]}, one a point, got {numbers.shape}")
-    return numbers
-
-
-def color_map(
-    values: np.ndarray,
-    cmap: str | None,
-    symmetric: bool | None,
-    limits: tuple[float, float] | None = None,
-    diverging: str = "RdBu_r",
-) -> Any:
-    """The map from values to colours; its bar is pointed at the ends at which values exceed its range."""
-    from matplotlib import cm, colormaps, colors
-
-    finite = values[np.isfinite(values)]
-    finite = finite if len(finite) else np.zeros(1)
-    low, high = np.percentile(finite, [1, 99])
-    symmetric = bool(low < 0 < high) if symmetric is None else symmetric
-    if symmetric:
-        high = max(abs(low), abs(high))
-        low = -high
-    if high <= low:
-        low, high = low - 1, high + 1
-    if limits is not None:
-        low, high = limits
-    slack = 0.02 * (high - low)  # point an end only where values are cut off
-    beyond = finite.min() < low - slack, finite.max() > high + slack
-    table = colormaps[cmap or (diverging if symmetric else "viridis")].with_extremes(bad=MISSING)
-    table.colorbar_extend = ("neither", "min", "max", "both")[beyond[0] + 2 * beyond[1]]
-    return cm.ScalarMappable(colors.Normalize(low, high), table)
 
 
 def plain(color: str, count: int) -> np.ndarray:
@@ -262,15 +173,3 @@ def _visible(flat: np.ndarray, faces: np.ndarray, chosen: np.ndarray) -> np.ndar
         fall = (normal[covered, :2] * (point - a[covered])[:, :2]).sum(axis=1) / area[covered]
         visible[i] = not (a[covered, 2] - fall > point[2] + slack).any()
     return visible
-
-
-def finish(ax: Any, title: str | None, shades: Any = None, label: str | None = None) -> Any:
-    """Give the axes equal aspect, no frame, a title and a colour bar, and return them."""
-    ax.autoscale_view()
-    ax.set_aspect("equal")
-    ax.set_axis_off()
-    if shades is not None:
-        ax.figure.colorbar(shades, ax=ax, shrink=0.6, pad=0.03, label=label or "")
-    if title:
-        ax.set_title(title)
-    return ax
