@@ -32,7 +32,6 @@ from torchlb.plot.comparison import draw_comparison, spectrum_table
 from torchlb.version import __version__
 
 FILE = click.Path(exists=True, dir_okay=False, path_type=Path)
-FOLDER = click.Path(file_okay=False, path_type=Path)
 COUNT = click.IntRange(min=1)
 SETTINGS = {"help_option_names": ["-h", "--help"], "show_default": True}
 PROJECTION, WEIGHTS = (click.Choice(get_args(names)) for names in (Projection, WeightsName))
@@ -103,9 +102,7 @@ def main() -> None:
 @main.command()
 @click.argument("mesh", type=FILE)
 @click.option("-k", type=COUNT, default=20, help="Number of eigenvalues.")
-@click.option(
-    "--out", type=click.Path(path_type=Path), help="Picture; MESH_compare.png if left out."
-)
+@click.option("--out", type=click.Path(path_type=Path), help="Picture; else MESH_compare.png.")
 @_stencil_options
 def compare(mesh: Path, k: int, out: Path | None, **settings: Any) -> None:
     """Report, stability and spectrum of MESH beside the cotangent operator's, and a picture.
@@ -140,13 +137,13 @@ def compare(mesh: Path, k: int, out: Path | None, **settings: Any) -> None:
 
 @main.command()
 @click.argument("folder", type=click.Path(exists=True, file_okay=False, path_type=Path))
-@click.option("--out", type=FOLDER, required=True, help="Cache to fill.")
+@click.option("--out", type=click.Path(file_okay=False), required=True, help="Cache to fill.")
 @click.option("--operator", type=click.Choice(get_args(Operator)), default="stencil")
 @click.option("-k", type=click.IntRange(min=0), default=0, help="Eigenpairs.")
 @click.option("--workers", type=int, default=-1, help="Processes; -1: all cores.")
 @click.option("--quiet", is_flag=True, help="No progress bar.")
 @_stencil_options
-def precompute(folder: Path, out: Path, operator: Operator, quiet: bool, **settings: Any) -> None:
+def precompute(folder: Path, out: str, operator: Operator, quiet: bool, **settings: Any) -> None:
     """Compute the operators of all shapes in FOLDER and store them, each once.
 
     What is in the cache is left as it is: after an interruption, give the same command again. A shape that fails stops

@@ -30,10 +30,9 @@ def weak_matrices(
     """Weak matrix C and diagonal mass M, both (N, N), with the sign of a library: M⁻¹C = ±Δ.
 
     For the cotangent operator C is that library's, entry by entry, on a mesh without boundary trouble or degenerate
-    triangles, that of robust_laplacian, which flips edges, on a Delaunay mesh; M is Voronoi, as igl has it by default,
-    where potpourri3d and LaPy's `lump=True` give a third of the triangles' areas. For the stencil C is not symmetric;
-    with certify=True its columns sum to zero like its rows, and its symmetric part is semidefinite. Methods that need
-    symmetry (Cholesky, eigsh) take the weak pair, `lb.stiffness`.
+    triangles, that of robust_laplacian, which flips edges, on a Delaunay mesh; M is Voronoi, as igl has it by default.
+    For the stencil C is not symmetric; with certify=True its columns sum to zero like its rows, and its symmetric part
+    is semidefinite. Methods that need symmetry (Cholesky, eigsh) take the weak pair, `lb.stiffness`.
 
     Parameters
     ----------

@@ -3,10 +3,8 @@
     from diffusion_net.geometry import get_operators      # before
     from torchlb.interop.diffusion_net import get_operators  # after
 
-Its own data sets call `get_all_operators`, which finds ours after
-``diffusion_net.geometry.get_operators = get_operators``.
-
-The names, arguments and the 7-tuple are those of the original (github.com/nmwsharp/diffusion-net, `geometry.py`).
+Names, arguments and the 7-tuple are those of the original (github.com/nmwsharp/diffusion-net, `geometry.py`), whose
+data sets find ours after ``diffusion_net.geometry.get_operators = get_operators``.
 
 =====================================================  =============  =====================  =====================
 promise of the original                                "cotangent"    a mesh                 a cloud
@@ -69,9 +67,7 @@ def get_operators(
     symmetric: bool = True,
     **options: Any,
 ) -> Operators:
-    """(frames, mass, L, evals, evecs, gradX, gradY) of a mesh or cloud, as the original gives them.
-
-    The table at the head of this module lists the original's promises, and which are kept or improved.
+    """(frames, mass, L, evals, evecs, gradX, gradY) of a mesh or cloud, as the table at the head of this module says.
 
     Parameters
     ----------
@@ -175,13 +171,11 @@ def _frames(lb: LaplaceBeltrami, side: Tensor | None) -> Float[Tensor, "V 3 3"]:
         side, known = settled_normals(lb.points, side.detach().cpu().double(), near)
         flip = (normal * side).sum(1, keepdim=True) < 0
         normal = torch.where(flip & known, -normal, normal)
-    axes = torch.eye(3, dtype=normal.dtype)
-    axis = torch.where(normal[:, :1].abs() < STEEP, axes[0], axes[1])
+    axis = torch.eye(3, dtype=normal.dtype)[(normal[:, 0].abs() >= STEEP).long()]
     x = torch.nn.functional.normalize(axis - (axis * normal).sum(1, keepdim=True) * normal)
     return torch.stack([x, torch.linalg.cross(normal, x), normal], dim=1)
 
 
 def _coo(index: Tensor, values: Tensor, like: Tensor) -> Tensor:
-    shape = (len(like), len(like))
-    matrix = torch.sparse_coo_tensor(index, values, shape, check_invariants=False).coalesce()
-    return matrix.to(like.device, like.dtype)
+    matrix = torch.sparse_coo_tensor(index, values, (len(like),) * 2, check_invariants=False)
+    return matrix.coalesce().to(like.device, like.dtype)

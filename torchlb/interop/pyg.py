@@ -44,6 +44,9 @@ from torchlb.stencils.conditions import kind_of
 
 __all__ = ["LaplaceBeltramiTransform", "to_operator"]
 
+KEPT = ("mass", "frames", "normals", "_shape_operators")
+"""Attributes of the operator that are keys as they are; the last two of hypersurfaces alone."""
+
 
 @functional_transform("laplace_beltrami")
 class LaplaceBeltramiTransform(BaseTransform):
@@ -66,10 +69,8 @@ class LaplaceBeltramiTransform(BaseTransform):
     lb_weak_index      (2, nnz)     [j; i] of every entry of the weak pair, none where there is no pair
     lb_weak_values     (nnz, 3)     stiffness, mass matrix, boundary mass matrix; (nnz, 4) with Robin's term
     lb_linear_…                     the same for P1 elements
-    lb_basis           (…,)         with k > 0: all parts of the eigenbasis in one vector, for `to_operator`
-    lb_nodes           (N,)         lb_first, lb_first + 1, …: they reveal a permutation of the nodes
-    lb_first           (1,)         checksum of the positions
-    lb_basis_size      (1,)         number of eigenpairs
+    lb_basis, _size    (…,), (1,)   with k > 0: all parts of the eigenbasis in one vector, and the number of pairs
+    lb_nodes, lb_first (N,), (1,)   lb_first, lb_first + 1, …, which reveal a permutation of the nodes, from a checksum
     lb_info            str          source, options, certificate, radius as JSON
     =================  ===========  ============================================================================
 
@@ -156,8 +157,6 @@ def _keys(lb: LaplaceBeltrami, k: int) -> dict[str, Any]:
     first = zlib.crc32(lb.points.cpu().numpy().tobytes())
     keys: dict[str, Any] = {
         "lb_order_t": lb.stencil.order_t,
-        "lb_mass": lb.mass,
-        "lb_frames": lb.frames,
         "lb_pos": lb.points,
         "lb_nodes": torch.arange(first, first + lb.num_points),
         "lb_first": torch.tensor([first]),
@@ -165,8 +164,7 @@ def _keys(lb: LaplaceBeltrami, k: int) -> dict[str, Any]:
         "lb_boundary": lb.mass < 0 if lb.boundary is None else lb.boundary,
         "lb_info": json.dumps(lb.get_extra_state()),
     }
-    if len(lb.normals):
-        keys |= {"lb_normals": lb.normals, "lb_shape_operators": lb._shape_operators}
+    keys |= {f"lb_{n.strip('_')}": getattr(lb, n) for n in KEPT if len(getattr(lb, n))}
     kind = kind_of(lb.options.get("condition"))
     width = 3 if kind.conserves or kind.fixes else 4  # the same for every shape with this condition
     for name, pair in {"stencil": lb.stencil, "weak": lb.weak, "linear": lb.weak.near}.items():
@@ -210,16 +208,9 @@ def to_operator(data: Any) -> LaplaceBeltrami:
 def _parts(data: Any, sizes: Int[Tensor, " S"]) -> dict[str, Any]:
     """The block-diagonal matrices, and the other tensors of the operator."""
     points = data.pos.detach().to(data.lb_mass)
-    boundary = data.lb_boundary
-    parts = {
-        "mass": data.lb_mass,
-        "points": points,
-        "frames": data.lb_frames,
-        "normals": data.get("lb_normals", points[:0]),
-        "_shape_operators": data.get("lb_shape_operators", points[:0]),
-        "_on_boundary": boundary[: None if boundary.any() else 0],
-        "faces": data.lb_face_index.T,
-    }
+    parts = {n: data.get(f"lb_{n.strip('_')}", points[:0]) for n in KEPT}
+    parts |= {"points": points, "faces": data.lb_face_index.T}
+    parts["_on_boundary"] = data.lb_boundary[: None if data.lb_boundary.any() else 0]
     matrices = []
     for name in ("stencil", "weak", "linear"):
         col, row = data[f"lb_{name}_index"]
@@ -272,8 +263,6 @@ def _bases(data: Any, sizes: list[int]) -> list[Eigenbasis]:
     pieces = data.lb_basis.split([2 * k * (1 + n) for n, k in zip(sizes, numbers, strict=True)])
     masses = data.lb_mass.split(sizes)
     for piece, mass, k in zip(pieces, masses, numbers, strict=True):
-        size = k * len(mass)
-        values, vectors, left, errors = piece.split([k, size, size, k])
-        vectors, left = vectors.view(-1, k), left.view(-1, k)
-        bases.append(Eigenbasis(values, vectors, mass, left, relative_errors=errors))
+        values, vectors, left, errors = piece.view(-1, k).split([1, len(mass), len(mass), 1])
+        bases.append(Eigenbasis(values[0], vectors, mass, left, relative_errors=errors[0]))
     return bases

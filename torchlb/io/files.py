@@ -43,25 +43,17 @@ def arrays_of(shape: Any) -> Shape:
 
 
 def read_shape(path: str | Path) -> Shape:
-    """Vertices, float64, and faces, int64 or None, of a file, in its order.
+    """Vertices, float64, and faces, int64 or None, of the file `path`, in its order.
 
-    Parameters
-    ----------
-    path
-        A mesh (.ply, .obj, .off, .stl, .glb, .gltf), whose polygons are split into triangles, along the shorter
-        diagonal of a quad; without faces it is a cloud. A surface of GIFTI (.gii) or FreeSurfer (lh.pial, …), through
-        nibabel. Polydata or an unstructured grid of VTK (.vtk, .vtp, .vtu), through pyvista: tetrahedra, else
-        triangles, else lines. A cloud in .pcd, or a table of numbers (.xyz, .txt, .csv, .pts, .asc) with the
-        coordinates in the columns x, y, z, or in the first three. An array (N, n) of points in .npy; or a .npz with
-        `vertices` (or `points`, or `pos`) and, for a mesh, `faces`. The corners of an .stl, which has no vertices, are
-        merged where they coincide to rounding.
+    A mesh (.ply, .obj, .off, .stl, .glb, .gltf), whose polygons are split into triangles, along the shorter diagonal of
+    a quad; without faces it is a cloud. A surface of GIFTI (.gii) or FreeSurfer (lh.pial, …), through nibabel. Polydata
+    or an unstructured grid of VTK (.vtk, .vtp, .vtu), through pyvista: tetrahedra, else triangles, else lines. A cloud
+    in .pcd, or a table of numbers (.xyz, .txt, .csv, .pts, .asc) with the coordinates in the columns x, y, z, or in the
+    first three. An array (N, n) of points in .npy; or a .npz with `vertices` (or `points`, or `pos`) and, for a mesh,
+    `faces`. The corners of an .stl, which has no vertices, are merged where they coincide to rounding.
 
-    Raises
-    ------
-    FileNotFoundError
-        If there is no such file.
-    ValueError
-        If it is no shape, or the library is missing that reads it; the message names the file.
+    Raises FileNotFoundError if there is no such file, and ValueError if it is no shape, or the library is missing that
+    reads it; the message names the file.
     """
     vertices, faces, data = _read(path)
     if vertices is None:

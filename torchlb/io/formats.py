@@ -31,10 +31,7 @@ def _polygons(vertices: Any, faces: list[Any]) -> Polygons:
 
 
 def read_obj(path: Path) -> Polygons:
-    """Vertices and faces of all groups and materials of an .obj; texture and normals split no vertex.
-
-    An index below zero counts back from the last vertex before its face.
-    """
+    """Vertices, which texture splits not, and faces of an .obj; indices below zero count back from the last vertex."""
     vertices, faces = [], []
     for line in path.read_text("utf-8", "replace").replace("\\\n", " ").splitlines():
         key, *words = line.split("#")[0].split() or [""]

@@ -28,8 +28,6 @@ from torchlb.operator.cleaning import cleaned
 from torchlb.operator.dispatch import Operator, check_options_of
 from torchlb.operator.inputs import check_path
 
-TABLE = "precompute.csv"
-"""File in the cache that lists the result of every shape in the last run."""
 STALE = 24 * 3600
 """Age, s, after which temporary files of killed writers are removed. Nobody writes one file for a day."""
 
@@ -148,7 +146,7 @@ def precompute_operators(
                 bar.update()
     finally:
         report = PrecomputeReport(tuple(results[i] for i in sorted(results)), skipped)
-        with written_whole(cache / TABLE, "x", encoding="utf-8", newline="") as file:
+        with written_whole(cache / "precompute.csv", "x", encoding="utf-8", newline="") as file:
             csv.writer(file).writerows([ShapeResult._fields, *report.results])
     return report
 
@@ -172,9 +170,7 @@ def _sources(
         return named, ()
     folder, skipped, found = Path(shapes).expanduser(), [], []
     if not folder.is_dir():
-        raise InputError(
-            f"{folder}: no such folder; give a folder, or a list of files or of arrays"
-        )
+        raise InputError(f"{folder}: no such folder; give a folder, or a list of files or arrays")
     for path in sorted(folder.rglob("*")):
         name, place = str(path.relative_to(folder)), path.resolve()
         if path.is_file() and path.name[0] != "." and cache.resolve() not in place.parents:
@@ -193,8 +189,7 @@ def _run(
     """Yield results as they come. Where a worker dies, the tasks that may have killed it run again, each by itself."""
     import joblib
 
-    backend, _ = joblib.parallel.get_active_backend()
-    lazy = getattr(backend, "supports_return_generator", False)
+    lazy = getattr(joblib.parallel.get_active_backend()[0], "supports_return_generator", False)
     way = "generator_unordered" if lazy else "list"
     settings: dict[str, Any] = {"batch_size": 1, "return_as": way}
 
@@ -242,5 +237,4 @@ def _solve(
         points, file, message = lb.num_points, str(path), "; ".join(sorted(notes))
     except Exception as error:
         status, points, file, message = "failed", 0, "", f"{type(error).__name__}: {error}"
-    seconds = time.perf_counter() - start
-    return index, ShapeResult(name, status, points, seconds, file, message)
+    return index, ShapeResult(name, status, points, time.perf_counter() - start, file, message)

@@ -68,8 +68,7 @@ class Diffusion(LearnedTimes):
     >>> from torchlb import LaplaceBeltrami
     >>> theta = torch.arange(36) * torch.pi / 18
     >>> lb = LaplaceBeltrami.from_points(torch.stack([theta.cos(), theta.sin()], dim=1))
-    >>> layer = Diffusion(3)
-    >>> layer(torch.ones(36, 3), lb).mean().item()
+    >>> Diffusion(3)(torch.ones(36, 3), lb).mean().item()
     1.0
     """
 
@@ -92,8 +91,7 @@ class Diffusion(LearnedTimes):
 
     def extra_repr(self) -> str:
         """Channels, method, k."""
-        basis = f", k={self.k}" if self.used_k else ""
-        return f"{self.channels}, method={self.method!r}{basis}"
+        return f"{self.channels}, method={self.method!r}" + (f", k={self.k}" if self.used_k else "")
 
 
 class ImplicitDiffusion(LearnedTimes):
@@ -115,9 +113,8 @@ class ImplicitDiffusion(LearnedTimes):
     --------
     >>> from torchlb import LaplaceBeltrami
     >>> from torchlb.surfaces import Sphere
-    >>> vertices, faces = Sphere().mesh(300)
-    >>> lb = LaplaceBeltrami.from_mesh(vertices.float(), faces)
-    >>> ImplicitDiffusion(3, init_time=0.5)(vertices.float(), lb).div(vertices).median().round(decimals=3).item()
+    >>> lb = LaplaceBeltrami.from_mesh(*Sphere().mesh(300)).float()
+    >>> ImplicitDiffusion(3, init_time=0.5)(lb.points, lb).div(lb.points).median().round(decimals=3).item()
     0.5
     """
 

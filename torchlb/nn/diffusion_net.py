@@ -151,10 +151,9 @@ class DiffusionNet(nn.Module):
 
         Parameters
         ----------
-        x
-            Features (N, in_channels), or (B, N, in_channels) of B inputs on one surface.
-        lb
-            Operator of one shape or of a batch, whose global mean is (S, out_channels), one for each shape.
+        x, lb
+            Features (N, in_channels), or (B, N, in_channels) of B inputs on one surface, and the operator of one shape
+            or of a batch, whose global mean is (S, out_channels), one for each shape.
         faces, edges
             For outputs at faces or edges; in a batch, the indices of shape s moved by ``lb.offsets[s]``.
         """
@@ -168,8 +167,7 @@ class DiffusionNet(nn.Module):
         else:
             y = self.last_lin(y)
         if self.outputs_at == "global_mean":
-            area = lb.integral(torch.ones_like(lb.mass))[..., None]
-            y = (lb.integral(y) / area).to(y.dtype)
+            y = (lb.integral(y) / lb.integral(torch.ones_like(lb.mass))[..., None]).to(y.dtype)
         elif self.outputs_at in ("faces", "edges"):
             corners = faces if self.outputs_at == "faces" else edges
             y = y[..., _checked_corners(self.outputs_at, corners, lb), :].mean(-2)

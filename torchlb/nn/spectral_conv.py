@@ -71,6 +71,5 @@ class SpectralConv(nn.Module):
 
     def extra_repr(self) -> str:
         """Channels, filters, k."""
-        return (
-            f"{self.in_channels}, {self.out_channels}, num_filters={self.num_filters}, k={self.k}"
-        )
+        filters = f"num_filters={self.num_filters}, k={self.k}"
+        return f"{self.in_channels}, {self.out_channels}, {filters}"

@@ -11,6 +11,8 @@ from scipy.spatial.transform import Rotation
 Eye = tuple[float, float]
 """Elevation of the eye above the plane of x and y, and azimuth from x, in degrees."""
 Views = Eye | Sequence[Eye]
+Shape = tuple[np.ndarray, np.ndarray | None]
+"""Points (N, 3), and triangles (F, 3), None for a cloud."""
 
 VIEW: Eye = (25.0, -55.0)
 """Default view of a surface: elevation and azimuth, °."""
@@ -49,18 +51,14 @@ def _stacked(points: np.ndarray, view: Views) -> Iterator[tuple[np.ndarray, Any]
 
 def paint(
     ax: Any,
-    points: np.ndarray,
-    faces: np.ndarray | None,
+    shape: Shape,
     colors: np.ndarray,
     view: Views,
     isolines: tuple[np.ndarray, np.ndarray] | None = None,
     size: float | None = None,
 ) -> None:
-    """Draw a surface in the colours of its triangles, or a cloud in those of its points, from back to front.
-
-    Triangles are shaded, with segments on them by `isolines_of`; points are disks of the area `size`, paler with
-    distance.
-    """
+    """Draw shaded triangles with segments by `isolines_of`, or disks of an area, paler with distance, back to front."""
+    points, faces = shape
     if faces is None:
         area = float(np.clip(60000 / len(points), 2, 60)) if size is None else size
         for flat, _ in _stacked(points, view):
@@ -98,10 +96,7 @@ def paint(
 def isolines_of(
     values: np.ndarray, faces: np.ndarray, levels: Sequence[float] | np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Segments on which the linear interpolant has one of the levels, none in triangles with a NaN or infinity.
-
-    Each end is given by its edge, (S, 2, 2), and its fraction of the edge, (S, 2, 1) in 0 … 1.
-    """
+    """Segments where the linear interpolant has a level, none at NaN: edges of their ends, (S, 2, 2), and fractions."""
     finite, levels = faces[np.isfinite(values[faces]).all(axis=1)], np.asarray(levels)
     edges = np.stack([finite, np.roll(finite, -1, axis=1)], axis=-1)  # (F, 3, 2)
     start, end = np.moveaxis(values[edges] > levels[:, None, None, None], -1, 0)
@@ -134,15 +129,10 @@ def _evenly_spread(points: np.ndarray, count: int) -> tuple[np.ndarray, float]:
 
 
 def draw_arrows(
-    ax: Any,
-    points: np.ndarray,
-    faces: np.ndarray | None,
-    field: np.ndarray,
-    colors: np.ndarray,
-    view: Views,
-    count: int,
+    ax: Any, shape: Shape, field: np.ndarray, colors: np.ndarray, view: Views, count: int
 ) -> None:
     """Draw arrows at `count` points, back to front: on a mesh only visible ones, on a cloud paler with distance."""
+    points, faces = shape
     tails, spacing = _evenly_spread(points, count)
     lengths = np.linalg.norm(field[tails], axis=1)
     drawn = np.isfinite(lengths) & (lengths > 0)

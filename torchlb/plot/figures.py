@@ -17,7 +17,7 @@ from torch import Tensor
 
 from torchlb.errors import InputError, InputTypeError, shown
 from torchlb.operator.inputs import check_corners
-from torchlb.plot.drawing import INK, VIEW, Views, draw_arrows, isolines_of, paint, plain
+from torchlb.plot.drawing import INK, VIEW, Shape, Views, draw_arrows, isolines_of, paint, plain
 
 Vertices = Float[Tensor, "N 3"] | Float[np.ndarray, "N 3"]
 Faces = Int[Tensor, "F 3"] | Int[np.ndarray, "F 3"]
@@ -53,32 +53,28 @@ def plot_surface(
     ----------
     vertices, faces, values
         (N, 3), (F, 3) and (N,), tensors or arrays; a triangle has the mean of its corners. Grey where not finite.
-    ax, title
-        Matplotlib axes, new ones by default, and the title above them.
+    ax, title, label
+        Matplotlib axes, new ones by default, the title above them, and the label of the colour bar, such as the unit.
     cmap
         matplotlib's name; by default "RdBu_r" around zero, "viridis" otherwise, which the colour-blind can read.
     symmetric
         Whether zero is in the middle of the colours; by default if the values have both signs. The colours span the
         values except the outer 1 % at either end, for which the bar has a pointed end.
-    limits
-        Least and greatest value of the colours instead.
-    levels
-        Values at which isolines are drawn.
+    limits, levels
+        Least and greatest value of the colours instead; values at which isolines are drawn.
     view
         Elevation and azimuth of the eye, degrees; several views are drawn below one another. A shape in the plane z = 0
         is seen from above.
-    label
-        Label of the colour bar, such as the unit.
 
     Returns the axes. Raises ValueError for values or faces that do not fit the vertices.
     """
     ax = _axes(ax)
-    points, corners = _shape(vertices, faces)
+    points, corners = shape = _shape(vertices, faces)
     numbers = _values(values, points)
     shades = _color_map(numbers, cmap, symmetric, limits)
     assert corners is not None
     isolines = isolines_of(numbers, corners, levels)
-    paint(ax, points, corners, shades.to_rgba(numbers[corners].mean(axis=1)), view, isolines)
+    paint(ax, shape, shades.to_rgba(numbers[corners].mean(axis=1)), view, isolines)
     return _finish(ax, title, shades, label)
 
 
@@ -111,9 +107,8 @@ def plot_points(
     ax = _axes(ax)
     places = _cloud(points)
     numbers = _values(values, places)
-    # The middle of "coolwarm" is not white.
-    shades = _color_map(numbers, cmap, symmetric, limits, "coolwarm")
-    paint(ax, places, None, shades.to_rgba(numbers), view, size=size)
+    shades = _color_map(numbers, cmap, symmetric, limits, "coolwarm")  # its middle is not white
+    paint(ax, (places, None), shades.to_rgba(numbers), view, size=size)
     return _finish(ax, title, shades, label)
 
 
@@ -152,7 +147,8 @@ def plot_vectors(
     Returns the axes. Raises ValueError for vectors, values or faces that do not fit the vertices.
     """
     ax = _axes(ax)
-    (places, corners), field = _shape(vertices, faces), _cloud(vectors, "vectors")
+    shape, field = _shape(vertices, faces), _cloud(vectors, "vectors")
+    places, corners = shape
     if field.shape != places.shape:
         raise InputError(f"vectors: expected {places.shape}, one a point, got {field.shape}")
     lengths = np.linalg.norm(field, axis=1)
@@ -160,9 +156,9 @@ def plot_vectors(
     shades = _color_map(numbers, cmap, symmetric, limits)
     painted = numbers if corners is None else numbers[corners].mean(axis=1)  # by dot or triangle
     ground = plain(PALE, len(painted)) if values is None else shades.to_rgba(painted)
-    paint(ax, places, corners, ground, view)
+    paint(ax, shape, ground, view)
     inks = shades.to_rgba(lengths) if values is None else plain(INK, len(places))
-    draw_arrows(ax, places, corners, field, inks, view, count)
+    draw_arrows(ax, shape, field, inks, view, count)
     return _finish(ax, title, shades, label)
 
 
@@ -194,10 +190,10 @@ def plot_orders(
 
     palette = colors.to_rgba_array(ORDER_COLORS)
     last = len(palette) - 1
-    places, corners = _shape(vertices, faces)
+    places, corners = shape = _shape(vertices, faces)
     reached = _values(order, places).astype(int)
     shown = reached if corners is None else reached[corners].min(axis=1)  # by dot or triangle
-    paint(ax, places, corners, palette[shown.clip(0, last)], view)
+    paint(ax, shape, palette[shown.clip(0, last)], view)
     handles = []
     for p, count in reversed(list(enumerate(np.bincount(reached)))):
         if count:
@@ -233,18 +229,16 @@ def plot_convergence(
     """
     ax = _axes(ax)
     orders = []
-    for i, (name, line) in enumerate(errors.items()):
+    for i, (key, line) in enumerate(errors.items()):
         n, error = np.asarray(sizes, dtype=float), np.asarray(line, dtype=float)
         if n.shape != error.shape:
-            raise InputError(
-                f"errors[{name!r}]: expected {len(n)}, one for a size, got {len(error)}"
-            )
+            raise InputError(f"errors[{key!r}]: expected {len(n)}, one for a size, got {len(line)}")
         good = np.isfinite(error) & (error > 0)
         n, error = n[good], error[good]
-        label = name
+        label = key
         if len(n) > 1:
             orders.append(-dim * np.polyfit(np.log(n[-3:]), np.log(error[-3:]), 1)[0])
-            label = f"{name}:  $h^{{{orders[-1]:.1f}}}$"
+            label = f"{key}:  $h^{{{orders[-1]:.1f}}}$"
         color, marker = LINE_COLORS[i % len(LINE_COLORS)], MARKERS[i % len(MARKERS)]
         ax.loglog(n, error, color=color, marker=marker, markersize=5, label=label)
     _references(ax, sizes, orders, dim)
@@ -309,8 +303,8 @@ def _cloud(points: Any, name: str = "points") -> np.ndarray:
     return np.pad(places, ((0, 0), (0, 3 - places.shape[1])))
 
 
-def _shape(points: Any, faces: Any) -> tuple[np.ndarray, np.ndarray | None]:
-    """Points as (N, 3), and the indices of their triangles (F, 3), None for a cloud; InputError for what is neither."""
+def _shape(points: Any, faces: Any) -> Shape:
+    """Points in space and their triangles, checked."""
     points = _cloud(points)
     if faces is None:
         return points, None
