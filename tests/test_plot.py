@@ -265,7 +265,7 @@ def test_what_does_not_fit_is_refused(sphere):
         plot_surface(vertices, faces, values[:-1])
     with pytest.raises(WRONG):
         plot_surface(vertices[:, :2], faces, values)
-    with pytest.raises(ValueError, match=r"indices 0 … 199, got 0 … 200"):
+    with pytest.raises(ValueError, match=r"indices outside 0 … 199: face 0 is \[0, 1, 200\]"):
         plot_surface(vertices, torch.tensor([[0, 1, 200]]), values)
     with pytest.raises(ValueError, match=r"choose the coordinates to draw"):
         plot_points(torch.rand(9, 4), torch.rand(9))

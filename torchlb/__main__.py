@@ -32,7 +32,6 @@ from torchlb.plot.comparison import draw_comparison, spectrum_table
 from torchlb.version import __version__
 
 FILE = click.Path(exists=True, dir_okay=False, path_type=Path)
-FOLDER = click.Path(file_okay=False, path_type=Path)
 COUNT = click.IntRange(min=1)
 SETTINGS = {"help_option_names": ["-h", "--help"], "show_default": True}
 PROJECTION, WEIGHTS = (click.Choice(get_args(names)) for names in (Projection, WeightsName))
@@ -66,10 +65,8 @@ def _show(message: Warning | str, category: type[Warning], *_: Any) -> None:
 def _stencil_options(command: Callable[..., Any]) -> Callable[..., Any]:
     """Add the options that the commands share."""
     for name, (kind, default, text) in OF_THE_OPERATOR.items():
-        option = click.option(
-            f"--{name}", type=kind, is_flag=kind is bool, default=default, help=text
-        )
-        command = option(command)
+        add = click.option(f"--{name}", type=kind, is_flag=kind is bool, default=default, help=text)
+        command = add(command)
     return command
 
 
@@ -84,9 +81,8 @@ def _built(shape: Path, settings: dict[str, Any]) -> tuple[LaplaceBeltrami, Any]
 
 def _stability(lb: LaplaceBeltrami) -> str:
     """What is known of an operator's stability."""
-    pair = "stable: symmetric, positive by its weak pair" if lb._has_weak_form else ""
-    known = [pair, "" if lb.certificate is None else str(lb.certificate)]
-    return "\n".join(filter(None, known)) or "no certificate"
+    pair = "stable: symmetric, positive by its weak pair" if lb._has_weak_form else None
+    return "\n".join(str(known) for known in (pair, lb.certificate) if known) or "no certificate"
 
 
 @click.group(cls=_Commands, context_settings=SETTINGS)
@@ -106,9 +102,7 @@ def main() -> None:
 @main.command()
 @click.argument("mesh", type=FILE)
 @click.option("-k", type=COUNT, default=20, help="Number of eigenvalues.")
-@click.option(
-    "--out", type=click.Path(path_type=Path), help="Picture; MESH_compare.png if left out."
-)
+@click.option("--out", type=click.Path(path_type=Path), help="Picture; else MESH_compare.png.")
 @_stencil_options
 def compare(mesh: Path, k: int, out: Path | None, **settings: Any) -> None:
     """Report, stability and spectrum of MESH beside the cotangent operator's, and a picture.
@@ -143,13 +137,13 @@ def compare(mesh: Path, k: int, out: Path | None, **settings: Any) -> None:
 
 @main.command()
 @click.argument("folder", type=click.Path(exists=True, file_okay=False, path_type=Path))
-@click.option("--out", type=FOLDER, required=True, help="Cache to fill.")
+@click.option("--out", type=click.Path(file_okay=False), required=True, help="Cache to fill.")
 @click.option("--operator", type=click.Choice(get_args(Operator)), default="stencil")
 @click.option("-k", type=click.IntRange(min=0), default=0, help="Eigenpairs.")
 @click.option("--workers", type=int, default=-1, help="Processes; -1: all cores.")
 @click.option("--quiet", is_flag=True, help="No progress bar.")
 @_stencil_options
-def precompute(folder: Path, out: Path, operator: Operator, quiet: bool, **settings: Any) -> None:
+def precompute(folder: Path, out: str, operator: Operator, quiet: bool, **settings: Any) -> None:
     """Compute the operators of all shapes in FOLDER and store them, each once.
 
     What is in the cache is left as it is: after an interruption, give the same command again. A shape that fails stops
@@ -194,8 +188,7 @@ def info(file: Path) -> None:
             click.echo(f"{loose} vertices belong to no face with distinct corners")
         return
     click.echo(f"{lb}\n\n{lb.report}\n{_stability(lb)}")
-    pairs = lb.modes.left.shape[-1]
-    click.echo(f"{pairs} eigenpairs stored")
+    click.echo(f"{lb.modes.left.shape[-1]} eigenpairs stored")
     click.echo(f"{file.stat().st_size / 1e6:.1f} MB, written by torchlb {header['version']}")
 
 
@@ -212,9 +205,7 @@ def _to_file(compute: Callable[..., dict[str, Any]]) -> Callable[..., None]:
         found = compute(lb, **settings)
         taken = found.keys() & {"path", "points", "cells"}
         if taken:
-            raise InputError(
-                f"{', '.join(taken)}: rename these data, a shape has parts of that name"
-            )
+            raise InputError(f"{', '.join(taken)}: rename these data, a shape has parts so named")
         write_shape(out, lb.points, lb.faces, **found)
         click.echo(f"{out}: {_size(lb.points, faces)}")
 

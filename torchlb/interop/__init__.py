@@ -8,10 +8,8 @@ Each needs its own library, and is imported on first use.
 from importlib import import_module
 from typing import Any
 
-MODULES = ("conventions", "diffusion_net", "pyg", "trimesh")
-
 
 def __getattr__(name: str) -> Any:
-    if name in MODULES:
+    if name in ("conventions", "diffusion_net", "pyg", "trimesh"):
         return import_module(f"torchlb.interop.{name}")
     raise AttributeError(f"module 'torchlb.interop' has no attribute {name!r}")

@@ -30,22 +30,15 @@ def weak_matrices(
     """Weak matrix C and diagonal mass M, both (N, N), with the sign of a library: M⁻¹C = ±Δ.
 
     For the cotangent operator C is that library's, entry by entry, on a mesh without boundary trouble or degenerate
-    triangles, that of robust_laplacian, which flips edges, on a Delaunay mesh; M is Voronoi, as igl has it by default,
-    where potpourri3d and LaPy's `lump=True` give a third of the triangles' areas. For the stencil C is not symmetric;
-    with certify=True its columns sum to zero like its rows, and its symmetric part is semidefinite. Methods that need
-    symmetry (Cholesky, eigsh) take the weak pair, `lb.stiffness`.
+    triangles, that of robust_laplacian, which flips edges, on a Delaunay mesh; M is Voronoi, as igl has it by default.
+    For the stencil C is not symmetric; with certify=True its columns sum to zero like its rows, and its symmetric part
+    is semidefinite. Methods that need symmetry (Cholesky, eigsh) take the weak pair, `lb.stiffness`.
 
     Parameters
     ----------
-    lb
-        Operator.
-    convention
-        "igl" (C ≤ 0), or "potpourri3d", "robust_laplacian", "lapy", "diffusion_net" (C ≥ 0).
-
-    Raises
-    ------
-    ValueError
-        For another library.
+    lb, convention
+        Operator, and "igl" (C ≤ 0), or "potpourri3d", "robust_laplacian", "lapy", "diffusion_net" (C ≥ 0), else an
+        InputError.
 
     Examples
     --------
@@ -71,16 +64,9 @@ def edge_weights(
 
     Parameters
     ----------
-    lb
-        Operator.
-    normalization
-        None for the weak matrix, "rw" for the strong one, Δ itself. PyG's "sym" presumes a symmetric weak matrix, which
-        the stencil does not have.
-
-    Raises
-    ------
-    ValueError
-        For another normalization.
+    lb, normalization
+        Operator, and None for the weak matrix, "rw" for the strong one, Δ itself, else an InputError. PyG's "sym"
+        presumes a symmetric weak matrix, which the stencil does not have.
     """
     check_operator(lb)
     if normalization not in (None, "rw"):

@@ -3,10 +3,8 @@
     from diffusion_net.geometry import get_operators      # before
     from torchlb.interop.diffusion_net import get_operators  # after
 
-Its own data sets call `get_all_operators`, which finds ours after
-``diffusion_net.geometry.get_operators = get_operators``.
-
-The names, arguments and the 7-tuple are those of the original (github.com/nmwsharp/diffusion-net, `geometry.py`).
+Names, arguments and the 7-tuple are those of the original (github.com/nmwsharp/diffusion-net, `geometry.py`), whose
+data sets find ours after ``diffusion_net.geometry.get_operators = get_operators``.
 
 =====================================================  =============  =====================  =====================
 promise of the original                                "cotangent"    a mesh                 a cloud
@@ -26,9 +24,8 @@ coalesced COO, type and device of verts                kept           kept      
 With ``symmetric=False`` L is −ΠΔ of the certified stencil, L / mass the Laplacian at a point at order p. A cloud has
 the stiffness of the surface through it.
 
-Intended differences: a float64 shape is not rounded to float32 in the cache; the key holds normals, options and
-version; int32 and int64 faces are one entry; k_eig > V gives V pairs; NaN, vertices without a face and duplicates
-in a cloud are errors that say what to do; normals of a cloud are those of the surface through it, and face out.
+Intended differences, beside those in `docs/from_diffusion_net.md`: NaN and duplicates in a cloud are errors that say
+what to do; normals of a cloud are those of the surface through it, and face out.
 """
 
 from __future__ import annotations
@@ -70,24 +67,19 @@ def get_operators(
     symmetric: bool = True,
     **options: Any,
 ) -> Operators:
-    """(frames, mass, L, evals, evecs, gradX, gradY) of a mesh or cloud, as the original gives them.
-
-    The table at the head of this module lists the original's promises, and which are kept or improved.
+    """(frames, mass, L, evals, evecs, gradX, gradY) of a mesh or cloud, as the table at the head of this module says.
 
     Parameters
     ----------
-    verts
-        (V, 3) tensor, ℓ; the results are constants (a warning says so if it requires a gradient).
-    faces
-        (F, 3) tensor; None or empty for a point cloud.
+    verts, faces
+        (V, 3) tensor, ℓ, and (F, 3) tensor, None or empty for a point cloud. The results are constants (a warning says
+        so if verts requires a gradient).
     k_eig
         Number of eigenpairs, 0 for none.
-    op_cache_dir
-        Folder of a cache (`load_or_build`), or None.
+    op_cache_dir, overwrite_cache
+        Folder of a cache (`load_or_build`), or None, and whether to compute anew.
     normals
         (V, 3). Made consistent, they orient the frames; on a cloud they are the first guess of the tangent planes.
-    overwrite_cache
-        Whether to compute anew.
     truncate_cache
         Argument of the original; without effect, since a file with more pairs serves already.
     operator, symmetric
@@ -113,9 +105,8 @@ def get_operators(
     else:
         arguments |= {"cache": op_cache_dir, "k": k_eig, "overwrite": overwrite_cache}
         lb = load_or_build(*shape, **arguments)
-    if cloud:
-        normals = None  # the operator's own are oriented by them
-    return _tuple(lb, k_eig, normals, symmetric, verts)
+    side = None if cloud else normals  # the normals of a cloud's operator are oriented by them
+    return _tuple(lb, k_eig, side, symmetric, verts)
 
 
 def compute_operators(
@@ -156,44 +147,35 @@ def _tuple(
     row = lb.stencil.row
     index = torch.stack([row, lb.stencil.col])
     gradient = torch.einsum("exd,de->xe", turn[row], lb.stencil.values[1:])
-    weak = -lb.mass[row] * lb.stencil.values[0]
+    place, weak = index, -lb.mass[row] * lb.stencil.values[0]
     if symmetric and lb._has_weak_form:
-        _, col, values = lb.weak.pair
-        matrix = _coo(torch.stack([lb.weak.row, col]), values[0], like)
+        place, weak = torch.stack([lb.weak.row, lb.weak.col]), lb.weak.pair[2][0]
     elif symmetric:
-        matrix = _coo(torch.cat([index, index.flip(0)], 1), torch.cat([weak, weak]) / 2, like)
-    else:
-        matrix = _coo(index, weak, like)
+        place, weak = torch.cat([index, index.flip(0)], 1), torch.cat([weak, weak]) / 2
+    values, vectors = lb.mass.new_zeros(0), lb.mass.new_zeros(lb.num_points, 0)
     if k_eig > 0:
-        basis = lb.eigenbasis(k_eig)
+        values, vectors = lb.eigenbasis(k_eig)
         # From orthonormal in M to orthonormal in the diagonal mass by Gram–Schmidt; the first stays constant.
-        gram = basis.eigenvectors.mT @ (lb.mass[:, None] * basis.eigenvectors)
-        lower = torch.linalg.cholesky(gram)
-        vectors = torch.linalg.solve_triangular(lower, basis.eigenvectors.mT, upper=False).mT
-        pairs = basis.eigenvalues, vectors
-    else:
-        pairs = lb.mass.new_zeros(0), lb.mass.new_zeros(lb.num_points, 0)
-    dense = [part.to(like) for part in (frames, lb.mass, *pairs)]
-    sparse = [_coo(index, part, like) for part in gradient]
-    return dense[0], dense[1], matrix, dense[2], dense[3], sparse[0], sparse[1]
+        lower = torch.linalg.cholesky(vectors.mT @ (lb.mass[:, None] * vectors))
+        vectors = torch.linalg.solve_triangular(lower, vectors.mT, upper=False).mT
+    frames, mass, values, vectors = (t.to(like) for t in (frames, lb.mass, values, vectors))
+    x, y = (_coo(index, part, like) for part in gradient)
+    return frames, mass, _coo(place, weak, like), values, vectors, x, y
 
 
 def _frames(lb: LaplaceBeltrami, side: Tensor | None) -> Float[Tensor, "V 3 3"]:
     """Rows X, Y, normal: X is e₁ projected on the tangent plane, or e₂ where e₁ is steep, and Y = normal × X."""
-    normal, known = lb.normals, False
+    normal = lb.normals
     if side is not None:
         near = nearest_neighbors(lb.points, min(NEAREST, len(normal)))
         side, known = settled_normals(lb.points, side.detach().cpu().double(), near)
-    if known and side is not None:
         flip = (normal * side).sum(1, keepdim=True) < 0
-        normal = torch.where(flip, -normal, normal)
-    axes = torch.eye(3, dtype=normal.dtype)
-    axis = torch.where(normal[:, :1].abs() < STEEP, axes[0], axes[1])
+        normal = torch.where(flip & known, -normal, normal)
+    axis = torch.eye(3, dtype=normal.dtype)[(normal[:, 0].abs() >= STEEP).long()]
     x = torch.nn.functional.normalize(axis - (axis * normal).sum(1, keepdim=True) * normal)
     return torch.stack([x, torch.linalg.cross(normal, x), normal], dim=1)
 
 
 def _coo(index: Tensor, values: Tensor, like: Tensor) -> Tensor:
-    shape = (len(like), len(like))
-    matrix = torch.sparse_coo_tensor(index, values, shape, check_invariants=False).coalesce()
-    return matrix.to(like.device, like.dtype)
+    matrix = torch.sparse_coo_tensor(index, values, (len(like),) * 2, check_invariants=False)
+    return matrix.coalesce().to(like.device, like.dtype)

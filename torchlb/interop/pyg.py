@@ -44,6 +44,9 @@ from torchlb.stencils.conditions import kind_of
 
 __all__ = ["LaplaceBeltramiTransform", "to_operator"]
 
+KEPT = ("mass", "frames", "normals", "_shape_operators")
+"""Attributes of the operator that are keys as they are; the last two of hypersurfaces alone."""
+
 
 @functional_transform("laplace_beltrami")
 class LaplaceBeltramiTransform(BaseTransform):
@@ -66,10 +69,8 @@ class LaplaceBeltramiTransform(BaseTransform):
     lb_weak_index      (2, nnz)     [j; i] of every entry of the weak pair, none where there is no pair
     lb_weak_values     (nnz, 3)     stiffness, mass matrix, boundary mass matrix; (nnz, 4) with Robin's term
     lb_linear_…                     the same for P1 elements
-    lb_basis           (…,)         with k > 0: all parts of the eigenbasis in one vector, for `to_operator`
-    lb_nodes           (N,)         lb_first, lb_first + 1, …: they reveal a permutation of the nodes
-    lb_first           (1,)         checksum of the positions
-    lb_basis_size      (1,)         number of eigenpairs
+    lb_basis, _size    (…,), (1,)   with k > 0: all parts of the eigenbasis in one vector, and the number of pairs
+    lb_nodes, lb_first (N,), (1,)   lb_first, lb_first + 1, …, which reveal a permutation of the nodes, from a checksum
     lb_info            str          source, options, certificate, radius as JSON
     =================  ===========  ============================================================================
 
@@ -79,10 +80,9 @@ class LaplaceBeltramiTransform(BaseTransform):
 
     Parameters
     ----------
-    operator
-        "stencil" or "cotangent".
-    k
-        Number of eigenpairs for spectral layers; 0 for none, which `to_operator(batch).eigenbasis` would solve anew.
+    operator, k
+        "stencil" or "cotangent"; number of eigenpairs for spectral layers, 0 for none, which
+        `to_operator(batch).eigenbasis` would solve anew.
     cache
         Folder, so that each shape is computed once (`load_or_build`); None to compute at every call.
     normals
@@ -94,12 +94,8 @@ class LaplaceBeltramiTransform(BaseTransform):
     **options
         Options of `LaplaceBeltrami.from_mesh` (for data with `face`) or `from_points` (without).
 
-    Raises
-    ------
-    ValueError
-        When called, for data without `pos`, and for bad shapes.
-
-    `FaceToEdge` drops `face`, which makes the shape a cloud; a warning says so where there are no normals either.
+    A call raises ValueError for data without `pos`, and for bad shapes. `FaceToEdge` drops `face`, which makes the
+    shape a cloud; a warning says so where there are no normals either.
     """
 
     def __init__(
@@ -158,21 +154,17 @@ class LaplaceBeltramiTransform(BaseTransform):
 
 def _keys(lb: LaplaceBeltrami, k: int) -> dict[str, Any]:
     """The keys and values to store in the data of one shape."""
-    closed = torch.zeros(lb.num_points, dtype=torch.bool)
     first = zlib.crc32(lb.points.cpu().numpy().tobytes())
     keys: dict[str, Any] = {
         "lb_order_t": lb.stencil.order_t,
-        "lb_mass": lb.mass,
-        "lb_frames": lb.frames,
         "lb_pos": lb.points,
         "lb_nodes": torch.arange(first, first + lb.num_points),
         "lb_first": torch.tensor([first]),
         "lb_face_index": lb.faces.T.contiguous(),
-        "lb_boundary": closed if lb.boundary is None else lb.boundary,
+        "lb_boundary": lb.mass < 0 if lb.boundary is None else lb.boundary,
         "lb_info": json.dumps(lb.get_extra_state()),
     }
-    if len(lb.normals):
-        keys |= {"lb_normals": lb.normals, "lb_shape_operators": lb._shape_operators}
+    keys |= {f"lb_{n.strip('_')}": getattr(lb, n) for n in KEPT if len(getattr(lb, n))}
     kind = kind_of(lb.options.get("condition"))
     width = 3 if kind.conserves or kind.fixes else 4  # the same for every shape with this condition
     for name, pair in {"stencil": lb.stencil, "weak": lb.weak, "linear": lb.weak.near}.items():
@@ -193,11 +185,8 @@ def to_operator(data: Any) -> LaplaceBeltrami:
     Of a `Batch` it is block-diagonal, as `LaplaceBeltrami.batch` makes it, and `lb(x)` acts on the features of all
     nodes. It holds the eigenbases, if they were stored. Nothing is solved or sorted: cheap enough for every step.
 
-    Raises
-    ------
-    ValueError
-        For data without the keys, for `pos` changed since by more than a translation, and for nodes in another order,
-        since transforms permute nodes, not matrices.
+    Raises ValueError for data without the keys, for `pos` changed since by more than a translation, and for nodes in
+    another order, since transforms permute nodes, not matrices.
     """
     if not hasattr(data, "keys") or "lb_stencil_index" not in data:
         raise InputError(
@@ -219,33 +208,24 @@ def to_operator(data: Any) -> LaplaceBeltrami:
 def _parts(data: Any, sizes: Int[Tensor, " S"]) -> dict[str, Any]:
     """The block-diagonal matrices, and the other tensors of the operator."""
     points = data.pos.detach().to(data.lb_mass)
-    boundary = data.lb_boundary
-    parts = {
-        "mass": data.lb_mass,
-        "points": points,
-        "frames": data.lb_frames,
-        "normals": data.get("lb_normals", points[:0]),
-        "_shape_operators": data.get("lb_shape_operators", points[:0]),
-        "_on_boundary": boundary[: None if boundary.any() else 0],
-        "faces": data.lb_face_index.T,
-    }
-    pair = {}
+    parts = {n: data.get(f"lb_{n.strip('_')}", points[:0]) for n in KEPT}
+    parts |= {"points": points, "faces": data.lb_face_index.T}
+    parts["_on_boundary"] = data.lb_boundary[: None if data.lb_boundary.any() else 0]
+    matrices = []
     for name in ("stencil", "weak", "linear"):
         col, row = data[f"lb_{name}_index"]
-        count = torch.bincount(row, minlength=len(points))
-        crow = torch.cat([count.new_zeros(1), count.cumsum(0)])
+        crow = pad(torch.bincount(row, minlength=len(points)).cumsum(0), (1, 0))
         ends = crow[pad(sizes.cumsum(0), (1, 0))]
         entries = ends.diff()
         if bool((entries == 0).any()):
             break  # as in `LaplaceBeltrami.batch`, if one shape has no pair
-        values = data[f"lb_{name}_values"].T.contiguous()
+        values, order_t = data[f"lb_{name}_values"].T.contiguous(), None
         if name == "stencil":
             order_t = data.lb_order_t + ends[:-1].repeat_interleave(entries)
-            parts[name] = Csr(crow, col.contiguous(), values, order_t)
-        else:
-            pair[name] = Csr(crow, col.contiguous(), values)
+        matrices.append(Csr(crow, col.contiguous(), values, order_t))
+    parts["stencil"], *pair = matrices
     if pair:
-        parts["weak"] = PairMatrices.trimmed(pair["weak"], pair["linear"])
+        parts["weak"] = PairMatrices.trimmed(*pair)
     return parts
 
 
@@ -259,9 +239,8 @@ def _check_unchanged(data: Any, sizes: Int[Tensor, " S"]) -> None:
             f"{len(pos)} points, but an operator of {count}: nodes were added or taken away after "
             "LaplaceBeltramiTransform; apply it last"
         )
-    before = sizes.cumsum(0) - sizes
-    number = torch.arange(len(pos), device=before.device) - before.repeat_interleave(sizes)
-    expected = data.lb_first.repeat_interleave(sizes) + number
+    shift = data.lb_first - (sizes.cumsum(0) - sizes)
+    expected = shift.repeat_interleave(sizes) + torch.arange(len(pos), device=sizes.device)
     astray = (data.lb_nodes != expected).nonzero()[:, 0]
     if len(astray):
         raise InputError(
@@ -269,8 +248,8 @@ def _check_unchanged(data: Any, sizes: Int[Tensor, " S"]) -> None:
             "LaplaceBeltramiTransform, and its matrices are not; permute or sample first, and apply it last"
         )
     moved = (pos - built).split(sizes.tolist())
-    by = max((float((d - d[:1]).abs().max()) for d in moved if len(d)), default=0.0)
-    scale = max(float(pos.abs().max()), float(built.abs().max())) if len(pos) else 0.0
+    by = max(float((d - d[0]).abs().max()) for d in moved)
+    scale = max(float(pos.abs().max()), float(built.abs().max()))
     if by > 64 * max(torch.finfo(t.dtype).eps for t in (pos, built)) * scale:
         raise InputError(
             f"pos: its points moved by up to {by:.3g} against each other since LaplaceBeltramiTransform, whose "
@@ -284,8 +263,6 @@ def _bases(data: Any, sizes: list[int]) -> list[Eigenbasis]:
     pieces = data.lb_basis.split([2 * k * (1 + n) for n, k in zip(sizes, numbers, strict=True)])
     masses = data.lb_mass.split(sizes)
     for piece, mass, k in zip(pieces, masses, numbers, strict=True):
-        size = k * len(mass)
-        values, vectors, left, errors = piece.split([k, size, size, k])
-        vectors, left = vectors.view(-1, k), left.view(-1, k)
-        bases.append(Eigenbasis(values, vectors, mass, left, relative_errors=errors))
+        values, vectors, left, errors = piece.view(-1, k).split([1, len(mass), len(mass), 1])
+        bases.append(Eigenbasis(values[0], vectors, mass, left, relative_errors=errors[0]))
     return bases

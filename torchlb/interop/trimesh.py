@@ -23,15 +23,10 @@ def from_trimesh(shape: Any, *, operator: Operator = "stencil", **options: Any) 
     ----------
     shape
         Vertices in ℓ. The geometries of a scene are placed and joined; they stay separate components.
-    operator
-        "stencil", or "cotangent" for libigl's.
-    **options
-        Options of `LaplaceBeltrami.from_mesh` or `from_points`.
+    operator, **options
+        "stencil", or "cotangent" for libigl's; options of `LaplaceBeltrami.from_mesh` or `from_points`.
 
-    Raises
-    ------
-    ValueError
-        For bad input, such as vertices that belong to no face: `shape.remove_unreferenced_vertices()`.
+    Raises ValueError for bad input, such as vertices that belong to no face: `shape.remove_unreferenced_vertices()`.
 
     Examples
     --------
@@ -48,18 +43,13 @@ def to_trimesh(lb: LaplaceBeltrami, faces: Any = None, **attributes: Any) -> Any
 
     Parameters
     ----------
-    lb
-        Operator of N points in R³.
-    faces
-        (F, 3), instead of the operator's own.
+    lb, faces
+        Operator of N points in R³, and (F, 3) instead of its own faces.
     **attributes
         (N,) or (N, C) data, such as ``curvature=lb.mean_curvature_normal()``, for `vertex_attributes`; files such as
         .ply keep them. A point cloud holds them in `metadata`.
 
-    Raises
-    ------
-    ValueError
-        For points of another dimension, or an attribute of another length.
+    Raises ValueError for points of another dimension, or an attribute of another length.
     """
     import trimesh
 

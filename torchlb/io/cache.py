@@ -56,10 +56,9 @@ def load_or_build(
         (N, n) tensor or array, ℓ, and (F, 3) indices; None or empty for a point cloud.
     cache
         Folder; made if missing, "~" is the home directory.
-    operator
-        "stencil" (`from_mesh` or `from_points`) or "cotangent" (`from_cotangent`).
-    k
-        Number of eigenpairs to have in the file. A file with fewer is completed; one with more serves.
+    operator, k
+        "stencil" (`from_mesh` or `from_points`) or "cotangent" (`from_cotangent`), and the number of eigenpairs to have
+        in the file. A file with fewer is completed; one with more serves.
     overwrite, progress, **options
         Whether to build the operator even if it is stored; arguments of the builder, such as ``order=5``.
 
@@ -147,18 +146,13 @@ def save_operator(lb: LaplaceBeltrami, path: str | Path, *, key: str = "") -> No
 
     Parameters
     ----------
-    lb
-        Any operator, also a batch.
+    lb, key
+        Any operator, also a batch, and its `operator_key`, for a file of a cache.
     path
         Path of the file, best with the ending .npz. Its folder is made if missing; an existing file is replaced as a
         whole, even if the program is killed or several write it.
-    key
-        Its `operator_key`, for a file of a cache.
 
-    Raises
-    ------
-    OSError
-        Where the file cannot be written; no part of it remains.
+    Raises OSError where the file cannot be written; no part of it remains.
     """
     check_operator(lb)
     path = check_path(path)
@@ -198,12 +192,8 @@ def _compact(tensor: Tensor) -> Tensor:
 def load_operator(path: str | Path) -> LaplaceBeltrami:
     """Read the operator in the file `path`, by `save_operator` or of a cache, bit for bit, on the CPU.
 
-    Raises
-    ------
-    FileNotFoundError
-        If there is no such file.
-    OperatorFileError
-        If it is something else, damaged, or of a version with another format.
+    Raises FileNotFoundError if there is no such file, and OperatorFileError if it is something else, damaged, or of a
+    version with another format.
     """
     return load_with_header(path)[0]
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from importlib import import_module
 from pathlib import Path
 from typing import Any
@@ -16,10 +17,7 @@ from torchlb.io.formats import READERS, numbers_of
 from torchlb.operator.cleaning import merged, triangles_of
 from torchlb.operator.inputs import ArrayLike, as_tensor, check_corners, check_path, check_points
 
-VTK, CELLS = (".vtk", ".vtp", ".vtu"), ("VERTEX", "LINE", "TRIANGLE", "TETRA")
-OTHERS = (".gii", ".glb", ".gltf", ".npy", ".npz", ".stl")
-SUFFIXES = tuple(sorted([*OTHERS, *VTK, *READERS]))
-"""Endings of the files that `read_shape` takes."""
+CELLS = ("VERTEX", "LINE", "TRIANGLE", "TETRA")
 STEPS = 4
 """Largest difference of coinciding corners in an .stl, in steps of float32 at the largest coordinate."""
 OF_THE_SHAPE = ("vertices", "points", "pos", "faces")
@@ -45,25 +43,17 @@ def arrays_of(shape: Any) -> Shape:
 
 
 def read_shape(path: str | Path) -> Shape:
-    """Vertices, float64, and faces, int64 or None, of a file, in its order.
+    """Vertices, float64, and faces, int64 or None, of the file `path`, in its order.
 
-    Parameters
-    ----------
-    path
-        A mesh (.ply, .obj, .off, .stl, .glb, .gltf), whose polygons are split into triangles, along the shorter
-        diagonal of a quad; without faces it is a cloud. A surface of GIFTI (.gii) or FreeSurfer (lh.pial, …), through
-        nibabel. Polydata or an unstructured grid of VTK (.vtk, .vtp, .vtu), through pyvista: tetrahedra, else
-        triangles, else lines. A cloud in .pcd, or a table of numbers (.xyz, .txt, .csv, .pts, .asc) with the
-        coordinates in the columns x, y, z, or in the first three. An array (N, n) of points in .npy; or a .npz with
-        `vertices` (or `points`, or `pos`) and, for a mesh, `faces`. The corners of an .stl, which has no vertices, are
-        merged where they coincide to rounding.
+    A mesh (.ply, .obj, .off, .stl, .glb, .gltf), whose polygons are split into triangles, along the shorter diagonal of
+    a quad; without faces it is a cloud. A surface of GIFTI (.gii) or FreeSurfer (lh.pial, …), through nibabel. Polydata
+    or an unstructured grid of VTK (.vtk, .vtp, .vtu), through pyvista: tetrahedra, else triangles, else lines. A cloud
+    in .pcd, or a table of numbers (.xyz, .txt, .csv, .pts, .asc) with the coordinates in the columns x, y, z, or in the
+    first three. An array (N, n) of points in .npy; or a .npz with `vertices` (or `points`, or `pos`) and, for a mesh,
+    `faces`. The corners of an .stl, which has no vertices, are merged where they coincide to rounding.
 
-    Raises
-    ------
-    FileNotFoundError
-        If there is no such file.
-    ValueError
-        If it is no shape, or the library is missing that reads it; the message names the file.
+    Raises FileNotFoundError if there is no such file, and ValueError if it is no shape, or the library is missing that
+    reads it; the message names the file.
     """
     vertices, faces, data = _read(path)
     if vertices is None:
@@ -94,20 +84,8 @@ def _read(path: str | Path) -> Contents:
     if not path.is_file():
         raise FileNotFoundError(f"{path}: no such file")
     try:
-        if suffix == ".npy":
-            found = np.load(path, allow_pickle=False), None, {}
-        elif suffix == ".npz":
-            found = _npz(path)
-        elif suffix in READERS:
-            found = *_triangulated(*READERS[suffix](path)), {}
-        elif suffix in VTK:
-            found = _vtk(path)
-        elif suffix == ".gii":
-            found = _gifti(path)
-        elif suffix in (".annot", ".mgh", ".mgz") or _start(path) in (SURFACE, MAP):
-            found = _freesurfer(path)
-        else:
-            found = *_by_trimesh(path), {}
+        named = suffix in (".annot", ".mgh", ".mgz") or _start(path) in (SURFACE, MAP)
+        found = KINDS.get(suffix, _freesurfer if named else _by_trimesh)(path)
         shape = (1, 1) if found[0] is None else found[0].shape
         if len(shape) != 2 or 0 in shape:
             raise InputError(f"vertices of shape {tuple(shape)}, expected (N, n)")
@@ -180,15 +158,15 @@ def _freesurfer(path: Path) -> Contents:
     return None, None, {suffix[1:]: nibabel.freesurfer.read_morph_data(path)}
 
 
-def _by_trimesh(path: Path) -> Shape:
+def _by_trimesh(path: Path) -> Contents:
     """What trimesh reads; the corners of an .stl become vertices."""
     import trimesh
 
     shape = trimesh.load(path, process=False, maintain_order=True, skip_materials=True)
     vertices, faces = arrays_of(shape)
     if path.suffix.lower() == ".stl" and faces is not None:
-        return _sewn(vertices, faces)
-    return vertices, faces
+        vertices, faces = _sewn(vertices, faces)
+    return vertices, faces, {}
 
 
 def write_shape(
@@ -228,9 +206,7 @@ def write_shape(
         mesh = trimesh.Trimesh(places, corners, process=False)
         _ = (mesh if len(corners) else trimesh.PointCloud(places)).export(path)
     else:
-        what = (
-            f"cells {corners.shape} on points {places.shape}{''.join(f', {name}' for name in data)}"
-        )
+        what = ", ".join([f"cells {corners.shape} on points {places.shape}", *data])
         raise InputError(
             f"{path}: this format does not hold {what}; .npz holds all, .vtk and .vtu all in R² and R³, .gii triangles "
             "and data in R³, .ply, .obj, .off and .glb triangles and points of R³ without data, .stl triangles"
@@ -281,10 +257,9 @@ def may_be_shape(path: Path) -> bool:
         return False
 
 
-def _triangulated(
-    vertices: Float[np.ndarray, "N n"], corners: Int[np.ndarray, " C"], sizes: Int[np.ndarray, " P"]
-) -> Shape:
-    """Split polygons into triangles, in their order; those with fewer than three corners are left out."""
+def _triangulated(path: Path) -> Contents:
+    """Polygons split into triangles, in their order; those with fewer than three corners are left out."""
+    vertices, corners, sizes = READERS[path.suffix.lower()](path)
     places, every = torch.from_numpy(vertices), torch.from_numpy(corners)
     bad = corners[(corners < 0) | (corners >= len(vertices))]
     if len(bad):
@@ -296,9 +271,9 @@ def _triangulated(
         parts.append(polygons[:, None] if size == 3 else triangles_of(places, polygons))
         owners.append(torch.from_numpy(chosen).repeat_interleave(size - 2))
     if not parts:
-        return places, None
+        return places, None, {}
     order = torch.cat(owners).argsort(stable=True)
-    return places, torch.cat([part.flatten(0, 1) for part in parts])[order]
+    return places, torch.cat([part.flatten(0, 1) for part in parts])[order], {}
 
 
 def _sewn(vertices: Float[Tensor, "N 3"], faces: Int[Tensor, "F 3"]) -> tuple[Tensor, Tensor]:
@@ -309,10 +284,22 @@ def _sewn(vertices: Float[Tensor, "N 3"], faces: Int[Tensor, "F 3"]) -> tuple[Te
     return vertices[kept], number[faces]
 
 
-def _npz(path: Path) -> Contents:
+def _numpy(path: Path) -> Contents:
+    if path.suffix.lower() == ".npy":
+        return np.load(path, allow_pickle=False), None, {}
     with np.load(path, allow_pickle=False) as archive:
         arrays = dict(archive)
     shape = {name: arrays.pop(name) for name in OF_THE_SHAPE if name in arrays}
-    faces = shape.pop("faces", None)
-    vertices = next(iter(shape.values()), None)
-    return vertices, None if faces is None or faces.size == 0 else faces, arrays
+    faces = shape.pop("faces", np.zeros(0))
+    return next(iter(shape.values()), None), faces if faces.size else None, arrays
+
+
+KINDS: dict[str, Callable[[Path], Contents]] = {
+    ".gii": _gifti,
+    **dict.fromkeys(READERS, _triangulated),
+    **dict.fromkeys((".npy", ".npz"), _numpy),
+    **dict.fromkeys((".vtk", ".vtp", ".vtu"), _vtk),
+    **dict.fromkeys((".glb", ".gltf", ".stl"), _by_trimesh),
+}
+SUFFIXES = tuple(sorted(KINDS))
+"""Endings of the files that `read_shape` takes."""

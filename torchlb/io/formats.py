@@ -18,13 +18,9 @@ from jaxtyping import Float, Int
 from torchlb.errors import InputError
 
 Polygons = tuple[Float[np.ndarray, "N n"], Int[np.ndarray, " C"], Int[np.ndarray, " P"]]
-TYPES = {
-    **{"char": "i1", "uchar": "u1", "short": "i2", "ushort": "u2", "int": "i4", "uint": "u4"},
-    **{"float": "f4", "double": "f8", "int8": "i1", "uint8": "u1", "int16": "i2", "uint16": "u2"},
-    **{"int32": "i4", "uint32": "u4", "float32": "f4", "float64": "f8"},
-}
-"""Types of .ply, as NumPy names them."""
-Property = tuple[str, str, str | None]
+TYPES = {"char": "i1", "uchar": "u1", "int": "i4", "uint": "u4", "float": "f4"}
+"""Types of .ply that NumPy names otherwise."""
+Property = tuple[str, ...]
 """Name of a property of .ply, its type, and that of its length if it is a list."""
 
 
@@ -35,10 +31,7 @@ def _polygons(vertices: Any, faces: list[Any]) -> Polygons:
 
 
 def read_obj(path: Path) -> Polygons:
-    """Vertices and faces of all groups and materials of an .obj; texture and normals split no vertex.
-
-    An index below zero counts back from the last vertex before its face.
-    """
+    """Vertices, which texture splits not, and faces of an .obj; indices below zero count back from the last vertex."""
     vertices, faces = [], []
     for line in path.read_text("utf-8", "replace").replace("\\\n", " ").splitlines():
         key, *words = line.split("#")[0].split() or [""]
@@ -83,15 +76,10 @@ def read_ply(path: Path) -> Polygons:
                 order = {"binary_little_endian": "<", "binary_big_endian": ">"}.get(kind, "")
             case ["element", name, count]:
                 elements.append((name, int(count), []))
-            case [
-                "property",
-                *kinds,
-                name,
-            ]:  # a number, or a list: the types of its length and of its numbers
-                types = [
-                    order + TYPES[kind] if order else "<f8" for kind in kinds if kind != "list"
-                ]
-                elements[-1][2].append((name, types[-1], types[0] if len(types) == 2 else None))
+            case ["property", *kinds, name]:  # of a list: those of its length and of its numbers
+                types = [TYPES.get(k, k) if order else "f8" for k in kinds if k != "list"]
+                *size, kind = ((order or "<") + np.dtype(each).str[1:] for each in types)
+                elements[-1][2].append((name, kind, *size))
     if not order:  # an ascii file is read as a binary one of doubles
         data, at = np.array(data[at:].split()).astype("<f8").tobytes(), 0
     vertices, faces = [np.zeros((0, 3))], [np.zeros((0, 3))]
@@ -100,11 +88,12 @@ def read_ply(path: Path) -> Polygons:
         if name == "vertex":
             vertices = [np.hstack([block[axis] for axis in "xyz"]) for block in blocks]
         elif name in ("face", "tristrips"):
-            lists = [title for title, _, size in properties if size]
+            lists = [title for title, _, *size in properties if size]
             title = next((n for n in lists if n.startswith("vertex_ind")), lists[0])
             rows = [block[title].astype(int) for block in blocks]
-            strips = chain(*rows) if name == "tristrips" else ()
-            faces += [t[None] for strip in strips for t in _strip(strip)] or rows
+            if name == "tristrips":
+                rows = [triangle[None] for strip in chain(*rows) for triangle in _strip(strip)]
+            faces += rows
     sizes = np.concatenate([np.full(len(rows), rows.shape[1]) for rows in faces])
     corners = np.concatenate([rows.ravel() for rows in faces]).astype(int)
     return np.concatenate(vertices).astype(float), corners, sizes
@@ -117,18 +106,17 @@ def _blocks(
     blocks, ahead = [], count
     while count:
         fields: list[tuple[str, str, tuple[int, ...]]] = []
-        for name, kind, size in properties:
+        for name, kind, *size in properties:
             length = 1
             if size:
-                length = int(np.frombuffer(data, size, 1, at + np.dtype(fields).itemsize)[0])
-                fields.append((f"size of {name}", size, ()))
+                length = int(np.frombuffer(data, size[0], 1, at + np.dtype(fields).itemsize)[0])
+                fields.append((f"size of {name}", size[0], ()))
             fields.append((name, kind, (length,)))
         row = np.dtype(fields)
         rows = max(1, min(ahead, count, (len(data) - at) // row.itemsize))
         table = np.frombuffer(data, row, rows, at)
-        alike = np.ones(rows, dtype=bool)
-        for name in (name for name, _, size in properties if size):
-            alike &= table[f"size of {name}"] == table[name].shape[1]
+        lists = [name for name, _, *size in properties if size]
+        alike = np.all([table[f"size of {name}"] == table[name].shape[1] for name in lists], axis=0)
         blocks.append(table if alike.all() else table[: alike.argmin()])
         ahead = 2 * len(blocks[-1])  # one row in a thousand of another length costs no more
         count, at = count - len(blocks[-1]), at + blocks[-1].nbytes
@@ -151,25 +139,20 @@ def _strip(corners: Int[np.ndarray, " C"]) -> Iterator[np.ndarray]:
 
 def read_pcd(path: Path) -> Polygons:
     """The points of a .pcd, ascii or binary, without those that are NaN."""
-    data, header = path.read_bytes(), {}
-    at = 0
-    while "DATA" not in header and at < len(data):
-        line, _, _ = data[at:].partition(b"\n")
-        at += len(line) + 1
-        key, *words = line.decode("ascii", "replace").split() or ["#"]
-        header[key] = words
-    kind = header["DATA"][0]
-    if kind == "ascii":
-        data, at = np.array(data[at:].split()).astype("<f8").tobytes(), 0
-    elif kind != "binary":
+    head, kind, data = re.split(rb"^DATA (\w+)\s*?\n", path.read_bytes(), maxsplit=1, flags=re.M)
+    lines = map(str.split, head.decode("ascii", "replace").splitlines())
+    header = {key: words for key, *words in filter(None, lines)}
+    if kind == b"ascii":
+        data = np.array(data.split()).astype("<f8").tobytes()
+    elif kind != b"binary":
         raise InputError(
-            f"its data are {kind}; write them as binary or ascii, as pcl_convert_pcd_ascii_binary does"
+            f"its data are {kind.decode()}; write them as binary or ascii, as pcl_convert_pcd_ascii_binary does"
         )
     names, repeats = header["FIELDS"], header.get("COUNT", ["1"] * len(header["SIZE"]))
     columns = zip(header["TYPE"], header["SIZE"], repeats, strict=True)
-    types = [("<f8" if kind == "ascii" else f"<{t.lower()}{n}", int(c)) for t, n, c in columns]
+    types = [("<f8" if kind == b"ascii" else f"<{t.lower()}{n}", int(c)) for t, n, c in columns]
     row = np.dtype([(str(i), *field) for i, field in enumerate(types)])
-    table: Any = np.frombuffer(data, row, int(header["POINTS"][0]), at)
+    table: Any = np.frombuffer(data, row, int(header["POINTS"][0]))
     places = [table[str(names.index(axis))].reshape(len(table), -1)[:, 0] for axis in "xyz"]
     points = np.stack(places, 1).astype(float)
     return _polygons(points[~np.isnan(points).any(1)], [])
@@ -204,7 +187,7 @@ def numbers_of(path: Path) -> Iterator[tuple[list[str], list[float]]]:
     names: list[str] = []
     begun = said = False
     with open(path, encoding="utf-8-sig", errors="replace") as file:
-        for number, line in enumerate(file, 1):
+        for i, line in enumerate(file, 1):
             text, _, comment = line.replace("//", "#").partition("#")
             only = not (begun or text.strip())
             text = comment if only else text
@@ -217,16 +200,11 @@ def numbers_of(path: Path) -> Iterator[tuple[list[str], list[float]]]:
                 row = [float(word) for word in words]
             except ValueError:
                 if begun:
-                    raise InputError(
-                        f"line {number}: {line.strip()[:60]!r} has no numbers"
-                    ) from None
+                    raise InputError(f"line {i}: {line.strip()[:60]!r} has no numbers") from None
                 row = []
             if len(row) > 1 and not line.lstrip().startswith(("#", "//")):
-                begun = True
-                yield (
-                    (names if said or len(names) == len(row) else []),
-                    row,
-                )  # a comment may be prose
+                begun = True  # and a comment may have been prose
+                yield names if said or len(names) == len(row) else [], row
             elif not begun:
                 said = not only
                 names = [(cell.strip(" \t\n\"'").split() or [""])[0].lower() for cell in cells]

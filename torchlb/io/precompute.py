@@ -13,10 +13,10 @@ import warnings
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import suppress
-from dataclasses import asdict, dataclass, fields
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from tqdm import tqdm
 
@@ -28,14 +28,11 @@ from torchlb.operator.cleaning import cleaned
 from torchlb.operator.dispatch import Operator, check_options_of
 from torchlb.operator.inputs import check_path
 
-TABLE = "precompute.csv"
-"""File in the cache that lists the result of every shape in the last run."""
 STALE = 24 * 3600
 """Age, s, after which temporary files of killed writers are removed. Nobody writes one file for a day."""
 
 
-@dataclass(frozen=True)
-class ShapeResult:
+class ShapeResult(NamedTuple):
     """Result of one shape.
 
     Attributes
@@ -62,10 +59,9 @@ class PrecomputeReport:
 
     Attributes
     ----------
-    results
-        A `ShapeResult` for each shape.
-    skipped
-        Files of the folder that are no shapes, by their endings or, of .txt and .csv, by their first lines.
+    results, skipped
+        A `ShapeResult` for each shape; files of the folder that are no shapes, by their endings or, of .txt and .csv,
+        by their first lines.
     """
 
     results: tuple[ShapeResult, ...]
@@ -125,10 +121,8 @@ def precompute_operators(
         workers are those of the Dask client.
     clean
         Whether to apply `clean_mesh` to meshes, and `clean_points` to clouds; the data set then has to do the same.
-    progress
-        Whether to show a bar, on a terminal.
-    **options
-        Options of `LaplaceBeltrami.from_mesh` or `from_points`.
+    progress, **options
+        Whether to show a bar, on a terminal; options of `LaplaceBeltrami.from_mesh` or `from_points`.
 
     Returns the result of each shape; also in `out`/precompute.csv. Exceptions of shapes are caught. Raises ValueError
     or TypeError for unknown options, a folder that is missing or has no shapes, before any work.
@@ -152,10 +146,8 @@ def precompute_operators(
                 bar.update()
     finally:
         report = PrecomputeReport(tuple(results[i] for i in sorted(results)), skipped)
-        with written_whole(cache / TABLE, "x", encoding="utf-8", newline="") as file:
-            writer = csv.DictWriter(file, [field.name for field in fields(ShapeResult)])
-            writer.writeheader()
-            writer.writerows(asdict(result) for result in report.results)
+        with written_whole(cache / "precompute.csv", "x", encoding="utf-8", newline="") as file:
+            csv.writer(file).writerows([ShapeResult._fields, *report.results])
     return report
 
 
@@ -164,15 +156,21 @@ def _sources(
 ) -> tuple[list[tuple[str, Any]], tuple[str, ...]]:
     """Name and file, or arrays, of every shape, and the names of other files in the folder."""
     if not isinstance(shapes, str | Path):
-        named = [_source(i, shape) for i, shape in enumerate(shapes)]
+        named: list[tuple[str, Any]] = []
+        for i, shape in enumerate(shapes):
+            if isinstance(shape, str | Path):
+                named.append((str(shape), Path(shape).expanduser().resolve()))
+            elif isinstance(shape, tuple | list) and len(shape) == 2:
+                named.append((f"shape {i}", tuple(shape)))
+            else:
+                got = type(shape)
+                raise InputError(f"shape {i}: expected a file or (vertices, faces), got {got}")
         if not named:
             raise InputError("shapes: got none")
         return named, ()
     folder, skipped, found = Path(shapes).expanduser(), [], []
     if not folder.is_dir():
-        raise InputError(
-            f"{folder}: no such folder; give a folder, or a list of files or of arrays"
-        )
+        raise InputError(f"{folder}: no such folder; give a folder, or a list of files or arrays")
     for path in sorted(folder.rglob("*")):
         name, place = str(path.relative_to(folder)), path.resolve()
         if path.is_file() and path.name[0] != "." and cache.resolve() not in place.parents:
@@ -185,23 +183,13 @@ def _sources(
     return found, tuple(skipped)
 
 
-def _source(number: int, shape: Any) -> tuple[str, Any]:
-    """Name of a shape in a list, and its file or arrays."""
-    if isinstance(shape, str | Path):
-        return str(shape), Path(shape).expanduser().resolve()
-    if isinstance(shape, tuple | list) and len(shape) == 2:
-        return f"shape {number}", tuple(shape)
-    raise InputError(f"shape {number}: expected a file or (vertices, faces), got {type(shape)}")
-
-
 def _run(
     work: Callable[..., Any], sources: Sequence[tuple[str, Any]], workers: int
 ) -> Iterator[tuple[int, ShapeResult]]:
     """Yield results as they come. Where a worker dies, the tasks that may have killed it run again, each by itself."""
     import joblib
 
-    backend, _ = joblib.parallel.get_active_backend()
-    lazy = getattr(backend, "supports_return_generator", False)
+    lazy = getattr(joblib.parallel.get_active_backend()[0], "supports_return_generator", False)
     way = "generator_unordered" if lazy else "list"
     settings: dict[str, Any] = {"batch_size": 1, "return_as": way}
 
@@ -249,5 +237,4 @@ def _solve(
         points, file, message = lb.num_points, str(path), "; ".join(sorted(notes))
     except Exception as error:
         status, points, file, message = "failed", 0, "", f"{type(error).__name__}: {error}"
-    seconds = time.perf_counter() - start
-    return index, ShapeResult(name, status, points, seconds, file, message)
+    return index, ShapeResult(name, status, points, time.perf_counter() - start, file, message)

@@ -51,34 +51,24 @@ class LearnedTimes(nn.Module):
 
 
 class Diffusion(LearnedTimes):
-    """Diffusion of each channel for a learned time: y_c = e^{t_c Δ}x_c.
+    """Diffusion of each channel for a learned time: y_c = e^{t_c Δ}x_c, t = softplus(100 raw_time)/100 > 0.
 
     Parameters
     ----------
-    channels
-        C.
-    method
-        "spectral" (as in the original DiffusionNet: Φe^{−λt}ΦᵀM, which drops everything beyond the basis), or
-        "rational" (exact at every scale; no basis, but solves). See `docs/conventions.md`.
-    k
-        Number of eigenpairs for the first.
-    init_time
-        Initial time, ℓ². Shapes of radius about one are expected.
+    channels, init_time
+        C, and the initial time, ℓ². Shapes of radius about one are expected.
+    method, k
+        "spectral" by k eigenpairs (as in the original DiffusionNet: Φe^{−λt}ΦᵀM, which drops everything beyond the
+        basis), or "rational" (exact at every scale; no basis, but solves). See `docs/conventions.md`.
     tolerance
         Tolerance of "rational", see `heat_flow`; None for 1e-5 in float32, 1e-10 in float64.
-
-    Attributes
-    ----------
-    raw_time
-        (C,), the parameter; the times are t = softplus(100 raw)/100, positive by construction.
 
     Examples
     --------
     >>> from torchlb import LaplaceBeltrami
     >>> theta = torch.arange(36) * torch.pi / 18
     >>> lb = LaplaceBeltrami.from_points(torch.stack([theta.cos(), theta.sin()], dim=1))
-    >>> layer = Diffusion(3)
-    >>> layer(torch.ones(36, 3), lb).mean().item()
+    >>> Diffusion(3)(torch.ones(36, 3), lb).mean().item()
     1.0
     """
 
@@ -101,39 +91,30 @@ class Diffusion(LearnedTimes):
 
     def extra_repr(self) -> str:
         """Channels, method, k."""
-        basis = f", k={self.k}" if self.used_k else ""
-        return f"{self.channels}, method={self.method!r}{basis}"
+        return f"{self.channels}, method={self.method!r}" + (f", k={self.k}" if self.used_k else "")
 
 
 class ImplicitDiffusion(LearnedTimes):
-    """One implicit step of each channel for a learned time: y_c = (1 − t_c Δ)⁻¹x_c.
+    """One implicit step of each channel for a learned time: y_c = (1 − t_c Δ)⁻¹x_c, t as in `Diffusion`.
 
     It decays as 1/(1 + tλ) where `Diffusion` does as e^{−tλ}: as far, and less sharply. It needs no eigenbasis and
     drops nothing. All channels share the factors of a few times, kept with the operator (`method.md`, section 10).
 
     Parameters
     ----------
-    channels
-        C.
-    init_time
-        Initial time, ℓ². Shapes of radius about one are expected.
+    channels, init_time
+        As for `Diffusion`.
     tolerance
         "P1" for four solves by P1 elements, to 1e-3 of |x|, which is accurate enough for learning and has no derivative
         in points and medium; else the relative tolerance of solves with the weak pair, by conjugate gradients, None for
         1e-5 in float32, 1e-10 in float64.
 
-    Attributes
-    ----------
-    raw_time
-        (C,), the parameter; the times are t = softplus(100 raw)/100, positive by construction.
-
     Examples
     --------
     >>> from torchlb import LaplaceBeltrami
     >>> from torchlb.surfaces import Sphere
-    >>> vertices, faces = Sphere().mesh(300)
-    >>> lb = LaplaceBeltrami.from_mesh(vertices.float(), faces)
-    >>> ImplicitDiffusion(3, init_time=0.5)(vertices.float(), lb).div(vertices).median().round(decimals=3).item()
+    >>> lb = LaplaceBeltrami.from_mesh(*Sphere().mesh(300)).float()
+    >>> ImplicitDiffusion(3, init_time=0.5)(lb.points, lb).div(lb.points).median().round(decimals=3).item()
     0.5
     """
 
@@ -155,9 +136,8 @@ class ImplicitDiffusion(LearnedTimes):
 
 def tolerance_for(x: Tensor, tolerance: float | None) -> float:
     """Tolerance of a layer for features x; None for the accuracy of their type, 1e-5 in float32, 1e-10 in float64."""
-    if tolerance is None:
-        return TOLERANCE if x.dtype == torch.float64 else SINGLE
-    return tolerance
+    own = TOLERANCE if x.dtype == torch.float64 else SINGLE
+    return own if tolerance is None else tolerance
 
 
 def diffusion_by(

@@ -7,6 +7,7 @@ trained on the original load: `load_original_state_dict`.
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Mapping, Sequence
 from typing import Literal
 
@@ -16,7 +17,7 @@ from torch import Tensor, nn
 from torch.nn.functional import linear
 
 from torchlb.errors import InputError
-from torchlb.linalg.checks import check_choice
+from torchlb.linalg.checks import check_choice, check_tensor
 from torchlb.nn.diffusion import diffusion_by, raw_of_time
 from torchlb.nn.gradient_features import GradientBlock, TangentMap
 from torchlb.nn.pointwise import unrounded
@@ -38,10 +39,9 @@ class DiffusionNetBlock(GradientBlock):
     ----------
     width
         Channels in and out.
-    hidden
-        Widths of the hidden layers of the pointwise network; [width, width] by default.
-    dropout
-        Whether that network drops half of its hidden values in training.
+    hidden, dropout
+        Widths of the hidden layers of the pointwise network, [width, width] by default, and whether it drops half of
+        its hidden values in training.
     gradient_features, rotations
         Whether there are gradient features, and whether they rotate gradients: see `GradientFeatures`.
     method, k
@@ -71,31 +71,23 @@ class DiffusionNet(nn.Module):
 
     Parameters
     ----------
-    in_channels, out_channels
-        Channels of the features and of the output.
-    width
-        Channels of the blocks.
-    num_blocks
-        Number of blocks.
-    block
-        "diffusion", "implicit" or "poisson".
+    in_channels, out_channels, width
+        Channels of the features, of the output, and of the blocks.
+    num_blocks, block
+        Number of blocks, and their kind: "diffusion", "implicit" or "poisson".
     outputs_at
         "vertices", "edges", "faces" (means over the corners) or "global_mean" (over the surface, by mass); "tangent"
         for tangent fields as space vectors at the vertices, with tangent=True.
     last_activation
         Applied to the output, such as ``lambda y: y.log_softmax(-1)``.
-    hidden, dropout, gradient_features, rotations
-        Arguments of the blocks.
-    method, k
-        Arguments of "diffusion" blocks.
+    hidden, dropout, gradient_features, rotations, method, k
+        Arguments of the blocks, the last two of "diffusion" blocks.
     tangent
         Whether blocks are `TangentBlock`, whose fields start as gradients of the first linear map: "diffusion" blocks
         with method="spectral", or "implicit" ones.
 
-    Raises
-    ------
-    InputError
-        For an unknown block, method or value of `outputs_at`, and for options that do not go with `tangent`.
+    Raises InputError for an unknown block, method or value of `outputs_at`, and for options that do not go with
+    `tangent`.
 
     Examples
     --------
@@ -159,10 +151,9 @@ class DiffusionNet(nn.Module):
 
         Parameters
         ----------
-        x
-            Features (N, in_channels), or (B, N, in_channels) of B inputs on one surface.
-        lb
-            Operator of one shape or of a batch, whose global mean is (S, out_channels), one for each shape.
+        x, lb
+            Features (N, in_channels), or (B, N, in_channels) of B inputs on one surface, and the operator of one shape
+            or of a batch, whose global mean is (S, out_channels), one for each shape.
         faces, edges
             For outputs at faces or edges; in a batch, the indices of shape s moved by ``lb.offsets[s]``.
         """
@@ -176,8 +167,7 @@ class DiffusionNet(nn.Module):
         else:
             y = self.last_lin(y)
         if self.outputs_at == "global_mean":
-            area = lb.integral(torch.ones_like(lb.mass))[..., None]
-            y = (lb.integral(y) / area).to(y.dtype)
+            y = (lb.integral(y) / lb.integral(torch.ones_like(lb.mass))[..., None]).to(y.dtype)
         elif self.outputs_at in ("faces", "edges"):
             corners = faces if self.outputs_at == "faces" else edges
             y = y[..., _checked_corners(self.outputs_at, corners, lb), :].mean(-2)
@@ -189,15 +179,14 @@ class DiffusionNet(nn.Module):
         Parameters keep their names, except ``block_{i}``, which is ``blocks.{i}``, ``mlp.miniMLP_mlp_layer_{jjj}``,
         which is ``mlp.linear_{j}``, and ``diffusion.diffusion_time``, from which ``diffusion.raw_time`` follows.
         Times below 1e-8, which the original raises to it when it runs, become 1e-8. With method="spectral" and the same
-        operators the network then computes the original's results.
-
-        Raises
-        ------
-        InputError
-            For missing or unexpected keys, which it lists, or a shape that differs.
+        operators the network then computes the original's results. Raises InputError for missing or unexpected keys,
+        which it lists, or a shape that differs.
         """
-        own = self.state_dict()
-        names = {_original_name(key): key for key in own}
+        own, names = self.state_dict(), {}
+        for key in own:
+            name = key.replace("blocks.", "block_").replace("raw_time", "diffusion_time")
+            name = re.sub(r"linear_(\d+)", lambda n: f"miniMLP_mlp_layer_{int(n[1]):03}", name)
+            names[name] = key
         missing, unexpected = names.keys() - state.keys(), state.keys() - names.keys()
         if missing or unexpected:
             raise InputError(
@@ -216,27 +205,13 @@ class DiffusionNet(nn.Module):
         self.load_state_dict(taken)
 
 
-def _original_name(key: str) -> str:
-    """Name in the original code of a parameter of `DiffusionNet`.
-
-    >>> _original_name("blocks.3.mlp.linear_2.bias")
-    'block_3.mlp.miniMLP_mlp_layer_002.bias'
-    """
-    name = key.replace("blocks.", "block_").replace("raw_time", "diffusion_time")
-    before, found, after = name.partition("linear_")
-    if not found:
-        return name
-    number, _, kind = after.partition(".")
-    return f"{before}miniMLP_mlp_layer_{int(number):03d}.{kind}"
-
-
 def _checked_corners(place: str, corners: Tensor | None, lb: LaplaceBeltrami) -> Tensor:
     """The corners of faces or edges, checked to have valid indices and, in a batch, to be moved by the offsets."""
     if corners is None:
         raise InputError(f"outputs_at={place!r} needs {place}, got None")
-    expected = 3 if place == "faces" else 2
-    if not isinstance(corners, Tensor) or corners.ndim != 2 or corners.shape[1] != expected:
-        got = tuple(corners.shape) if hasattr(corners, "shape") else type(corners)
+    check_tensor(corners, place)
+    expected, got = 3 if place == "faces" else 2, tuple(corners.shape)
+    if len(got) != 2 or got[1] != expected:
         raise InputError(
             f"{place}: expected a tensor of shape (·, {expected}), got {got}; PyG has the transpose"
         )

@@ -19,10 +19,8 @@ class TangentMap(nn.Module):
 
     Parameters
     ----------
-    channels
-        C.
-    out_channels
-        Number of the fields that it gives; C by default.
+    channels, out_channels
+        C, and the number of the fields that it gives, C by default.
     rotations
         Whether A is complex, so that it also rotates vectors in the tangent plane; that needs a surface whose normals
         are oriented consistently (a mesh, or a cloud with oriented normals). A real A takes any dimension.

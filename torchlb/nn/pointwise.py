@@ -44,10 +44,7 @@ def check_features(
 
 
 def unrounded(x: Tensor, lb: PairMethods, channels: int, parameter: Tensor) -> Tensor:
-    """Features in the type of the parameters, where autocast rounded them, for layers that are differentiated.
-
-    Rounding before a gradient grows by 1/h. Errors as for `check_features`.
-    """
+    """Features, checked, in the type of parameters where autocast rounded them: a gradient amplifies that by 1/h."""
     check_features(x, lb, channels, parameter)
     return x.to(parameter.dtype)
 
@@ -69,10 +66,7 @@ class Dropout(nn.Dropout):
 
 
 def mlp(inputs: int, hidden: Widths, width: int, dropout: bool) -> nn.Sequential:
-    """Linear layers with ReLU between them, and half of the values dropped before each but the first.
-
-    Two hidden layers of the width of the result by default.
-    """
+    """Linear layers, two hidden by default, with ReLU between, half of the values dropped before all but the first."""
     sizes = [inputs, *([width, width] if hidden is None else hidden), width]
     layers: OrderedDict[str, nn.Module] = OrderedDict()
     for i in range(len(sizes) - 1):

@@ -1,9 +1,7 @@
 """A block that solves a Poisson problem for learned sources: global in one step, without an eigenbasis.
 
 After PoissonNet (Maesumi, Thambiraja and others 2025), which maps gradients and returns to functions by such a solve.
-Sources at the points are added, since mapped gradients alone reproduce the input: with them a segmentation of bodies
-from coordinates stays at half of the points, with sources alone it reaches nine tenths (benchmarks/README.md,
-learning).
+Sources at the points are added, since mapped gradients alone reproduce the input (benchmarks/README.md, learning).
 """
 
 from __future__ import annotations
@@ -32,12 +30,8 @@ class PoissonFeatures(nn.Module):
 
     Parameters
     ----------
-    channels
-        C.
-    fields
-        Whether there are fields; they make a training step a third longer.
-    rotations
-        Whether A is complex, see `TangentMap`.
+    channels, fields, rotations
+        C, whether there are fields, which make a training step a third longer, and whether A is complex (`TangentMap`).
     tolerance
         Relative tolerance of the solves with the weak pair; "P1" for one exact solve by P1 elements, which is accurate
         enough for learning.
@@ -76,23 +70,16 @@ class PoissonBlock(GradientBlock):
 
     Parameters
     ----------
-    width
-        Channels in and out.
-    hidden
-        Widths of the hidden layers of the pointwise network; [width, width] by default.
-    dropout
-        Whether that network drops half of its hidden values in training.
-    gradient_features, rotations
-        Whether there are gradient features, and whether they rotate gradients: see `GradientFeatures`.
+    width, hidden, dropout, gradient_features, rotations
+        As for `DiffusionNetBlock`.
     fields, tolerance
         Arguments of `PoissonFeatures`.
 
     Examples
     --------
     >>> from torchlb.surfaces import Sphere
-    >>> vertices, faces = Sphere().mesh(300)
-    >>> lb = LaplaceBeltrami.from_mesh(vertices.float(), faces)
-    >>> PoissonBlock(3)(vertices.float(), lb).shape
+    >>> lb = LaplaceBeltrami.from_mesh(*Sphere().mesh(300)).float()
+    >>> PoissonBlock(3)(lb.points, lb).shape
     torch.Size([300, 3])
     """
 

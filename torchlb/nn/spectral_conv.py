@@ -24,14 +24,10 @@ class SpectralConv(nn.Module):
     ----------
     in_channels, out_channels
         Channels of the features (…, N, C).
-    num_filters
-        Number of polynomials, T_0, ….
-    k
-        Number of eigenpairs.
+    num_filters, k, bias
+        Number of polynomials, T_0, …, and of eigenpairs, and whether to add b.
     scale
         1/ℓ², the eigenvalue in the middle of the filters' range; about 10 suits shapes of radius one.
-    bias
-        Whether to add b.
 
     Examples
     --------
@@ -75,6 +71,5 @@ class SpectralConv(nn.Module):
 
     def extra_repr(self) -> str:
         """Channels, filters, k."""
-        return (
-            f"{self.in_channels}, {self.out_channels}, num_filters={self.num_filters}, k={self.k}"
-        )
+        filters = f"num_filters={self.num_filters}, k={self.k}"
+        return f"{self.in_channels}, {self.out_channels}, {filters}"

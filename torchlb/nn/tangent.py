@@ -76,10 +76,8 @@ class TangentBlock(nn.Module):
 
     Parameters
     ----------
-    width
-        Channels C of functions and of fields.
-    hidden, dropout, rotations
-        As for `DiffusionNetBlock`; rotations of the fields by a complex A.
+    width, hidden, dropout, rotations
+        Channels C of functions and of fields; the others as for `DiffusionNetBlock`, rotations of the fields too.
     method, k
         Of the diffusion of both: "spectral" by k eigenpairs of each, or "implicit".
 

@@ -36,10 +36,7 @@ def spectrum_table(values: Mapping[str, Float[Tensor, " k"]]) -> str:
 
 
 def plot_spectrum(values: Mapping[str, Float[Tensor, " k"]], ax: Any) -> Any:
-    """Plot the eigenvalues of the first operator against their index on matplotlib axes, and return the axes.
-
-    The right axis shows the differences of the other operators in per cent, as in the table.
-    """
+    """Plot eigenvalues of the first operator on axes, which it returns, and the others' differences in % beside."""
     from matplotlib.ticker import MaxNLocator
 
     (name, first), *others = values.items()

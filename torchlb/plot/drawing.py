@@ -1,7 +1,4 @@
-"""Drawing in three dimensions with matplotlib, for `plot`: projection, the painter's algorithm, colours, axes.
-
-The functions take checked input, as `cloud_of`, `shape_of` and `values_of` return it: NumPy arrays of float64.
-"""
+"""Drawing in three dimensions with matplotlib, of input that `figures` checks: projection, the painter's algorithm."""
 
 from __future__ import annotations
 
@@ -9,106 +6,20 @@ from collections.abc import Iterator, Sequence
 from typing import Any
 
 import numpy as np
-import torch
-
-from torchlb.errors import InputError, InputTypeError, shown
+from scipy.spatial.transform import Rotation
 
 Eye = tuple[float, float]
 """Elevation of the eye above the plane of x and y, and azimuth from x, in degrees."""
 Views = Eye | Sequence[Eye]
+Shape = tuple[np.ndarray, np.ndarray | None]
+"""Points (N, 3), and triangles (F, 3), None for a cloud."""
 
 VIEW: Eye = (25.0, -55.0)
 """Default view of a surface: elevation and azimuth, °."""
 LIGHT = (-0.35, 0.45, 0.82)
 """Direction of the light in the picture's coordinates: right, up, towards the eye."""
-MISSING = "0.6"
-"""Colour of values that are NaN or infinite: grey."""
 INK = "0.1"
 """Colour of isolines, and of arrows on a coloured shape."""
-
-
-def axes_of(ax: Any) -> Any:
-    """Return the given axes, or new ones of `matplotlib.pyplot`; ImportError without matplotlib."""
-    try:
-        import matplotlib as mpl  # noqa: F401
-    except ImportError as error:
-        raise ImportError('pictures need matplotlib: pip install ".[plot]" in a clone') from error
-    if ax is not None:
-        return ax
-    import matplotlib.pyplot as plt
-
-    return plt.subplots(figsize=(6.4, 4.8), layout="constrained")[1]
-
-
-def _numpy(values: Any) -> np.ndarray:
-    try:
-        return torch.as_tensor(values).detach().cpu().double().numpy()
-    except (TypeError, ValueError, RuntimeError) as error:
-        raise InputTypeError(
-            f"expected a tensor or array, got {shown(values)}; an operator has lb.points and lb.faces"
-        ) from error
-
-
-def cloud_of(points: Any, name: str = "points") -> np.ndarray:
-    """Points as (N, 3), with z = 0 for points of the plane."""
-    places = _numpy(points)
-    if places.ndim != 2 or places.shape[1] not in (2, 3):
-        raise InputError(
-            f"{name}: expected (N, 2) or (N, 3), got {places.shape}; choose the coordinates to draw, "
-            "for example points[:, :3]"
-        )
-    return np.pad(places, ((0, 0), (0, 3 - places.shape[1])))
-
-
-def shape_of(points: Any, faces: Any) -> tuple[np.ndarray, np.ndarray | None]:
-    """Points as (N, 3), and the indices of their triangles (F, 3), None for a cloud; InputError for what is neither."""
-    points = cloud_of(points)
-    if faces is None:
-        return points, None
-    corners = torch.as_tensor(faces).detach().cpu().numpy()
-    if corners.ndim != 2 or corners.shape[1] != 3 or len(corners) == 0:
-        raise InputError(f"faces: expected (F, 3), at least one, got {corners.shape}")
-    if corners.min() < 0 or corners.max() >= len(points):
-        raise InputError(
-            f"faces: expected indices 0 … {len(points) - 1}, got {corners.min()} … {corners.max()}"
-        )
-    return points, corners
-
-
-def values_of(values: Any, points: np.ndarray) -> np.ndarray:
-    """One number for each point, (N,); ValueError for another count."""
-    numbers = _numpy(values)
-    if numbers.shape != points.shape[:1]:
-        raise InputError(f"values: expected {points.shape[:1]}, one a point, got {numbers.shape}")
-    return numbers
-
-
-def color_map(
-    values: np.ndarray,
-    cmap: str | None,
-    symmetric: bool | None,
-    limits: tuple[float, float] | None = None,
-    diverging: str = "RdBu_r",
-) -> tuple[Any, str]:
-    """The map from values to colours, and the ends at which values exceed its range."""
-    from matplotlib import cm, colormaps, colors
-
-    finite = values[np.isfinite(values)]
-    finite = finite if len(finite) else np.zeros(1)
-    low, high = np.percentile(finite, [1, 99])
-    symmetric = bool(low < 0 < high) if symmetric is None else symmetric
-    if symmetric:
-        high = max(abs(low), abs(high))
-        low = -high
-    if high <= low:
-        low, high = low - 1, high + 1
-    if limits is not None:
-        low, high = limits
-    slack = 0.02 * (high - low)  # point an end only where values are cut off
-    beyond = finite.min() < low - slack, finite.max() > high + slack
-    extend = ("neither", "min", "max", "both")[beyond[0] + 2 * beyond[1]]
-    table = colormaps[cmap or (diverging if symmetric else "viridis")].with_extremes(bad=MISSING)
-    return cm.ScalarMappable(colors.Normalize(low, high), table), extend
 
 
 def plain(color: str, count: int) -> np.ndarray:
@@ -118,44 +29,36 @@ def plain(color: str, count: int) -> np.ndarray:
     return np.tile(to_rgba(color), (count, 1))
 
 
-def _project(points: np.ndarray, view: Eye) -> np.ndarray:
+def _project(points: np.ndarray, view: Any) -> np.ndarray:
     """Coordinates (N, 3) in the picture: right, up, towards the eye."""
-    elevation, azimuth = np.radians(view)
-    right = np.array([-np.sin(azimuth), np.cos(azimuth), 0.0])
-    ahead = np.array([np.cos(azimuth), np.sin(azimuth), 0.0])
-    eye = np.cos(elevation) * ahead + np.sin(elevation) * np.array([0.0, 0.0, 1.0])
-    return points @ np.stack([right, np.cross(eye, right), eye], axis=1)
+    elevation, azimuth = view
+    turn = Rotation.from_euler("ZX", [azimuth + 90, 90 - elevation], degrees=True)
+    return points @ turn.as_matrix()
 
 
-def _stacked(points: np.ndarray, view: Views) -> Iterator[tuple[np.ndarray, Eye]]:
+def _stacked(points: np.ndarray, view: Views) -> Iterator[tuple[np.ndarray, Any]]:
     """The projections for all eyes, one below the other. A shape in the plane z = 0 is seen from above."""
     if not points[:, 2].any():
         view = (90.0, -90.0)
-    views: Any = [view] if isinstance(view[0], int | float) else view
     floor = 0.0
-    for eye in views:
+    for eye in np.reshape(view, (-1, 2)):
         flat = _project(points - points.mean(axis=0), eye)
-        height = np.ptp(flat[:, 1])
         flat[:, 1] += floor - flat[:, 1].max()
         flat[:, 0] -= (flat[:, 0].max() + flat[:, 0].min()) / 2
-        floor -= 1.08 * height
+        floor -= 1.08 * np.ptp(flat[:, 1])
         yield flat, eye
 
 
 def paint(
     ax: Any,
-    points: np.ndarray,
-    faces: np.ndarray | None,
+    shape: Shape,
     colors: np.ndarray,
     view: Views,
     isolines: tuple[np.ndarray, np.ndarray] | None = None,
     size: float | None = None,
 ) -> None:
-    """Draw a surface in the colours of its triangles, or a cloud in those of its points, from back to front.
-
-    Triangles are shaded, with segments on them by `isolines_of`; points are disks of the area `size`, paler with
-    distance.
-    """
+    """Draw shaded triangles with segments by `isolines_of`, or disks of an area, paler with distance, back to front."""
+    points, faces = shape
     if faces is None:
         area = float(np.clip(60000 / len(points), 2, 60)) if size is None else size
         for flat, _ in _stacked(points, view):
@@ -193,20 +96,15 @@ def paint(
 def isolines_of(
     values: np.ndarray, faces: np.ndarray, levels: Sequence[float] | np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Segments on which the linear interpolant has one of the levels, none in triangles with a NaN or infinity.
-
-    Each end is given by its edge, (S, 2, 2), and its fraction of the edge, (S, 2, 1) in 0 … 1.
-    """
-    finite = faces[np.isfinite(values[faces]).all(axis=1)]
+    """Segments where the linear interpolant has a level, none at NaN: edges of their ends, (S, 2, 2), and fractions."""
+    finite, levels = faces[np.isfinite(values[faces]).all(axis=1)], np.asarray(levels)
     edges = np.stack([finite, np.roll(finite, -1, axis=1)], axis=-1)  # (F, 3, 2)
-    start, end = values[edges[..., 0]], values[edges[..., 1]]
-    found, shares = [], []
-    for level in levels:
-        crossed = (start > level) != (end > level)  # two edges of a triangle, or none
-        found.append(edges[crossed].reshape(-1, 2, 2))
-        share = (level - start[crossed]) / (end[crossed] - start[crossed])
-        shares.append(share.reshape(-1, 2, 1))
-    return np.concatenate(found), np.concatenate(shares)
+    start, end = np.moveaxis(values[edges] > levels[:, None, None, None], -1, 0)
+    level, *place = np.nonzero(start != end)  # two edges of a triangle, or none
+    crossed = edges[tuple(place)]
+    start, end = values[crossed].T
+    share = (levels[level] - start) / (end - start)
+    return crossed.reshape(-1, 2, 2), share.reshape(-1, 2, 1)
 
 
 def _faded(colors: np.ndarray, flat: np.ndarray) -> np.ndarray:
@@ -231,15 +129,10 @@ def _evenly_spread(points: np.ndarray, count: int) -> tuple[np.ndarray, float]:
 
 
 def draw_arrows(
-    ax: Any,
-    points: np.ndarray,
-    faces: np.ndarray | None,
-    field: np.ndarray,
-    colors: np.ndarray,
-    view: Views,
-    count: int,
+    ax: Any, shape: Shape, field: np.ndarray, colors: np.ndarray, view: Views, count: int
 ) -> None:
     """Draw arrows at `count` points, back to front: on a mesh only visible ones, on a cloud paler with distance."""
+    points, faces = shape
     tails, spacing = _evenly_spread(points, count)
     lengths = np.linalg.norm(field[tails], axis=1)
     drawn = np.isfinite(lengths) & (lengths > 0)
@@ -270,21 +163,3 @@ def _visible(flat: np.ndarray, faces: np.ndarray, chosen: np.ndarray) -> np.ndar
         fall = (normal[covered, :2] * (point - a[covered])[:, :2]).sum(axis=1) / area[covered]
         visible[i] = not (a[covered, 2] - fall > point[2] + slack).any()
     return visible
-
-
-def finish(
-    ax: Any,
-    title: str | None,
-    shades: Any = None,
-    extend: str = "neither",
-    label: str | None = None,
-) -> Any:
-    """Give the axes equal aspect, no frame, a title and a colour bar, and return them."""
-    ax.autoscale_view()
-    ax.set_aspect("equal")
-    ax.set_axis_off()
-    if shades is not None:
-        ax.figure.colorbar(shades, ax=ax, shrink=0.6, pad=0.03, extend=extend, label=label or "")
-    if title:
-        ax.set_title(title)
-    return ax

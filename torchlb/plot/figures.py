@@ -11,25 +11,13 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
+import torch
 from jaxtyping import Float, Int, Num
 from torch import Tensor
 
-from torchlb.errors import InputError
-from torchlb.plot.drawing import (
-    INK,
-    VIEW,
-    Views,
-    axes_of,
-    cloud_of,
-    color_map,
-    draw_arrows,
-    finish,
-    isolines_of,
-    paint,
-    plain,
-    shape_of,
-    values_of,
-)
+from torchlb.errors import InputError, InputTypeError, shown
+from torchlb.operator.inputs import check_corners
+from torchlb.plot.drawing import INK, VIEW, Shape, Views, draw_arrows, isolines_of, paint, plain
 
 Vertices = Float[Tensor, "N 3"] | Float[np.ndarray, "N 3"]
 Faces = Int[Tensor, "F 3"] | Int[np.ndarray, "F 3"]
@@ -39,6 +27,8 @@ ORDER_COLORS = ("#ece7dc", "#cfd6cf", "#abc1c4", "#7fa5b5", "#5485a0", "#33648a"
 """Colours by order reached, low-order rows first, the last for all beyond: darker is higher, also in grey."""
 LINE_COLORS = ("#d55e00", "#56b4e9", "#0072b2", "#000000", "#e69f00", "#009e73", "#cc79a7")
 MARKERS = "osD^vP*"
+MISSING = "0.6"
+"""Colour of values that are NaN or infinite: grey."""
 PALE = "0.88"
 """Colour of a shape on which only the arrows are coloured."""
 
@@ -61,41 +51,31 @@ def plot_surface(
 
     Parameters
     ----------
-    vertices
-        (N, 3) tensor or array.
-    faces
-        (F, 3) indices.
-    values
-        (N,); a triangle has the mean of its corners. Grey where not finite.
-    ax
-        Matplotlib axes; new ones by default.
-    title
-        Title above the axes.
+    vertices, faces, values
+        (N, 3), (F, 3) and (N,), tensors or arrays; a triangle has the mean of its corners. Grey where not finite.
+    ax, title, label
+        Matplotlib axes, new ones by default, the title above them, and the label of the colour bar, such as the unit.
     cmap
         matplotlib's name; by default "RdBu_r" around zero, "viridis" otherwise, which the colour-blind can read.
     symmetric
         Whether zero is in the middle of the colours; by default if the values have both signs. The colours span the
         values except the outer 1 % at either end, for which the bar has a pointed end.
-    limits
-        Least and greatest value of the colours instead.
-    levels
-        Values at which isolines are drawn.
+    limits, levels
+        Least and greatest value of the colours instead; values at which isolines are drawn.
     view
         Elevation and azimuth of the eye, degrees; several views are drawn below one another. A shape in the plane z = 0
         is seen from above.
-    label
-        Label of the colour bar, such as the unit.
 
     Returns the axes. Raises ValueError for values or faces that do not fit the vertices.
     """
-    ax = axes_of(ax)
-    points, corners = shape_of(vertices, faces)
-    numbers = values_of(values, points)
-    shades, extend = color_map(numbers, cmap, symmetric, limits)
+    ax = _axes(ax)
+    points, corners = shape = _shape(vertices, faces)
+    numbers = _values(values, points)
+    shades = _color_map(numbers, cmap, symmetric, limits)
     assert corners is not None
-    isolines = isolines_of(numbers, corners, levels) if len(levels) else None
-    paint(ax, points, corners, shades.to_rgba(numbers[corners].mean(axis=1)), view, isolines)
-    return finish(ax, title, shades, extend, label)
+    isolines = isolines_of(numbers, corners, levels)
+    paint(ax, shape, shades.to_rgba(numbers[corners].mean(axis=1)), view, isolines)
+    return _finish(ax, title, shades, label)
 
 
 def plot_points(
@@ -115,10 +95,8 @@ def plot_points(
 
     Parameters
     ----------
-    points
-        (N, 2) or (N, 3) tensor or array.
-    values
-        (N,).
+    points, values
+        (N, 2) or (N, 3), and (N,), tensors or arrays.
     size
         Area of a disk, in square points (1/72 inch); by default smaller the more there are.
     ax, title, cmap, symmetric, limits, view, label
@@ -126,13 +104,12 @@ def plot_points(
 
     Returns the axes. Raises ValueError for points of another dimension, or values that do not fit them.
     """
-    ax = axes_of(ax)
-    places = cloud_of(points)
-    numbers = values_of(values, places)
-    # The middle of "coolwarm" is not white.
-    shades, extend = color_map(numbers, cmap, symmetric, limits, "coolwarm")
-    paint(ax, places, None, shades.to_rgba(numbers), view, size=size)
-    return finish(ax, title, shades, extend, label)
+    ax = _axes(ax)
+    places = _cloud(points)
+    numbers = _values(values, places)
+    shades = _color_map(numbers, cmap, symmetric, limits, "coolwarm")  # its middle is not white
+    paint(ax, (places, None), shades.to_rgba(numbers), view, size=size)
+    return _finish(ax, title, shades, label)
 
 
 def plot_vectors(
@@ -156,10 +133,8 @@ def plot_vectors(
 
     Parameters
     ----------
-    vertices
-        (N, 3); also (N, 2) for a cloud.
-    faces
-        (F, 3), or None for a cloud.
+    vertices, faces
+        (N, 3) and (F, 3); (N, 2) or (N, 3) and None for a cloud.
     vectors
         (N, 3), or (N, 2) in the plane. Vectors that are zero or not finite are not drawn.
     values
@@ -171,19 +146,20 @@ def plot_vectors(
 
     Returns the axes. Raises ValueError for vectors, values or faces that do not fit the vertices.
     """
-    ax = axes_of(ax)
-    (places, corners), field = shape_of(vertices, faces), cloud_of(vectors, "vectors")
+    ax = _axes(ax)
+    shape, field = _shape(vertices, faces), _cloud(vectors, "vectors")
+    places, corners = shape
     if field.shape != places.shape:
         raise InputError(f"vectors: expected {places.shape}, one a point, got {field.shape}")
     lengths = np.linalg.norm(field, axis=1)
-    numbers = lengths if values is None else values_of(values, places)
-    shades, extend = color_map(numbers, cmap, symmetric, limits)
+    numbers = lengths if values is None else _values(values, places)
+    shades = _color_map(numbers, cmap, symmetric, limits)
     painted = numbers if corners is None else numbers[corners].mean(axis=1)  # by dot or triangle
     ground = plain(PALE, len(painted)) if values is None else shades.to_rgba(painted)
-    paint(ax, places, corners, ground, view)
+    paint(ax, shape, ground, view)
     inks = shades.to_rgba(lengths) if values is None else plain(INK, len(places))
-    draw_arrows(ax, places, corners, field, inks, view, count)
-    return finish(ax, title, shades, extend, label)
+    draw_arrows(ax, shape, field, inks, view, count)
+    return _finish(ax, title, shades, label)
 
 
 def plot_orders(
@@ -199,34 +175,32 @@ def plot_orders(
 
     Parameters
     ----------
-    vertices
-        (N, 3); also (N, 2) for a cloud.
-    faces
-        (F, 3), or None for a cloud. A triangle takes the lowest order of its corners.
+    vertices, faces
+        As for `plot_vectors`.
     order
-        (N,), 0 for a low-order row. Darker is higher.
+        (N,), 0 for a low-order row. Darker is higher. A triangle takes the lowest order of its corners.
     ax, title, view
         As for `plot_surface`.
 
     Returns the axes. Raises ValueError for orders or faces that do not fit the vertices.
     """
-    ax = axes_of(ax)
+    ax = _axes(ax)
     from matplotlib import colors
     from matplotlib.patches import Patch
 
     palette = colors.to_rgba_array(ORDER_COLORS)
     last = len(palette) - 1
-    places, corners = shape_of(vertices, faces)
-    reached = values_of(order, places).astype(int)
+    places, corners = shape = _shape(vertices, faces)
+    reached = _values(order, places).astype(int)
     shown = reached if corners is None else reached[corners].min(axis=1)  # by dot or triangle
-    paint(ax, places, corners, palette[shown.clip(0, last)], view)
+    paint(ax, shape, palette[shown.clip(0, last)], view)
     handles = []
     for p, count in reversed(list(enumerate(np.bincount(reached)))):
         if count:
             label = f"order {p}: {count:,}" if p else f"low order: {count:,}"
             handles.append(Patch(facecolor=palette[min(p, last)], edgecolor="0.6", label=label))
     ax.legend(handles=handles, loc="center left", bbox_to_anchor=(1.0, 0.5), frameon=False)
-    return finish(ax, title)
+    return _finish(ax, title)
 
 
 def plot_convergence(
@@ -244,32 +218,27 @@ def plot_convergence(
 
     Parameters
     ----------
-    sizes
-        Numbers of points N, ascending.
-    errors
-        Errors at these sizes, by method; zeros and NaN are left out.
+    sizes, errors
+        Numbers of points N, ascending, and the errors at these, by method; zeros and NaN are left out.
     dim
         d of the manifold. The measured order is the slope against h over the three finest sizes.
-    ax, title
-        As for `plot_surface`.
-    ylabel
-        Label of the vertical axis.
+    ax, title, ylabel
+        As for `plot_surface`, and the label of the vertical axis.
 
     Returns the axes. Raises ValueError if no error is positive, or if their number is not that of the sizes.
     """
-    ax = axes_of(ax)
+    ax = _axes(ax)
     orders = []
-    for i, (name, line) in enumerate(errors.items()):
+    for i, (key, line) in enumerate(errors.items()):
         n, error = np.asarray(sizes, dtype=float), np.asarray(line, dtype=float)
         if n.shape != error.shape:
-            expected = f"expected {len(n)}, one for a size"
-            raise InputError(f"errors[{name!r}]: {expected}, got {len(error)}")
+            raise InputError(f"errors[{key!r}]: expected {len(n)}, one for a size, got {len(line)}")
         good = np.isfinite(error) & (error > 0)
         n, error = n[good], error[good]
-        label = name
+        label = key
         if len(n) > 1:
             orders.append(-dim * np.polyfit(np.log(n[-3:]), np.log(error[-3:]), 1)[0])
-            label = f"{name}:  $h^{{{orders[-1]:.1f}}}$"
+            label = f"{key}:  $h^{{{orders[-1]:.1f}}}$"
         color, marker = LINE_COLORS[i % len(LINE_COLORS)], MARKERS[i % len(MARKERS)]
         ax.loglog(n, error, color=color, marker=marker, markersize=5, label=label)
     _references(ax, sizes, orders, dim)
@@ -299,3 +268,95 @@ def _references(ax: Any, sizes: Sequence[int], orders: list[float], dim: int) ->
         box = {"facecolor": ax.get_facecolor(), "edgecolor": "none", "pad": 1}
         ax.annotate(name, at, color="0.45", ha="center", va="center", bbox=box, zorder=0)
     ax.set_ylim(low, 1.2 * high)
+
+
+def _axes(ax: Any) -> Any:
+    """Return the given axes, or new ones of `matplotlib.pyplot`; ImportError without matplotlib."""
+    try:
+        import matplotlib as mpl  # noqa: F401
+    except ImportError as error:
+        raise ImportError('pictures need matplotlib: pip install ".[plot]" in a clone') from error
+    if ax is not None:
+        return ax
+    import matplotlib.pyplot as plt
+
+    return plt.subplots(figsize=(6.4, 4.8), layout="constrained")[1]
+
+
+def _numpy(values: Any) -> np.ndarray:
+    try:
+        return torch.as_tensor(values).detach().cpu().double().numpy()
+    except (TypeError, ValueError, RuntimeError) as error:
+        raise InputTypeError(
+            f"expected a tensor or array, got {shown(values)}; an operator has lb.points and lb.faces"
+        ) from error
+
+
+def _cloud(points: Any, name: str = "points") -> np.ndarray:
+    """Points as (N, 3), with z = 0 for points of the plane."""
+    places = _numpy(points)
+    if places.ndim != 2 or places.shape[1] not in (2, 3):
+        raise InputError(
+            f"{name}: expected (N, 2) or (N, 3), got {places.shape}; choose the coordinates to draw, "
+            "for example points[:, :3]"
+        )
+    return np.pad(places, ((0, 0), (0, 3 - places.shape[1])))
+
+
+def _shape(points: Any, faces: Any) -> Shape:
+    """Points in space and their triangles, checked."""
+    points = _cloud(points)
+    if faces is None:
+        return points, None
+    corners = check_corners(faces, len(points)).numpy()
+    if corners.shape[1] != 3:
+        raise InputError(f"faces: expected (F, 3), got {corners.shape}")
+    return points, corners
+
+
+def _values(values: Any, points: np.ndarray) -> np.ndarray:
+    """One number for each point, (N,); ValueError for another count."""
+    numbers = _numpy(values)
+    if numbers.shape != points.shape[:1]:
+        raise InputError(f"values: expected {points.shape[:1]}, one a point, got {numbers.shape}")
+    return numbers
+
+
+def _color_map(
+    values: np.ndarray,
+    cmap: str | None,
+    symmetric: bool | None,
+    limits: tuple[float, float] | None = None,
+    diverging: str = "RdBu_r",
+) -> Any:
+    """The map from values to colours; its bar is pointed at the ends at which values exceed its range."""
+    from matplotlib import cm, colormaps, colors
+
+    finite = values[np.isfinite(values)]
+    finite = finite if len(finite) else np.zeros(1)
+    low, high = np.percentile(finite, [1, 99])
+    symmetric = bool(low < 0 < high) if symmetric is None else symmetric
+    if symmetric:
+        high = max(abs(low), abs(high))
+        low = -high
+    if high <= low:
+        low, high = low - 1, high + 1
+    if limits is not None:
+        low, high = limits
+    slack = 0.02 * (high - low)  # point an end only where values are cut off
+    beyond = finite.min() < low - slack, finite.max() > high + slack
+    table = colormaps[cmap or (diverging if symmetric else "viridis")].with_extremes(bad=MISSING)
+    table.colorbar_extend = ("neither", "min", "max", "both")[beyond[0] + 2 * beyond[1]]
+    return cm.ScalarMappable(colors.Normalize(low, high), table)
+
+
+def _finish(ax: Any, title: str | None, shades: Any = None, label: str | None = None) -> Any:
+    """Give the axes equal aspect, no frame, a title and a colour bar, and return them."""
+    ax.autoscale_view()
+    ax.set_aspect("equal")
+    ax.set_axis_off()
+    if shades is not None:
+        ax.figure.colorbar(shades, ax=ax, shrink=0.6, pad=0.03, label=label or "")
+    if title:
+        ax.set_title(title)
+    return ax

@@ -133,10 +133,8 @@ class Surface:
 
     def _stratified(self, shares: Float[Tensor, "N 1"]) -> Points:
         """Points of a curve, by fractions of its length."""
-        from scipy.integrate import cumulative_trapezoid
-
         grid = torch.linspace(0, 1, 4097, dtype=torch.float64)[:, None]
-        length = cumulative_trapezoid(self._density(grid).numpy(), initial=0)
+        length = pad(torch.cumulative_trapezoid(self._density(grid)), (1, 0)).numpy()
         cube = np.interp(shares[:, 0].numpy() * length[-1], length, grid[:, 0].numpy())
         return self._chart(torch.from_numpy(cube)[:, None])
 

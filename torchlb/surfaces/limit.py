@@ -17,31 +17,16 @@ def limit_surface(
 
     The surface is that of a real shape, and smooth: twice continuously differentiable except at extraordinary vertices
     (valence not six), where it is C¹. All meshes are inscribed in the same surface, so that results on a coarse one can
-    be compared with those on a fine one.
+    be compared with those on a fine one. (Loop, *Smooth Subdivision Surfaces Based on Triangles*, 1987; limit positions
+    as in Hoppe et al., *Piecewise smooth surface reconstruction*, 1994.)
 
     Parameters
     ----------
-    vertices, faces
-        The control mesh; closed, two triangles at every edge.
-    levels
-        Number of subdivisions.
+    vertices, faces, levels
+        The control mesh, closed, two triangles at every edge, and the number of subdivisions.
 
-    Returns
-    -------
-    points
-        (P, 3), those of the finest level; those of every coarser level come first.
-    faces
-        Triangles of the levels 0 to `levels`; `points[: faces[i].max() + 1]` are the vertices of level i.
-
-    Raises
-    ------
-    InputError
-        For meshes that are not closed.
-
-    References
-    ----------
-    Loop, *Smooth Subdivision Surfaces Based on Triangles*, 1987; limit positions as in Hoppe et al., *Piecewise smooth
-    surface reconstruction*, 1994.
+    Returns the points of the finest level, (P, 3), and the triangles of the levels 0 to `levels`:
+    `points[: faces[i].max() + 1]` are the vertices of level i. Raises InputError for meshes that are not closed.
 
     Examples
     --------
@@ -65,15 +50,12 @@ def limit_surface(
     for _ in range(levels):
         points, triangles = trimesh.remesh.subdivide_loop(points, triangles)
         meshes.append(triangles)
-    return from_numpy(_limit(points, triangles)), [from_numpy(m.astype(np.int64)) for m in meshes]
-
-
-def _limit(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    """Limit positions of the vertices: (1 − nχ)v + χ Σ neighbours, n of them, χ = 1/(3/(8β) + n)."""
-    ends = faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2).T
-    half = sparse.csr_array((np.full(ends.shape[1], 0.5), ends), shape=(len(vertices),) * 2)
+    # limit positions of the vertices: (1 − nχ)v + χ Σ neighbours, n of them, χ = 1/(3/(8β) + n)
+    ends = triangles[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2).T
+    half = sparse.csr_array((np.full(ends.shape[1], 0.5), ends), shape=(len(points),) * 2)
     graph = half + half.T
     valence = graph.sum(1)
     beta = (5 / 8 - (3 / 8 + np.cos(2 * np.pi / valence) / 4) ** 2) / valence
     share = 1 / (3 / (8 * beta) + valence)
-    return (1 - valence * share)[:, None] * vertices + share[:, None] * (graph @ vertices)
+    points = (1 - valence * share)[:, None] * points + share[:, None] * (graph @ points)
+    return from_numpy(points), [from_numpy(mesh.astype(np.int64)) for mesh in meshes]
