@@ -25,7 +25,7 @@ from torchlb.cloud.manifold import face_vectors
 from torchlb.cloud.noise import SAMPLE, spacing_at
 from torchlb.cloud.surface import CloudSurface
 from torchlb.errors import first_few, warn
-from torchlb.geometry.boundary import boundary_faces
+from torchlb.geometry.boundary import open_sides
 from torchlb.geometry.compatibility import compatible_neighbors
 from torchlb.geometry.complex import Faces, edges_of
 from torchlb.geometry.fit_search import REASONS
@@ -79,7 +79,7 @@ def warn_of_joins(surface: CloudSurface) -> None:
 
 def on_rim(cells: Int[Tensor, "F corners"], count: int) -> Bool[Tensor, " N"]:
     """Points on the boundary of a complex."""
-    return torch.zeros(count, dtype=torch.bool).index_fill(0, boundary_faces(cells).flatten(), True)
+    return torch.zeros(count, dtype=torch.bool).index_fill(0, open_sides(cells)[0].flatten(), True)
 
 
 def warn_of_buried(cells: Int[Tensor, "F corners"], boundary: Bool[Tensor, " N"]) -> None:

@@ -96,9 +96,8 @@ class Edges:
         """(number of the edge between two points; number of its faces, 0 if there is no such edge)."""
         key = np.minimum(tail, head) * self.count + np.maximum(tail, head)
         place = np.searchsorted(self.keys, key)
-        place[place == len(self.keys)] = 0
-        there = self.keys[place] == key if len(self.keys) else np.zeros(key.shape, dtype=bool)
-        return place, np.where(there, self.uses[place] if len(self.uses) else 0, 0)
+        there = np.append(self.keys, -1)[place] == key
+        return place * there, np.append(self.uses, 0)[place] * there
 
 
 def _order(key: Int[np.ndarray, " K"], count: int) -> Int[np.ndarray, " K"]:
@@ -173,14 +172,12 @@ def seams(faces: Int[Tensor, "F v"], count: int) -> Bool[Tensor, " N"]:
     >>> seams(torch.tensor([[0, 1, 2], [0, 1, 3]]), 4).tolist()
     [True, True, False, False]
     """
-    found = torch.zeros(count, dtype=torch.bool)
     if faces.shape[1] == 2:
         return (torch.stack([torch.bincount(end, minlength=count) for end in faces.T]) > 1).any(0)
     tail, head = faces.flatten(), faces.roll(-1, 1).flatten()
     _, number, uses = torch.unique(tail * count + head, return_inverse=True, return_counts=True)
     again = uses[number] > 1  # a directed edge
-    found[tail[again]] = found[head[again]] = True
-    return found
+    return torch.isin(torch.arange(count), torch.stack([tail[again], head[again]]))
 
 
 def consistently_wound(faces: Int[Tensor, "F v"]) -> bool:

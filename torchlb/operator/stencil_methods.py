@@ -9,7 +9,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from torchlb.errors import InputError
-from torchlb.geometry.boundary import boundary_faces
+from torchlb.geometry.boundary import open_sides
 from torchlb.linalg.checks import check_tensor, takes_arrays
 from torchlb.linalg.csr import tensors_of
 from torchlb.operator.report import StencilReport
@@ -223,7 +223,7 @@ class StencilMethods(OperatorStorage):
         on_boundary = torch.zeros_like(self.mass, dtype=torch.bool)
         if self.boundary is not None:
             on_boundary |= self.boundary
-        sides = boundary_faces(self.faces.cpu()).flatten()
+        sides = open_sides(self.faces.cpu())[0].flatten()
         return on_boundary.index_fill(0, sides.to(on_boundary.device), True)
 
 
