@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property, reduce
+from operator import mul
 from typing import Any
 
 import numpy as np
@@ -173,40 +174,35 @@ class Candidates:
 
 
 def conormals(
-    points: Vectors,
-    tail: Int[np.ndarray, "*batch"],
-    head: Int[np.ndarray, "*batch"],
-    tip: Int[np.ndarray, "*batch"],
-) -> Float[np.ndarray, "*batch 3"]:
+    points: Float[np.ndarray, "N n"], tail: np.ndarray, head: np.ndarray, tip: np.ndarray
+) -> np.ndarray:
     """Unit vectors normal to the edges tail–head, towards the points `tip`."""
     start = points.take(tail, 0)
     along, out = unit(points.take(head, 0) - start), points.take(tip, 0) - start
     return unit(out - inner(out, along)[..., None] * along)
 
 
-def best_manifold(points: Vectors, faces: Faces) -> Faces:
+def best_manifold(points: Float[np.ndarray, "N n"], faces: Faces) -> Faces:
     """Greedy choice of triangles, best first, such that no edge has three faces or two that fold back.
 
     Only triangles at an edge where not all can stay are decided one by one.
     """
     edges = edges_of(faces, len(points))
     tail, head = (end.reshape(-1, 3) for end in edges.ends)
-    conormal = conormals(points, tail, head, faces).reshape(-1, 3)
+    conormal = conormals(points, tail, head, faces).reshape(-1, points.shape[1])
     one, two = edges.twins
     contested = edges.uses > 2
     contested[edges.of[one[inner(conormal[one], conormal[two]) > CREASE]]] = True
     rows = np.flatnonzero(contested[edges.of].reshape(-1, 3).any(1))
     taken, halves = np.ones(len(faces), dtype=bool), np.arange(3 * len(faces)).reshape(-1, 3)[rows]
-    parts = (*conormal.T, edges.of, contested[edges.of])
-    x, y, z, of, doubtful = (part[halves.ravel()].tolist() for part in parts)
+    parts = conormal, edges.of, contested[edges.of]
+    away, of, doubtful = (part[halves.ravel()].tolist() for part in parts)
     uses, first = [0] * len(edges.keys), [0] * len(edges.keys)
     for number, face in enumerate(rows.tolist()):
         mine = [half for half in range(3 * number, 3 * number + 3) if doubtful[half]]
         for a in mine:
             b = first[of[a]]
-            if uses[of[a]] > 1 or (
-                uses[of[a]] and x[a] * x[b] + y[a] * y[b] + z[a] * z[b] > CREASE
-            ):
+            if uses[of[a]] > 1 or (uses[of[a]] and sum(map(mul, away[a], away[b])) > CREASE):
                 taken[face] = False
                 break
         else:

@@ -127,26 +127,25 @@ def warn_of_near_duplicates(points: Points, neighbors: Near, dim: int) -> None:
 
 def warn_of_layers(points: Float[Tensor, "N 3"]) -> None:
     """Warn if much of a cloud lies in two layers so close that they may be taken for one noisy sheet."""
-    layered, looked_at = in_two_layers(points.numpy())
-    if len(layered) > LOW * looked_at:  # 0.4 and more on plates, 0.001 on noisy shapes
+    layered, share = _in_two_layers(points.numpy())
+    if share > LOW:  # 0.4 and more on plates, 0.001 on noisy shapes
         warn(
-            f"points: around {len(layered) / looked_at:.0%} of them ({first_few(torch.from_numpy(layered))}) they lie "
+            f"points: around {share:.0%} of them ({first_few(torch.from_numpy(layered))}) they lie "
             "in two layers about a spacing apart or closer, as on a thin plate sampled on both sides; the surface may "
             "be one sheet there, with half of the area. Add points until they are closer than it is thick, keep one "
             "side alone, or give the mesh if there is one"
         )
 
 
-def in_two_layers(points: Vectors) -> tuple[Int[np.ndarray, " M"], int]:
-    """Return those of a sample of points around which the cloud has two layers, and the size of the sample.
+def _in_two_layers(points: Vectors) -> tuple[Int[np.ndarray, " M"], float]:
+    """(those of a sample of points around which there are two layers, a spacing apart or closer; their share).
 
-    The layers are a spacing apart or closer. A local quadratic is fitted around each point of the sample. Residuals of
-    one noisy layer have one peak, those of two layers have two with few points between, which their kurtosis tells.
-    Clouds of fewer than 2 `PATCH` points are not tested.
+    Residuals of a local quadratic have one peak for one noisy layer. For two layers they have two peaks with few points
+    between, which their kurtosis tells. Clouds of fewer than 2 `PATCH` points are not tested.
     """
     some = np.arange(0, len(points), -(-len(points) // SAMPLE))
     if len(points) < 2 * PATCH:
-        return some[:0], len(some)
+        return some[:0], 0.0
     distance, index = (np.asarray(part) for part in KDTree(points).query(points[some], k=PATCH))
     offset = points[index] - points[index].mean(1, keepdims=True)
     axes = np.linalg.eigh(offset.transpose(0, 2, 1) @ offset)[1]
@@ -155,12 +154,11 @@ def in_two_layers(points: Vectors) -> tuple[Int[np.ndarray, " M"], int]:
     height -= (basis @ (basis.transpose(0, 2, 1) @ height[..., None]))[..., 0]
     square = np.square(height).mean(1)
     layered = (height**4).mean(1) < UNIMODAL * square**2
-    return some[layered & (square > LOW**2 * np.pi / PATCH)], len(some)
+    layered &= square > LOW**2 * np.pi / PATCH
+    return some[layered], float(layered.mean())
 
 
-def _surrounded(
-    points: Float[Tensor, "N 3"], normals: Float[Tensor, "N 3"], near: Int[Tensor, "B K"]
-) -> Bool[np.ndarray, " B"]:
+def _surrounded(points: Points, normals: Points, near: Int[Tensor, "B K"]) -> np.ndarray:
     """Whether the first point of each row is surrounded by its own sheet: no gap of 120° in the tangent plane."""
     good = compatible_neighbors(points, normals, near)[:, 1:]
     good &= good.cumsum(1) <= NEAREST
@@ -194,11 +192,10 @@ def in_doubt(surface: CloudSurface, faces: Faces) -> Bool[np.ndarray, " F"]:
     if steep.any():
         amid, ends = np.zeros(count, dtype=bool), np.unique([i[steep], j[steep]])
         amid[ends] = _surrounded(surface.points, surface.normals, surface.neighbors[ends])
-        across = (steep_i & amid[i]) | (steep_j & amid[j])
-        close = np.zeros(count, dtype=bool)
-        close[i[across]] = close[j[across]] = True
-        beside = close[i] | close[j]
-        close[i[beside]] = close[j[beside]] = True
+        beside = (steep_i & amid[i]) | (steep_j & amid[j])
+        for _ in range(2):
+            close = np.isin(np.arange(count), [i[beside], j[beside]])
+            beside = close[i] | close[j]
         found |= steep & close[i] & close[j]
     return np.asarray(found[edges.of].reshape(-1, 3).any(1))
 
@@ -212,10 +209,10 @@ def spectral_change(surface: CloudSurface) -> tuple[float, Mask]:
     points, parts = surface.points.numpy(), (surface.cells.numpy(), surface.stars.numpy())
     faces = np.concatenate(parts)
     weight = np.array([1.0, 1 / 3]).repeat([len(part) for part in parts])
-    doubtful, marked = in_doubt(surface, faces), np.zeros(len(points), dtype=bool)
+    doubtful = in_doubt(surface, faces)
+    marked = np.isin(np.arange(len(points)), faces[doubtful])
     if not doubtful.any():
         return 0.0, marked
-    marked[faces[doubtful]] = True
     stiffness, mass = _elements(points, faces, weight)
     sound, _ = _elements(points, faces, np.where(doubtful, SMALL, 1.0) * weight)
     used = mass > 0  # points in no face have none

@@ -65,12 +65,12 @@ def _principal_directions(
 
 
 def refined_normals(
-    points: Float[Tensor, "N 3"],
-    normals: Float[Tensor, "N 3"],
+    points: Points,
+    normals: Points,
     candidates: Near,
-    centers: Int[Tensor, " B"] | None = None,
+    centers: Tensor | None = None,
     rounds: int = 1,
-) -> Float[Tensor, "N 3"]:
+) -> Points:
     """Unit normals, at `centers` from quadratics through compatible candidates, with error O(h²); not oriented.
 
     The quadratics need not pass through the point itself, which lessens the effect of noise on the slope.
@@ -124,9 +124,9 @@ def nearest_pairs(candidates: Near) -> tuple[Int[Tensor, " P"], Int[Tensor, " P"
     i = torch.arange(num_points).repeat_interleave(size - 1)
     j = candidates[:, 1:].reshape(-1)
     code = (torch.minimum(i, j) * num_points + torch.maximum(i, j)).numpy()
-    code.sort()  # takes a quarter of the time of `torch.unique`
-    code = torch.from_numpy(code[np.flatnonzero(np.diff(code, prepend=-1))])
-    low, high = code // num_points, code % num_points
+    code.sort()  # takes a tenth of the time of `np.unique`, which hashes
+    code = code[np.flatnonzero(np.diff(code, prepend=-1))]
+    low, high = map(torch.from_numpy, np.divmod(code, num_points))
     return low[low != high], high[low != high]
 
 

@@ -74,8 +74,7 @@ def lone_points(points: Vectors, near: Int[np.ndarray, "N K"]) -> Mask:
     spread along the edge. At a jump in density half a disc of twice the spacing holds twelve other points of a like
     spacing. Of many outliers some lie in one plane by chance, but most of their like are lone, too.
     """
-    lone = np.zeros(len(points), dtype=bool)
-    spacing = spacing_at(points, near)
+    lone, spacing = np.zeros(len(points), dtype=bool), spacing_at(points, near)
     usual = np.partition(spacing[near[:, 1:]], near.shape[1] // 4, axis=1)[:, near.shape[1] // 4]
     apart = spacing > LONE * usual
     far = np.flatnonzero(apart)

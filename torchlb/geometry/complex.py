@@ -16,12 +16,12 @@ from scipy.sparse import csgraph
 from scipy.spatial import Delaunay
 from torch import Tensor
 
-from torchlb.geometry.vectors import Mask, Vectors, inner
+from torchlb.geometry.vectors import Coords, Mask, Vectors, inner
 
 Faces = Int[np.ndarray, "_ 3"]
 
 
-def delaunay(points: Float[np.ndarray, "N n"]) -> Delaunay:
+def delaunay(points: Coords) -> Delaunay:
     """Delaunay simplices by Qhull, of centred points of size about one, since its tolerances are lengths."""
     centered = points - points.mean(0)
     return Delaunay(np.ldexp(centered, -np.frexp(np.abs(centered).max())[1]))
@@ -84,11 +84,8 @@ class Edges:
     @cached_property
     def outer(self) -> Mask:
         """Points on the boundary or in no face."""
-        result = np.ones(self.count, dtype=bool)
-        result[self.faces.ravel()] = False
-        for end in self.ends:
-            result[end[self.boundary]] = True
-        return result
+        every, rim = np.arange(self.count), [end[self.boundary] for end in self.ends]
+        return np.isin(every, rim) | ~np.isin(every, self.faces)
 
     def find(
         self, tail: np.ndarray, head: np.ndarray
