@@ -60,7 +60,12 @@ def cloud_curve(
             f"points: {len(alone)} ({first_few(alone)}) are farther from all others than points of a "
             "curve are apart, and no segment reaches them; leave them out, or add points between"
         )
-    _warn(places, index, chains, spacing, noise, gaps)
+    _warn(places, index, chains, spacing, gaps)
+    if noise:
+        warn(
+            f"points: they lie beside the curve by {noise:.2g} (root mean square), and are moved onto a smooth one for "
+            "all that is computed; give the segments to from_mesh if they lie on it"
+        )
     cells = [np.stack([chain[:-1], chain[1:]], 1) for chain in chains]
     if points.shape[1] == 2:
         given = normals.numpy() if oriented and normals is not None else None
@@ -201,14 +206,9 @@ def _facing_out(
 
 
 def _warn(
-    points: Coords,
-    near: Nearest,
-    chains: list[np.ndarray],
-    spacing: Float[np.ndarray, " N"],
-    noise: float,
-    gaps: list[int],
+    points: Coords, near: Nearest, chains: list[np.ndarray], spacing: np.ndarray, gaps: list[int]
 ) -> None:
-    """Warn where parts of the curve are close, or gaps are hardly longer than segments; and of noise."""
+    """Warn where parts of the curve are close, or gaps are hardly longer than segments."""
     number, place, size = np.zeros((3, len(points)))
     for k, chain in enumerate(chains):
         way = np.append(0, np.cumsum(lengths(np.diff(points[chain], axis=0))))
@@ -234,9 +234,4 @@ def _warn(
         warn(
             f"points: the curve ends at gaps hardly longer than those between its points, near {where(at_gap)}; add "
             "points where it goes on, or give the segments to from_mesh"
-        )
-    if noise:
-        warn(
-            f"points: they lie beside the curve by {noise:.2g} (root mean square), and are moved onto a smooth one for "
-            "all that is computed; give the segments to from_mesh if they lie on it"
         )

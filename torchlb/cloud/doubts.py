@@ -126,28 +126,17 @@ def warn_of_near_duplicates(points: Points, neighbors: Near, dim: int) -> None:
 
 
 def warn_of_layers(points: Float[Tensor, "N 3"]) -> None:
-    """Warn if much of a cloud lies in two layers so close that they may be taken for one noisy sheet."""
-    layered, share = _in_two_layers(points.numpy())
-    if share > LOW:  # 0.4 and more on plates, 0.001 on noisy shapes
-        warn(
-            f"points: around {share:.0%} of them ({first_few(torch.from_numpy(layered))}) they lie "
-            "in two layers about a spacing apart or closer, as on a thin plate sampled on both sides; the surface may "
-            "be one sheet there, with half of the area. Add points until they are closer than it is thick, keep one "
-            "side alone, or give the mesh if there is one"
-        )
+    """Warn if much of a cloud lies in two layers, a spacing apart or closer, that may be taken for one noisy sheet.
 
-
-def _in_two_layers(points: Vectors) -> tuple[Int[np.ndarray, " M"], float]:
-    """(those of a sample of points around which there are two layers, a spacing apart or closer; their share).
-
-    Residuals of a local quadratic have one peak for one noisy layer. For two layers they have two peaks with few points
-    between, which their kurtosis tells. Clouds of fewer than 2 `PATCH` points are not tested.
+    A local quadratic is fitted around each of a sample of points. Residuals of one noisy layer have one peak, those of
+    two layers have two with few points between, which their kurtosis tells. Clouds of fewer than 2 `PATCH` points are
+    not tested.
     """
-    some = np.arange(0, len(points), -(-len(points) // SAMPLE))
+    some, places = np.arange(0, len(points), -(-len(points) // SAMPLE)), points.numpy()
     if len(points) < 2 * PATCH:
-        return some[:0], 0.0
-    distance, index = (np.asarray(part) for part in KDTree(points).query(points[some], k=PATCH))
-    offset = points[index] - points[index].mean(1, keepdims=True)
+        return
+    distance, index = (np.asarray(part) for part in KDTree(places).query(places[some], k=PATCH))
+    offset = places[index] - places[index].mean(1, keepdims=True)
     axes = np.linalg.eigh(offset.transpose(0, 2, 1) @ offset)[1]
     height, v, u = np.moveaxis(offset @ axes / distance[:, -1:, None], -1, 0)
     basis = np.linalg.qr(np.stack([np.ones_like(u), u, v, u * u, u * v, v * v], -1))[0]
@@ -155,7 +144,13 @@ def _in_two_layers(points: Vectors) -> tuple[Int[np.ndarray, " M"], float]:
     square = np.square(height).mean(1)
     layered = (height**4).mean(1) < UNIMODAL * square**2
     layered &= square > LOW**2 * np.pi / PATCH
-    return some[layered], float(layered.mean())
+    if layered.mean() > LOW:  # 0.4 and more on plates, 0.001 on noisy shapes
+        warn(
+            f"points: around {layered.mean():.0%} of them ({first_few(torch.from_numpy(some[layered]))}) they lie "
+            "in two layers about a spacing apart or closer, as on a thin plate sampled on both sides; the surface may "
+            "be one sheet there, with half of the area. Add points until they are closer than it is thick, keep one "
+            "side alone, or give the mesh if there is one"
+        )
 
 
 def _surrounded(points: Points, normals: Points, near: Int[Tensor, "B K"]) -> np.ndarray:
@@ -192,10 +187,10 @@ def in_doubt(surface: CloudSurface, faces: Faces) -> Bool[np.ndarray, " F"]:
     if steep.any():
         amid, ends = np.zeros(count, dtype=bool), np.unique([i[steep], j[steep]])
         amid[ends] = _surrounded(surface.points, surface.normals, surface.neighbors[ends])
-        beside = (steep_i & amid[i]) | (steep_j & amid[j])
-        for _ in range(2):
-            close = np.isin(np.arange(count), [i[beside], j[beside]])
-            beside = close[i] | close[j]
+        across = (steep_i & amid[i]) | (steep_j & amid[j])
+        close = np.isin(np.arange(count), [i[across], j[across]])
+        beside = close[i] | close[j]
+        close = np.isin(np.arange(count), [i[beside], j[beside]])
         found |= steep & close[i] & close[j]
     return np.asarray(found[edges.of].reshape(-1, 3).any(1))
 

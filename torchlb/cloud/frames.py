@@ -33,10 +33,8 @@ def cloud_frames(points: Points, candidates: Near, dim: int, rounds: int = 3) ->
     Each further round takes the nearest candidates that are compatible by the frames before, so that the other side of
     a thin sheet drops out. The error is O(h) on a smooth surface.
     """
-    planes = None
-    frames = torch.empty(0)
+    planes, frames, parts = None, torch.empty(0), candidates.split(AT_ONCE)
     for _ in range(rounds):
-        parts = candidates.split(AT_ONCE)
         frames = torch.cat([_principal_directions(points, part, planes, dim) for part in parts])
         planes = planes_of(frames)
     return frames
@@ -181,9 +179,7 @@ def mended_normals(
         return normals, torch.zeros(len(points), dtype=torch.bool)
     sign, root = _carried(points, normals, candidates)
 
-    def contradicted(
-        told: Float[Tensor, " P"], side: Float[Tensor, " N"], group: Int[Tensor, " N"]
-    ) -> Float[Tensor, " N"]:
+    def contradicted(told: Tensor, side: Tensor, group: Tensor) -> Tensor:
         """Share of contradicting pairs at the points of each group."""
         wrong = told * (cosine * side[i] * side[j] < 0)
         total = torch.zeros(2, len(points), dtype=points.dtype)

@@ -95,8 +95,7 @@ def overlapping(cloud: Cloud, new: Faces, faces: Faces, corners: int = 3) -> Boo
     for k in range(corners):
         ours = _wedges(cloud, new, np.full(len(new), k))
         i, j = _matches(new[:, k], faces[rows, places], len(cloud.points))
-        a, b = (np.stack([x[i] for x in ours], 1), np.stack([x[j] for x in theirs], 1))
-        result[i[_meet(a, b) | _meet(b, a)]] = True
+        result[i[_meet(ours[i], theirs[j]) | _meet(theirs[j], ours[i])]] = True
     return result
 
 
@@ -109,9 +108,7 @@ def _matches(wanted: Int[np.ndarray, " W"], found: Int[np.ndarray, " F"], count:
     return i, order[np.arange(len(i)) + first[i]]
 
 
-def _wedges(
-    cloud: Cloud, faces: Faces, corner: Int[np.ndarray, " T"]
-) -> tuple[Float[np.ndarray, "T 3"], ...]:
+def _wedges(cloud: Cloud, faces: Faces, corner: np.ndarray) -> Float[np.ndarray, "T 4 3"]:
     """(two sides of a face at a corner, their bisector, the normal of the turn): unit, the first three tangential."""
     rows = np.arange(len(faces))
     apex = faces[rows, corner]
@@ -121,13 +118,12 @@ def _wedges(
         side = cloud.points[faces[rows, (corner + turn) % 3]] - cloud.points[apex]
         sides.append(unit(side - inner(side, normal)[:, None] * normal))
     turn = np.sign(inner(np.cross(*sides), normal))[:, None] * normal
-    return *sides, unit(sides[0] + sides[1]), turn
+    return np.stack([*sides, unit(sides[0] + sides[1]), turn], 1)
 
 
 def _meet(one: Float[np.ndarray, "P 4 3"], two: Float[np.ndarray, "P 4 3"]) -> np.ndarray:
     """Whether a side or the bisector of wedge one lies inside wedge two."""
-    first, second, turn = two[:, None, 0], two[:, None, 1], two[:, None, 3]
-    rays = one[:, :3]
+    rays, (first, second, _, turn) = one[:, :3], two[:, :, None].swapaxes(0, 1)
     after = inner(np.cross(first, rays), turn) > SLIGHT
     before = inner(np.cross(rays, second), turn) > SLIGHT
     return np.any(after & before, axis=1)
@@ -140,8 +136,7 @@ def closed(cloud: Cloud, faces: Faces, kept: Mask) -> tuple[Faces, int]:
     on the declared boundary, or one is in `kept`.
     """
     count = len(cloud.points)
-    edges = edges_of(faces, count)
-    known, new = set(edges.keys.tolist()), [faces]
+    known, new = set(edges_of(faces, count).keys.tolist()), [faces]
 
     def cost(turn: Faces) -> Float[np.ndarray, " T"]:
         radius, normal = cloud.circles(turn)

@@ -152,9 +152,8 @@ def corrected_normals(points: Points, normals: Points, candidates: Near, poles: 
         seen = at(where, poles.point).nonzero()[:, 0]
         point = poles.point[seen]
         along = dot(poles.ray[seen], at(normals, point)).abs()
-        most = torch.full_like(length, torch.inf).scatter_reduce(
-            0, point, along, "amax", include_self=False
-        )
+        most = torch.full_like(length, torch.inf)
+        most.scatter_reduce_(0, point, along, "amax", include_self=False)
         return torch.where((most * LONG < length)[:, None], longest, normals)
 
     where = torch.ones(len(points), dtype=torch.bool)

@@ -169,12 +169,12 @@ def _start(
         reach = _reaches(points.numpy(), near)
         return Cloud(points.numpy(), normals.numpy(), near, reach, on_boundary)
 
-    planar, normals = _planar_triangles(points.numpy()), given
-    if planar is not None:
-        faces, normal = planar
-        up = torch.from_numpy(normal if normal[2] >= 0 else -normal).expand_as(points)
+    normals, centered = given, (points - points.mean(0)).numpy()
+    _, spread, axes = np.linalg.svd(centered, full_matrices=False)
+    if spread[2] <= NEGLIGIBLE * spread[0]:
+        up = torch.from_numpy(axes[2] if axes[2, 2] >= 0 else -axes[2]).expand_as(points)
         cloud = cloud_of(points, up if given is None else given)
-        small = cloud.small(faces)
+        small = cloud.small(delaunay(centered @ axes[:2].T).simplices.astype(np.int64))
         every = np.ones(len(small), dtype=bool)
         found = Candidates(small, small, every, every, up.numpy())
         return cloud, found, True, frames, 0.0, lone
@@ -291,17 +291,8 @@ def _realigned(cloud: Cloud, faces: Faces) -> Cloud:
     of_faces = _of_faces(cloud, faces)
     cosine = (cloud.normals * of_faces).sum(1)
     misaligned = (np.abs(cosine) < LEVEL) & of_faces.any(1)
-    realigned = of_faces * np.where(cosine < 0, -1.0, 1.0)[:, None]
-    return replace(cloud, normals=np.where(misaligned[:, None], realigned, cloud.normals))
-
-
-def _planar_triangles(points: Vectors) -> tuple[Faces, Float[np.ndarray, " 3"]] | None:
-    """Delaunay triangles and normal of a planar cloud; None if it is not planar."""
-    centered = points - points.mean(0)
-    _, spread, axes = np.linalg.svd(centered, full_matrices=False)
-    if spread[2] > NEGLIGIBLE * spread[0]:
-        return None
-    return delaunay(centered @ axes[:2].T).simplices.astype(np.int64), axes[2]
+    realigned = replace(cloud, normals=np.where(misaligned[:, None], of_faces, cloud.normals))
+    return _along(realigned, cloud.normals)
 
 
 def _contacts(cloud: Cloud, faces: Faces) -> Mask:

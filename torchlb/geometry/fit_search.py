@@ -181,10 +181,7 @@ class FitSearch:
 
 
 def _block(
-    degree: int,
-    vertices: Int[Tensor, " b"],
-    points: Int[Tensor, "b K"],
-    keep: Bool[Tensor, "b neighbors"] | None = None,
+    degree: int, vertices: Tensor, points: Tensor, keep: Tensor | None = None
 ) -> Neighborhoods:
     """Neighbourhoods with no flag set; without `keep` all points count."""
     keep = torch.ones_like(points[:, 1:], dtype=torch.bool) if keep is None else keep

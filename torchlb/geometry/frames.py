@@ -115,10 +115,7 @@ def local_offsets(
 
 
 def local_heights(
-    points: Points,
-    frames: Frames,
-    index: Int[Tensor, "B K"],
-    coords: Float[Tensor, "B neighbors d"],
+    points: Points, frames: Frames, index: Int[Tensor, "B K"], coords: Tensor
 ) -> Float[Tensor, "B neighbors n"]:
     """Heights e − E_i y of the neighbours over their coordinates y in the centre's tangent plane, as vectors in Rⁿ."""
     offset = at(points, index[:, 1:]) - at(points, index[:, 0])[:, None]
