@@ -16,7 +16,7 @@ from torchlb.galerkin.boundary import boundary_curves_plan, lagrange
 from torchlb.galerkin.elements import lattice, simplex
 from torchlb.galerkin.flips import flipped
 from torchlb.galerkin.pair import mesh_pair
-from torchlb.geometry.boundary import boundary_faces
+from torchlb.geometry.boundary import open_sides
 from torchlb.geometry.fit_search import FitSearch
 from torchlb.geometry.frames import complete_frames, vertex_normals
 from torchlb.geometry.neighbors import GraphNeighborhoods, mesh_graph
@@ -419,4 +419,4 @@ def test_flips_end(monkeypatch):
     monkeypatch.setattr(flips, "_flips", lambda *a: rounds.append(a) or one_round(*a))
     after = flipped(vertices, faces)
     assert 1 < len(rounds) < 10
-    assert len(boundary_faces(after)) == len(boundary_faces(faces))
+    assert len(open_sides(after)[0]) == len(open_sides(faces)[0])

@@ -7,8 +7,10 @@ cone around the normal (Amenta, Choi, Dey and Leekha 2000).
 
 from __future__ import annotations
 
+from collections import defaultdict
 from dataclasses import dataclass
 from functools import cached_property, reduce
+from operator import mul
 from typing import Any
 
 import numpy as np
@@ -173,43 +175,33 @@ class Candidates:
 
 
 def conormals(
-    points: Vectors,
-    tail: Int[np.ndarray, "*batch"],
-    head: Int[np.ndarray, "*batch"],
-    tip: Int[np.ndarray, "*batch"],
-) -> Float[np.ndarray, "*batch 3"]:
+    points: Float[np.ndarray, "N n"], tail: np.ndarray, head: np.ndarray, tip: np.ndarray
+) -> np.ndarray:
     """Unit vectors normal to the edges tail–head, towards the points `tip`."""
     start = points.take(tail, 0)
     along, out = unit(points.take(head, 0) - start), points.take(tip, 0) - start
     return unit(out - inner(out, along)[..., None] * along)
 
 
-def best_manifold(points: Vectors, faces: Faces) -> Faces:
+def best_manifold(points: Float[np.ndarray, "N n"], faces: Faces) -> Faces:
     """Greedy choice of triangles, best first, such that no edge has three faces or two that fold back.
 
     Only triangles at an edge where not all can stay are decided one by one.
     """
     edges = edges_of(faces, len(points))
-    tail, head = (end.reshape(-1, 3) for end in edges.ends)
-    conormal = conormals(points, tail, head, faces).reshape(-1, 3)
-    one, two = edges.twins
+    tail, head, of = (part.reshape(-1, 3) for part in (*edges.ends, edges.of))
+    conormal = conormals(points, tail, head, faces)
+    one, two = (conormal.reshape(-1, points.shape[1]).take(twin, 0) for twin in edges.twins)
     contested = edges.uses > 2
-    contested[edges.of[one[inner(conormal[one], conormal[two]) > CREASE]]] = True
-    rows = np.flatnonzero(contested[edges.of].reshape(-1, 3).any(1))
-    taken, halves = np.ones(len(faces), dtype=bool), np.arange(3 * len(faces)).reshape(-1, 3)[rows]
-    parts = (*conormal.T, edges.of, contested[edges.of])
-    x, y, z, of, doubtful = (part[halves.ravel()].tolist() for part in parts)
-    uses, first = [0] * len(edges.keys), [0] * len(edges.keys)
-    for number, face in enumerate(rows.tolist()):
-        mine = [half for half in range(3 * number, 3 * number + 3) if doubtful[half]]
-        for a in mine:
-            b = first[of[a]]
-            if uses[of[a]] > 1 or (
-                uses[of[a]] and x[a] * x[b] + y[a] * y[b] + z[a] * z[b] > CREASE
-            ):
-                taken[face] = False
-                break
-        else:
-            for a in mine:
-                uses[of[a]], first[of[a]] = uses[of[a]] + 1, a
+    contested[edges.of[edges.twins[0][inner(one, two) > CREASE]]] = True
+    rows, taken = np.flatnonzero(contested[of].any(1)), np.ones(len(faces), dtype=bool)
+    beside: dict[int, list[list[float]]] = defaultdict(list)  # conormals of taken faces, by edge
+    parts = (part[rows].tolist() for part in (conormal, of, contested[of]))
+    for face, *sides in zip(rows.tolist(), *parts, strict=True):
+        mine = [(out, edge) for out, edge, doubtful in zip(*sides, strict=True) if doubtful]
+        full = any(len(beside[edge]) > 1 for _, edge in mine)
+        pairs = [(out, other) for out, edge in mine for other in beside[edge]]
+        taken[face] = not full and all(sum(map(mul, *pair)) <= CREASE for pair in pairs)
+        for out, edge in mine if taken[face] else ():
+            beside[edge].append(out)
     return faces[taken]

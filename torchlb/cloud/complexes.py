@@ -9,7 +9,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from torchlb.geometry.complex import components
-from torchlb.geometry.vectors import Mask, lengths
+from torchlb.geometry.vectors import Coords, Mask, Nearest, lengths
 from torchlb.linalg.precision import LOW
 
 Places = tuple[tuple[float, ...], ...]
@@ -41,9 +41,7 @@ def in_words(places: Places) -> str:
     return ", ".join(f"({', '.join(f'{x:g}' for x in place)})" for place in places)
 
 
-def places_of(
-    points: Float[np.ndarray, "N n"], near: Int[np.ndarray, "N K"], marked: Mask
-) -> Places:
+def places_of(points: Coords, near: Nearest, marked: Mask) -> Places:
     """Centres of the largest groups of marked points, at most `PLACES` of them, ℓ."""
     i, j = np.arange(len(points)).repeat(near.shape[1] - 1), near[:, 1:].ravel()
     both = marked[i] & marked[j]

@@ -7,8 +7,6 @@ segments. A segment longer than the gaps between random points is left out, and 
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
-
 import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
@@ -17,11 +15,12 @@ from torch import Tensor
 
 from torchlb.cloud.complexes import Complex, in_words, places_of
 from torchlb.cloud.frames import cloud_frames, settled_normals
+from torchlb.cloud.manifold import in_turn
 from torchlb.cloud.noise import denoised
 from torchlb.errors import InputError, first_few, warn
 from torchlb.geometry.neighbors import nearest_neighbors
 from torchlb.geometry.thresholds import CREASE, FACTOR, HALF_CREASE, OBTUSE, RING, ROUGH, WIDER
-from torchlb.geometry.vectors import Mask, Points, inner, lengths
+from torchlb.geometry.vectors import Coords, Mask, Nearest, Points, inner, lengths
 from torchlb.linalg.precision import TINY
 
 NEAR = 2 * RING
@@ -53,41 +52,29 @@ def cloud_curve(
     tangents = cloud_frames(points, near, 1)[..., 0].numpy() if noise else None
     places, index = points.numpy(), near.numpy()
     links = _joined(places, _links(places, index, single, noise, tangents), single, noise)
-    chains, gaps = _cut(places, _in_turn(_with_passed_by(places, index, links)), noise)
-    alone = [int(chain.points[0]) for chain in chains if len(chain.points) == 1]
-    if alone:
+    links = _with_passed_by(places, index, links)
+    chains, spacing, gaps = _cut(places, in_turn(links), noise)
+    alone = torch.tensor([chain[0] for chain in chains if len(chain) == 1])
+    if len(alone):
         raise InputError(
-            f"points: {len(alone)} ({first_few(torch.tensor(alone))}) are farther from all others than points of a "
+            f"points: {len(alone)} ({first_few(alone)}) are farther from all others than points of a "
             "curve are apart, and no segment reaches them; leave them out, or add points between"
         )
-    _warn(places, index, chains, noise, gaps)
-    cells = [chain.segments for chain in chains]
+    _warn(places, index, chains, spacing, gaps)
+    if noise:
+        warn(
+            f"points: they lie beside the curve by {noise:.2g} (root mean square), and are moved onto a smooth one for "
+            "all that is computed; give the segments to from_mesh if they lie on it"
+        )
+    cells = [np.stack([chain[:-1], chain[1:]], 1) for chain in chains]
     if points.shape[1] == 2:
         given = normals.numpy() if oriented and normals is not None else None
-        cells = [_facing_out(places, chain, given) for chain in chains]
+        cells = [_facing_out(places, segments, given) for segments in cells]
     return Complex(points=points, cells=torch.from_numpy(np.concatenate(cells)))
 
 
-class Chain(NamedTuple):
-    """Points in order, the first after the last again if closed; and the mean spacing around each, ℓ."""
-
-    points: Int[np.ndarray, " M"]
-    closed: bool
-    spacing: Float[np.ndarray, " M"]
-
-    @property
-    def segments(self) -> Int[np.ndarray, "S 2"]:
-        """End points of the segments."""
-        pairs = np.stack([self.points, np.roll(self.points, -1)], 1)
-        return pairs if self.closed else pairs[:-1]
-
-
 def _links(
-    points: Float[np.ndarray, "N n"],
-    near: Int[np.ndarray, "N K"],
-    single: Mask,
-    noise: float,
-    tangents: Float[np.ndarray, "N n"] | None,
+    points: Coords, near: Nearest, single: Mask, noise: float, tangents: Coords | None
 ) -> Links:
     """(N, 2) points beside each, −1 for none, where both ends agree; at most one for those that are `single`.
 
@@ -120,7 +107,7 @@ def _links(
     return links
 
 
-def _joined(points: Float[np.ndarray, "N n"], links: Links, single: Mask, noise: float) -> Links:
+def _joined(points: Coords, links: Links, single: Mask, noise: float) -> Links:
     """Join loose ends by the shortest segments that do not turn back, but for noise."""
     free = np.where(single, 1, 2) - (links >= 0).sum(1)
     loose = np.flatnonzero(free > 0)
@@ -132,12 +119,13 @@ def _joined(points: Float[np.ndarray, "N n"], links: Links, single: Mask, noise:
     i, j = i[i < j], j[i < j]
     order = np.argsort(lengths(points[i] - points[j]), kind="stable")
 
-    def open_to(here: int, there: int) -> Any:
+    def open_to(here: int, there: int) -> bool:
         other = links[here].max()
         if other < 0 or free[here] == 0:
-            return free[here]
+            return bool(free[here])
         back, onward = points[[other, there]] - points[here]
-        return back @ onward <= 0 or min(back @ back, onward @ onward) < (FACTOR * noise) ** 2
+        short = min(back @ back, onward @ onward) < (FACTOR * noise) ** 2
+        return bool(short or back @ onward <= 0)
 
     for one, two in zip(i[order].tolist(), j[order].tolist(), strict=True):
         if two not in links[one] and open_to(one, two) and open_to(two, one):
@@ -147,9 +135,7 @@ def _joined(points: Float[np.ndarray, "N n"], links: Links, single: Mask, noise:
     return links
 
 
-def _with_passed_by(
-    points: Float[np.ndarray, "N n"], near: Int[np.ndarray, "N K"], links: Links
-) -> Links:
+def _with_passed_by(points: Coords, near: Nearest, links: Links) -> Links:
     """Insert points without segments into the neighbouring segment that grows least, unless its length doubles."""
     for i in np.flatnonzero((links < 0).all(1)).tolist():
         best, ends = 1.0, None
@@ -165,98 +151,69 @@ def _with_passed_by(
     return links
 
 
-def _in_turn(links: Links) -> list[tuple[np.ndarray, bool]]:
-    """Points of every chain in order, from an end if there is one, and whether it is closed."""
-    beside = links.tolist()
-    first = np.argsort((links >= 0).all(1), kind="stable").tolist()  # ends of chains first
-    seen, chains = np.zeros(len(links), dtype=bool), []
-    for start in first:
-        if seen[start]:
-            continue
-        chain, here = [], start
-        while here >= 0 and not seen[here]:
-            seen[here] = True
-            chain.append(here)
-            one, two = beside[here]
-            here = one if one >= 0 and not seen[one] else two
-        chains.append((np.array(chain), start in beside[chain[-1]] and len(chain) > 2))
-    return chains
-
-
 def _cut(
-    points: Float[np.ndarray, "N n"], chains: list[tuple[np.ndarray, bool]], noise: float
-) -> tuple[list[Chain], Int[np.ndarray, " G"]]:
-    """(chains cut at their gaps; ends of the gaps that are less than twice as long as the limit)."""
-    turns = (np.append(chain, chain[:1]) if closed else chain for chain, closed in chains)
-    steps = [np.diff(points[turn], axis=0) for turn in turns]
+    points: Coords, chains: list[np.ndarray], noise: float
+) -> tuple[list[np.ndarray], Float[np.ndarray, " N"], list[int]]:
+    """(chains cut at their gaps; spacing around each point, ℓ; ends of gaps less than twice as long as the limit)."""
+    steps = [np.diff(points[chain], axis=0) for chain in chains]
     sizes = [lengths(step) for step in steps]
     uneven = (np.abs(np.diff(x)) / np.maximum(x[1:] + x[:-1], TINY) for x in sizes)
     spread = np.concatenate(list(uneven))
     random = min(1.0, 2 * float(np.median(spread))) if len(spread) else 0.0
     limit = FACTOR + random * (np.log(len(points)) + RANDOM)
-    found, doubtful = [], []
-    for (chain, closed), step, length in zip(chains, steps, sizes, strict=True):
+    found, spacing, doubtful = [], np.zeros(len(points)), []
+    for chain, step, length in zip(chains, steps, sizes, strict=True):
+        closed = len(chain) > 1 and bool(chain[0] == chain[-1])
         usual = _usual(length, closed) if len(length) > 1 else length
+        spacing[chain[-1]], spacing[chain[:-1]] = usual[-1:].sum(), usual
         cosine = inner(step, np.roll(step, 1, 0)) / np.maximum(length * np.roll(length, 1), TINY)
         turn = np.arccos(np.clip(cosine, -1, 1))
-        if not closed:
-            turn[:1] = 0
+        turn[: not closed] = 0
         # a segment half as long again is a gap, too, if the angles at its two ends add up to a turn back
-        back = turn + np.append(turn[1:], turn[:1] if closed else 0) > OBTUSE
-        back &= noise == 0  # short segments of noisy points have any direction
+        back = (turn + np.roll(turn, -1) > OBTUSE) & (noise == 0)  # noisy ones have any direction
         share = length / np.maximum(np.where(back, WIDER, limit) * usual, TINY)
         gap = np.flatnonzero(share > 1)
-        for k in gap[(share[gap] < 2) & ~back[gap]].tolist():
-            doubtful += [int(chain[k]), int(chain[(k + 1) % len(chain)])]
-        spacing = usual if closed else np.append(usual, usual[-1:] if len(usual) else 0.0)
+        for k in gap[(share[gap] < 2) & ~back[gap]]:
+            doubtful += chain[k : k + 2].tolist()
         if closed and len(gap):
-            chain, spacing = (np.roll(x, -gap[0] - 1) for x in (chain, spacing))
-            gap = gap[1:] - gap[0] - 1
-            closed = False
-        parts = [np.split(x, gap + 1) for x in (chain, spacing)]
-        found += [Chain(part, closed, width) for part, width in zip(*parts, strict=True)]
-    return found, np.array(doubtful, dtype=np.int64)
+            chain, gap = np.roll(chain[:-1], -gap[0] - 1), gap[1:] - gap[0] - 1
+        found += np.split(chain, gap + 1)
+    return found, spacing, doubtful
 
 
 def _usual(length: Float[np.ndarray, " S"], closed: bool) -> Float[np.ndarray, " S"]:
     """Mean length of the segments before each or of those after it, whichever is larger: the density may jump."""
     count, width = len(length), min(NEAR, len(length) - 1) if closed else 0
-    around = np.concatenate([length[count - width :], length, length[:width]])
-    total, place = np.append(0, np.cumsum(around)), np.arange(count) + width
-    means = []
-    for first, last in ((place - NEAR, place), (place + 1, place + 1 + NEAR)):
-        first, last = (np.clip(end, 0, len(around)) for end in (first, last))
-        means.append((total[last] - total[first]) / np.maximum(last - first, 1))
-    return np.maximum(*means)
+    around = np.pad(length, width, mode="wrap")
+    parts = (np.convolve(np.pad(x, 1), np.ones(NEAR)) for x in (around, np.ones_like(around)))
+    total, number = (part[width:][: count + NEAR + 1] for part in parts)
+    mean = total / np.maximum(number, 1)
+    return np.maximum(mean[:count], mean[-count:])
 
 
 def _facing_out(
-    points: Float[np.ndarray, "N 2"], chain: Chain, normals: Float[np.ndarray, "N 2"] | None
+    points: Float[np.ndarray, "N 2"], segments: np.ndarray, normals: Float[np.ndarray, "N 2"] | None
 ) -> Int[np.ndarray, "S 2"]:
-    """Segments of a plane curve, facing as the normals do; without normals outward if closed, else up."""
-    a, b = points[chain.segments].swapaxes(0, 1)
+    """Segments of a chain, facing as the normals do; without normals outward if it is closed, else up."""
+    a, b = points[segments].swapaxes(0, 1)
     normal = (b - a)[:, ::-1] * [1, -1]
     if normals is not None:
-        outward = normals[chain.segments].sum(1)
+        outward = normals[segments].sum(1)
     else:
-        outward = (a + b) / 2 - points[chain.points].mean(0) if chain.closed else np.array([0.0, 1])
-    return chain.segments if np.sum(normal * outward) >= 0 else chain.segments[:, ::-1]
+        closed = segments[0, 0] == segments[-1, 1]
+        outward = (a + b) / 2 - a.mean(0) if closed else np.array([0.0, 1])
+    return segments if np.sum(normal * outward) >= 0 else segments[:, ::-1]
 
 
 def _warn(
-    points: Float[np.ndarray, "N n"],
-    near: Int[np.ndarray, "N K"],
-    chains: list[Chain],
-    noise: float,
-    gaps: Int[np.ndarray, " G"],
+    points: Coords, near: Nearest, chains: list[np.ndarray], spacing: np.ndarray, gaps: list[int]
 ) -> None:
-    """Warn where parts of the curve are close, or gaps are hardly longer than segments; and of noise."""
-    number, place, size, spacing = np.zeros((4, len(points)))
+    """Warn where parts of the curve are close, or gaps are hardly longer than segments."""
+    number, place, size = np.zeros((3, len(points)))
     for k, chain in enumerate(chains):
-        steps = lengths(np.diff(points[chain.segments], axis=1)[:, 0])
-        number[chain.points], spacing[chain.points] = k, chain.spacing
-        place[chain.points] = np.append(0, np.cumsum(steps))[: len(chain.points)]
-        size[chain.points] = steps.sum() if chain.closed else np.inf
+        way = np.append(0, np.cumsum(lengths(np.diff(points[chain], axis=0))))
+        number[chain], place[chain] = k, way
+        size[chain] = way[-1] if chain[0] == chain[-1] else np.inf
     way = np.abs(place[near] - place[:, None])
     way = np.minimum(way, np.abs(size[:, None] - way))
     other = (way > FACTOR * spacing[:, None]) | (number[near] != number[:, None])
@@ -277,9 +234,4 @@ def _warn(
         warn(
             f"points: the curve ends at gaps hardly longer than those between its points, near {where(at_gap)}; add "
             "points where it goes on, or give the segments to from_mesh"
-        )
-    if noise:
-        warn(
-            f"points: they lie beside the curve by {noise:.2g} (root mean square), and are moved onto a smooth one for "
-            "all that is computed; give the segments to from_mesh if they lie on it"
         )

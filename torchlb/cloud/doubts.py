@@ -25,7 +25,7 @@ from torchlb.cloud.manifold import face_vectors
 from torchlb.cloud.noise import SAMPLE, spacing_at
 from torchlb.cloud.surface import CloudSurface
 from torchlb.errors import first_few, warn
-from torchlb.geometry.boundary import boundary_faces
+from torchlb.geometry.boundary import open_sides
 from torchlb.geometry.compatibility import compatible_neighbors
 from torchlb.geometry.complex import Faces, edges_of
 from torchlb.geometry.fit_search import REASONS
@@ -79,7 +79,7 @@ def warn_of_joins(surface: CloudSurface) -> None:
 
 def on_rim(cells: Int[Tensor, "F corners"], count: int) -> Bool[Tensor, " N"]:
     """Points on the boundary of a complex."""
-    return torch.zeros(count, dtype=torch.bool).index_fill(0, boundary_faces(cells).flatten(), True)
+    return torch.zeros(count, dtype=torch.bool).index_fill(0, open_sides(cells)[0].flatten(), True)
 
 
 def warn_of_buried(cells: Int[Tensor, "F corners"], boundary: Bool[Tensor, " N"]) -> None:
@@ -126,41 +126,34 @@ def warn_of_near_duplicates(points: Points, neighbors: Near, dim: int) -> None:
 
 
 def warn_of_layers(points: Float[Tensor, "N 3"]) -> None:
-    """Warn if much of a cloud lies in two layers so close that they may be taken for one noisy sheet."""
-    layered, looked_at = in_two_layers(points.numpy())
-    if len(layered) > LOW * looked_at:  # 0.4 and more on plates, 0.001 on noisy shapes
-        warn(
-            f"points: around {len(layered) / looked_at:.0%} of them ({first_few(torch.from_numpy(layered))}) they lie "
-            "in two layers about a spacing apart or closer, as on a thin plate sampled on both sides; the surface may "
-            "be one sheet there, with half of the area. Add points until they are closer than it is thick, keep one "
-            "side alone, or give the mesh if there is one"
-        )
+    """Warn if much of a cloud lies in two layers, a spacing apart or closer, that may be taken for one noisy sheet.
 
-
-def in_two_layers(points: Vectors) -> tuple[Int[np.ndarray, " M"], int]:
-    """Return those of a sample of points around which the cloud has two layers, and the size of the sample.
-
-    The layers are a spacing apart or closer. A local quadratic is fitted around each point of the sample. Residuals of
-    one noisy layer have one peak, those of two layers have two with few points between, which their kurtosis tells.
-    Clouds of fewer than 2 `PATCH` points are not tested.
+    A local quadratic is fitted around each of a sample of points. Residuals of one noisy layer have one peak, those of
+    two layers have two with few points between, which their kurtosis tells. Clouds of fewer than 2 `PATCH` points are
+    not tested.
     """
-    some = np.arange(0, len(points), -(-len(points) // SAMPLE))
+    some, places = np.arange(0, len(points), -(-len(points) // SAMPLE)), points.numpy()
     if len(points) < 2 * PATCH:
-        return some[:0], len(some)
-    distance, index = (np.asarray(part) for part in KDTree(points).query(points[some], k=PATCH))
-    offset = points[index] - points[index].mean(1, keepdims=True)
+        return
+    distance, index = (np.asarray(part) for part in KDTree(places).query(places[some], k=PATCH))
+    offset = places[index] - places[index].mean(1, keepdims=True)
     axes = np.linalg.eigh(offset.transpose(0, 2, 1) @ offset)[1]
     height, v, u = np.moveaxis(offset @ axes / distance[:, -1:, None], -1, 0)
     basis = np.linalg.qr(np.stack([np.ones_like(u), u, v, u * u, u * v, v * v], -1))[0]
     height -= (basis @ (basis.transpose(0, 2, 1) @ height[..., None]))[..., 0]
     square = np.square(height).mean(1)
     layered = (height**4).mean(1) < UNIMODAL * square**2
-    return some[layered & (square > LOW**2 * np.pi / PATCH)], len(some)
+    layered &= square > LOW**2 * np.pi / PATCH
+    if layered.mean() > LOW:  # 0.4 and more on plates, 0.001 on noisy shapes
+        warn(
+            f"points: around {layered.mean():.0%} of them ({first_few(torch.from_numpy(some[layered]))}) they lie "
+            "in two layers about a spacing apart or closer, as on a thin plate sampled on both sides; the surface may "
+            "be one sheet there, with half of the area. Add points until they are closer than it is thick, keep one "
+            "side alone, or give the mesh if there is one"
+        )
 
 
-def _surrounded(
-    points: Float[Tensor, "N 3"], normals: Float[Tensor, "N 3"], near: Int[Tensor, "B K"]
-) -> Bool[np.ndarray, " B"]:
+def _surrounded(points: Points, normals: Points, near: Int[Tensor, "B K"]) -> np.ndarray:
     """Whether the first point of each row is surrounded by its own sheet: no gap of 120° in the tangent plane."""
     good = compatible_neighbors(points, normals, near)[:, 1:]
     good &= good.cumsum(1) <= NEAREST
@@ -195,10 +188,9 @@ def in_doubt(surface: CloudSurface, faces: Faces) -> Bool[np.ndarray, " F"]:
         amid, ends = np.zeros(count, dtype=bool), np.unique([i[steep], j[steep]])
         amid[ends] = _surrounded(surface.points, surface.normals, surface.neighbors[ends])
         across = (steep_i & amid[i]) | (steep_j & amid[j])
-        close = np.zeros(count, dtype=bool)
-        close[i[across]] = close[j[across]] = True
+        close = np.isin(np.arange(count), [i[across], j[across]])
         beside = close[i] | close[j]
-        close[i[beside]] = close[j[beside]] = True
+        close = np.isin(np.arange(count), [i[beside], j[beside]])
         found |= steep & close[i] & close[j]
     return np.asarray(found[edges.of].reshape(-1, 3).any(1))
 
@@ -212,10 +204,10 @@ def spectral_change(surface: CloudSurface) -> tuple[float, Mask]:
     points, parts = surface.points.numpy(), (surface.cells.numpy(), surface.stars.numpy())
     faces = np.concatenate(parts)
     weight = np.array([1.0, 1 / 3]).repeat([len(part) for part in parts])
-    doubtful, marked = in_doubt(surface, faces), np.zeros(len(points), dtype=bool)
+    doubtful = in_doubt(surface, faces)
+    marked = np.isin(np.arange(len(points)), faces[doubtful])
     if not doubtful.any():
         return 0.0, marked
-    marked[faces[doubtful]] = True
     stiffness, mass = _elements(points, faces, weight)
     sound, _ = _elements(points, faces, np.where(doubtful, SMALL, 1.0) * weight)
     used = mass > 0  # points in no face have none

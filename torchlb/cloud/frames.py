@@ -33,10 +33,8 @@ def cloud_frames(points: Points, candidates: Near, dim: int, rounds: int = 3) ->
     Each further round takes the nearest candidates that are compatible by the frames before, so that the other side of
     a thin sheet drops out. The error is O(h) on a smooth surface.
     """
-    planes = None
-    frames = torch.empty(0)
+    planes, frames, parts = None, torch.empty(0), candidates.split(AT_ONCE)
     for _ in range(rounds):
-        parts = candidates.split(AT_ONCE)
         frames = torch.cat([_principal_directions(points, part, planes, dim) for part in parts])
         planes = planes_of(frames)
     return frames
@@ -65,12 +63,12 @@ def _principal_directions(
 
 
 def refined_normals(
-    points: Float[Tensor, "N 3"],
-    normals: Float[Tensor, "N 3"],
+    points: Points,
+    normals: Points,
     candidates: Near,
-    centers: Int[Tensor, " B"] | None = None,
+    centers: Tensor | None = None,
     rounds: int = 1,
-) -> Float[Tensor, "N 3"]:
+) -> Points:
     """Unit normals, at `centers` from quadratics through compatible candidates, with error O(h²); not oriented.
 
     The quadratics need not pass through the point itself, which lessens the effect of noise on the slope.
@@ -124,9 +122,9 @@ def nearest_pairs(candidates: Near) -> tuple[Int[Tensor, " P"], Int[Tensor, " P"
     i = torch.arange(num_points).repeat_interleave(size - 1)
     j = candidates[:, 1:].reshape(-1)
     code = (torch.minimum(i, j) * num_points + torch.maximum(i, j)).numpy()
-    code.sort()  # takes a quarter of the time of `torch.unique`
-    code = torch.from_numpy(code[np.flatnonzero(np.diff(code, prepend=-1))])
-    low, high = code // num_points, code % num_points
+    code.sort()  # takes a tenth of the time of `np.unique`, which hashes
+    code = code[np.flatnonzero(np.diff(code, prepend=-1))]
+    low, high = map(torch.from_numpy, np.divmod(code, num_points))
     return low[low != high], high[low != high]
 
 
@@ -181,9 +179,7 @@ def mended_normals(
         return normals, torch.zeros(len(points), dtype=torch.bool)
     sign, root = _carried(points, normals, candidates)
 
-    def contradicted(
-        told: Float[Tensor, " P"], side: Float[Tensor, " N"], group: Int[Tensor, " N"]
-    ) -> Float[Tensor, " N"]:
+    def contradicted(told: Tensor, side: Tensor, group: Tensor) -> Tensor:
         """Share of contradicting pairs at the points of each group."""
         wrong = told * (cosine * side[i] * side[j] < 0)
         total = torch.zeros(2, len(points), dtype=points.dtype)

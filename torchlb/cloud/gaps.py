@@ -13,7 +13,7 @@ from jaxtyping import Bool, Float, Int
 from scipy.spatial.distance import pdist
 
 from torchlb.cloud.cocone import REACH, Cloud, conormals
-from torchlb.cloud.manifold import boundary_loops, ears_of
+from torchlb.cloud.manifold import beside_of, boundary_loops, ears_of
 from torchlb.cloud.voronoi import natural_neighbors, unrolled
 from torchlb.geometry.complex import Edges, Faces, edges_of, pieces_of, spanning_pairs
 from torchlb.geometry.thresholds import CREASE, NEAREST, ROUGH, SLIGHT
@@ -32,51 +32,32 @@ def filled(cloud: Cloud, faces: Faces, pool: Faces, *, oriented: bool, strict: b
     triangles have to agree with them. If not `strict`, triangles may tilt from the normals by nearly a right angle, and
     overlap faces with which they share no edge.
     """
-    count = len(cloud.points)
+    count, every = len(cloud.points), np.arange(len(cloud.points))
     outer = edges_of(faces, count).outer  # only there can anything be added
     near = outer[faces].any(1)
     away, around = faces[~near], faces[near]
     while True:
         edges = edges_of(around, count)
-        half = edges.boundary[
-            outer[edges.ends[0][edges.boundary]] & outer[edges.ends[1][edges.boundary]]
-        ]
-        free = outer.copy()
-        free[around.ravel()] = False
-        for end in edges.ends:
-            free[end[half]] = True
+        half = edges.boundary
+        half = half[np.all([outer[end[half]] for end in edges.ends], axis=0)]
+        free = outer & ~np.isin(every, around) | np.isin(every, [end[half] for end in edges.ends])
         pool = pool[free[pool].all(1)]
-        ears = _ears(edges, half)
+        point, beside = beside_of(edges, half)
+        ears = np.insert(beside, 1, point, axis=1)
         candidates = np.concatenate([pool, ears[~cloud.boundary[ears].all(1)]])
         new = _proposals(cloud, edges, half, candidates, oriented, ROUGH if strict else LOW)
         new = new[~overlapping(cloud, new, around)] if strict else new
         if len(new) == 0:
-            done = len(away) + len(around) == len(faces)
-            return faces if done else np.concatenate([away, around])
+            same = len(away) + len(around) == len(faces)
+            return faces if same else np.concatenate([away, around])
         best = np.full(count, len(new))
         np.minimum.at(best, new.ravel(), np.arange(len(new)).repeat(3))
         chosen = (best[new] == np.arange(len(new))[:, None]).all(1)
         around = np.concatenate([around, new[chosen]])
 
 
-def _ears(edges: Edges, half: Int[np.ndarray, " G"]) -> Faces:
-    """Triangles of two boundary edges that meet in a point without further boundary edges."""
-    tail, head = (end[half] for end in edges.ends)
-    here, there = np.concatenate([tail, head]), np.concatenate([head, tail])
-    order = np.argsort(here, kind="stable")
-    here, there = here[order], there[order]
-    _, first, uses = np.unique(here, return_index=True, return_counts=True)
-    first = first[uses == 2]
-    return np.stack([there[first], here[first], there[first + 1]], 1)
-
-
 def _proposals(
-    cloud: Cloud,
-    edges: Edges,
-    half: Int[np.ndarray, " G"],
-    faces: Faces,
-    oriented: bool,
-    least: float,
+    cloud: Cloud, edges: Edges, half: np.ndarray, faces: Faces, oriented: bool, least: float
 ) -> Faces:
     """Faces that fit to boundary half-edges without a fold or third face, aligned to the normals; best first."""
     faces = np.unique(np.sort(faces, axis=1), axis=0)
@@ -114,14 +95,11 @@ def overlapping(cloud: Cloud, new: Faces, faces: Faces, corners: int = 3) -> Boo
     for k in range(corners):
         ours = _wedges(cloud, new, np.full(len(new), k))
         i, j = _matches(new[:, k], faces[rows, places], len(cloud.points))
-        a, b = (np.stack([x[i] for x in ours], 1), np.stack([x[j] for x in theirs], 1))
-        result[i[_meet(a, b) | _meet(b, a)]] = True
+        result[i[_meet(ours[i], theirs[j]) | _meet(theirs[j], ours[i])]] = True
     return result
 
 
-def _matches(
-    wanted: Int[np.ndarray, " W"], found: Int[np.ndarray, " F"], count: int
-) -> tuple[Int[np.ndarray, " P"], Int[np.ndarray, " P"]]:
+def _matches(wanted: Int[np.ndarray, " W"], found: Int[np.ndarray, " F"], count: int) -> Pairs:
     """All (i, j) with wanted[i] = found[j], two lists of numbers below `count`."""
     order, number = np.argsort(found, kind="stable"), np.bincount(found, minlength=count)
     uses, start = number[wanted], np.cumsum(number) - number
@@ -130,9 +108,7 @@ def _matches(
     return i, order[np.arange(len(i)) + first[i]]
 
 
-def _wedges(
-    cloud: Cloud, faces: Faces, corner: Int[np.ndarray, " T"]
-) -> tuple[Float[np.ndarray, "T 3"], ...]:
+def _wedges(cloud: Cloud, faces: Faces, corner: np.ndarray) -> Float[np.ndarray, "T 4 3"]:
     """(two sides of a face at a corner, their bisector, the normal of the turn): unit, the first three tangential."""
     rows = np.arange(len(faces))
     apex = faces[rows, corner]
@@ -142,27 +118,25 @@ def _wedges(
         side = cloud.points[faces[rows, (corner + turn) % 3]] - cloud.points[apex]
         sides.append(unit(side - inner(side, normal)[:, None] * normal))
     turn = np.sign(inner(np.cross(*sides), normal))[:, None] * normal
-    return *sides, unit(sides[0] + sides[1]), turn
+    return np.stack([*sides, unit(sides[0] + sides[1]), turn], 1)
 
 
 def _meet(one: Float[np.ndarray, "P 4 3"], two: Float[np.ndarray, "P 4 3"]) -> np.ndarray:
     """Whether a side or the bisector of wedge one lies inside wedge two."""
-    first, second, turn = two[:, None, 0], two[:, None, 1], two[:, None, 3]
-    rays = one[:, :3]
+    rays, (first, second, _, turn) = one[:, :3], two[:, :, None].swapaxes(0, 1)
     after = inner(np.cross(first, rays), turn) > SLIGHT
     before = inner(np.cross(rays, second), turn) > SLIGHT
     return np.any(after & before, axis=1)
 
 
-def closed(cloud: Cloud, faces: Faces, kept: Mask) -> tuple[Faces, list[list[int]]]:
-    """(faces with narrow boundary loops closed by ear clipping; the loops that were closed).
+def closed(cloud: Cloud, faces: Faces, kept: Mask) -> tuple[Faces, int]:
+    """(faces with narrow boundary loops closed by ear clipping; number of these loops).
 
     The reach of a point is at least that of the triangles at it. A loop stays open if two neighbouring points of it are
     on the declared boundary, or one is in `kept`.
     """
     count = len(cloud.points)
-    edges = edges_of(faces, count)
-    known, new, done = set(edges.keys.tolist()), [faces], []
+    known, new = set(edges_of(faces, count).keys.tolist()), [faces]
 
     def cost(turn: Faces) -> Float[np.ndarray, " T"]:
         radius, normal = cloud.circles(turn)
@@ -177,22 +151,16 @@ def closed(cloud: Cloud, faces: Faces, kept: Mask) -> tuple[Faces, list[list[int
         declared = cloud.boundary[loop] & cloud.boundary[np.roll(loop, 1)]
         if declared.any() or kept[loop].any() or np.ptp(places, axis=0).max() > wide:
             continue
-        if pdist(places).max() > wide:
-            continue
-        ears = ears_of(loop, known, count, cost)
-        if ears is not None:
-            done.append(loop)
-            new.append(np.array(ears))
-    return np.concatenate(new) if done else faces, done
+        ears = ears_of(loop, known, count, cost) if pdist(places).max() <= wide else None
+        new += [] if ears is None else [np.array(ears)]
+    return np.concatenate(new) if len(new) > 1 else faces, len(new) - 1
 
 
 def with_left_points(cloud: Cloud, faces: Faces) -> Faces:
     """Faces with each point in no face inserted into the one that it stands over, if there is one."""
     count = len(cloud.points)
     while True:
-        outside = np.ones(count, dtype=bool)
-        outside[faces.ravel()] = False
-        left = np.flatnonzero(outside)
+        left = np.flatnonzero(~np.isin(np.arange(count), faces))
         near = cloud.neighbors[left, 1:NEAREST]
         row, corner = _matches(near.ravel(), faces.ravel(), count)
         points, under = left.repeat(near.shape[1])[row], corner // 3
@@ -242,9 +210,7 @@ def at_gaps(faces: Faces, pairs: Pairs, count: int) -> Mask:
     i, j = pairs
     piece, outer = pieces_of(faces, count), edges_of(faces, count).outer
     across = (piece[i] != piece[j]) & (outer[i] | outer[j])
-    result = np.zeros(count, dtype=bool)
-    result[i[across]] = result[j[across]] = True
-    return result
+    return np.isin(np.arange(count), [i[across], j[across]])
 
 
 def stars_in_gaps(cloud: Cloud, faces: Faces, pairs: Pairs) -> Faces:

@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Callable
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 
-from torchlb.geometry.complex import Faces, components, edges_of, tree_sides
+from torchlb.geometry.complex import Edges, Faces, components, edges_of, tree_sides
 from torchlb.geometry.vectors import Vectors, inner, unit
 
 
@@ -59,8 +59,7 @@ def wound_alike(points: Vectors, faces: Faces) -> tuple[Faces, Bool[np.ndarray, 
     order = np.argsort(bend, kind="stable")
     flip = tree_sides(i[order], j[order], against[order], size)
     seam = against ^ flip[i] ^ flip[j]
-    at_seam = np.zeros(size, dtype=bool)
-    at_seam[i[seam]] = at_seam[j[seam]] = True
+    at_seam = np.isin(np.arange(size), [i[seam], j[seam]])
     return np.where(flip[:, None], faces[:, ::-1], faces), at_seam
 
 
@@ -75,43 +74,53 @@ def facing_out(points: Vectors, faces: Faces, outward: Vectors) -> Faces:
     return np.where(turned[:, None], faces[:, ::-1], faces)
 
 
-def boundary_loops(faces: Faces, count: int) -> list[list[int]]:
-    """Points of every boundary loop in order, each walked round from face to face."""
+def beside_of(
+    edges: Edges, half: Int[np.ndarray, " G"]
+) -> tuple[Int[np.ndarray, " B"], Int[np.ndarray, "B 2"]]:
+    """(points where two of these half-edges meet, and no more; the other ends of the two)."""
+    ends = np.stack([end[half] for end in edges.ends])
+    order = np.argsort(ends, axis=None, kind="stable")
+    here, there = ends.ravel()[order], ends[::-1].ravel()[order]
+    point, first, uses = np.unique(here, return_index=True, return_counts=True)
+    first = first[uses == 2]
+    return point[uses == 2], np.stack([there[first], there[first + 1]], 1)
+
+
+def in_turn(links: Int[np.ndarray, "N 2"]) -> list[Int[np.ndarray, " M"]]:
+    """Points of every chain in order, from an end if there is one; of a closed one the first comes again at the end.
+
+    `links` are the two points beside each, −1 for none.
+    """
+    beside, left, chains = links.tolist(), [True] * len(links), []
+    for start in np.argsort((links >= 0).all(1), kind="stable").tolist():  # ends first
+        chain, here = [], start
+        while here >= 0 and left[here]:
+            left[here] = False
+            chain.append(here)
+            one, two = beside[here]
+            here = one if one >= 0 and left[one] else two
+        if len(chain) > 2 and start in beside[chain[-1]]:
+            chain.append(start)
+        if chain:
+            chains.append(np.array(chain))
+    return chains
+
+
+def boundary_loops(faces: Faces, count: int) -> list[Int[np.ndarray, " M"]]:
+    """Points of every boundary loop in order, of faces with single fans."""
     edges = edges_of(faces, count)
-    mate = np.full(3 * len(faces), -1)
-    one, two = edges.twins
-    mate[one], mate[two] = two, one
-    tail, head = edges.ends
-    found, seen = [], set()
-    for start in edges.boundary.tolist():
-        if start in seen:
-            continue
-        half, at, loop = start, int(head[start]), [int(tail[start])]
-        while half not in seen:
-            seen.add(half)
-            while True:  # rotate about the point, across faces, up to the next boundary edge
-                face = half - half % 3
-                half = face + next(
-                    k for k in range(3) if face + k != half and faces[face // 3, k] != at
-                )
-                if mate[half] < 0:
-                    break
-                half = int(mate[half])
-            if half not in seen:
-                loop.append(at)
-                at = int(head[half] if tail[half] == at else tail[half])
-        found.append(loop)
-    return found
+    point, beside = beside_of(edges, edges.boundary)
+    return [point[loop[:-1]] for loop in in_turn(np.searchsorted(point, beside))]
 
 
 def ears_of(
-    loop: list[int], known: set[int], count: int, cost: Callable[[Faces], Float[np.ndarray, " T"]]
+    loop: Int[np.ndarray, " M"], known: set[int], count: int, cost: Callable[[Faces], np.ndarray]
 ) -> list[list[int]] | None:
     """Triangles that close a loop, the ear of least cost first, and None if an edge would be used a third time.
 
     `known` are the keys of the edges in use, low · count + high, to which those of the triangles are added.
     """
-    loop, ears, own = list(loop), [], set()
+    ears, own = [], set()
     while len(loop) > 3:
         turn = np.stack([np.roll(loop, 1), loop, np.roll(loop, -1)], 1)
         a, c = turn[:, 0], turn[:, 2]
@@ -123,6 +132,6 @@ def ears_of(
             return None
         ears.append(turn[best].tolist())
         own.add(keys[best])
-        del loop[best]
+        loop = np.delete(loop, best)
     known |= own
-    return [*ears, loop]
+    return [*ears, loop.tolist()]

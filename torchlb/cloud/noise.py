@@ -45,10 +45,8 @@ def denoised(points: Points, planes: Points | Frames, candidates: Near) -> tuple
     four = local_polynomials(points, planes, some, 4, weighted=False)[1].square().sum((1, 2))
     free = count - terms[0], count - terms[1]
     use = (free[1] > 2) & (two > free[0] * (NEGLIGIBLE * radius) ** 2)
-    if use.double().mean() < 0.5:
-        return points, 0.0
     ratio = (two - four) / (free[0] - free[1]) / (four / free[1])
-    if ratio[use].median() > SMOOTH:
+    if use.double().mean() < 0.5 or ratio[use].median() > SMOOTH:
         return points, 0.0
     moved, squares = points.clone(), []
     for part in candidates.split(AT_ONCE):
@@ -74,8 +72,7 @@ def lone_points(points: Vectors, near: Int[np.ndarray, "N K"]) -> Mask:
     spread along the edge. At a jump in density half a disc of twice the spacing holds twelve other points of a like
     spacing. Of many outliers some lie in one plane by chance, but most of their like are lone, too.
     """
-    lone = np.zeros(len(points), dtype=bool)
-    spacing = spacing_at(points, near)
+    lone, spacing = np.zeros(len(points), dtype=bool), spacing_at(points, near)
     usual = np.partition(spacing[near[:, 1:]], near.shape[1] // 4, axis=1)[:, near.shape[1] // 4]
     apart = spacing > LONE * usual
     far = np.flatnonzero(apart)

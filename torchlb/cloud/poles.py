@@ -21,7 +21,7 @@ from torchlb.cloud.cocone import Tetrahedra
 from torchlb.cloud.frames import refined_normals
 from torchlb.geometry.complex import edges_of, tree_sides
 from torchlb.geometry.thresholds import FACTOR
-from torchlb.geometry.vectors import Near, at, dot, inner, lengths
+from torchlb.geometry.vectors import Near, Points, at, dot, inner, lengths
 from torchlb.linalg.precision import LOW, ROUNDING, STEPS, TINY
 
 LONG = 1.4
@@ -50,12 +50,9 @@ class Poles:
         u, v, w = (points.take(cells[:, k], 0) - first for k in (1, 2, 3))
         longest = reduce(np.maximum, map(lengths, (u, v, w)))
         solid = np.flatnonzero(np.abs(inner(u, np.cross(v, w))) > ROUNDING * longest**3)
-        outer = tetrahedra.triangles[hull]
-        point = np.concatenate([cells[solid].ravel(), outer.ravel()])
+        point = np.concatenate([cells[solid].ravel(), tetrahedra.triangles[hull].ravel()])
         ball = np.concatenate([solid.repeat(4), tetrahedra.sides[1][hull].repeat(3)])
-        far = tetrahedra.ends(hull)[1]
-        center = [tetrahedra.centers[solid].repeat(4, 0), far.repeat(3, 0)]
-        ray = np.concatenate(center) - points.take(point, 0)
+        ray = tetrahedra.centers.take(ball, 0) - points.take(point, 0)
         return cls(tetrahedra, *(torch.from_numpy(x) for x in (point, ball, ray)))
 
     def farthest(self, value: Float[Tensor, " R"]) -> Int[Tensor, " N"]:
@@ -120,10 +117,7 @@ class Poles:
 
 
 def _vote(
-    i: Int[np.ndarray, " P"],
-    j: Int[np.ndarray, " P"],
-    weight: Float[np.ndarray, " P"],
-    outside: Bool[np.ndarray, " S"],
+    i: np.ndarray, j: np.ndarray, weight: np.ndarray, outside: Bool[np.ndarray, " S"]
 ) -> Float[np.ndarray, " S"]:
     """Signs of the minimiser x of Σ |w| (x_i − sign(w) x_j)² over all pairs, x = 1 outside; in float32."""
     count, free = len(outside), np.flatnonzero(~outside)
@@ -133,9 +127,8 @@ def _vote(
     around = np.maximum(total.astype(np.float32), np.finfo(np.float32).tiny)
     rows = sparse.csr_array(one + one.T)[free]
     matrix = sparse.csr_array(sparse.diags_array(around) - rows[:, free])
-    x, _ = cg(
-        matrix, rows @ outside, rtol=RESIDUAL, maxiter=STEPS, M=sparse.diags_array(1 / around)
-    )
+    scale = sparse.diags_array(1 / around)
+    x, _ = cg(matrix, rows @ outside, rtol=RESIDUAL, maxiter=STEPS, M=scale)
     side = np.ones(count)
     side[free] = np.where(x > 0, 1.0, -1.0)
     return side
@@ -145,9 +138,7 @@ def _cosine(a: Float[Tensor, "B 3"], b: Float[Tensor, "B 3"]) -> Float[Tensor, "
     return dot(a, b) / (dot(a, a) * dot(b, b)).sqrt().clamp_min(TINY)
 
 
-def corrected_normals(
-    points: Float[Tensor, "N 3"], normals: Float[Tensor, "N 3"], candidates: Near, poles: Poles
-) -> Float[Tensor, "N 3"]:
+def corrected_normals(points: Points, normals: Points, candidates: Near, poles: Poles) -> Points:
     """Normals replaced by the longest ray where the Voronoi cell is short along them, and refined around that.
 
     Where points lie on rings or other curves far apart, the planes through the nearest of them are those of the curves,
@@ -161,9 +152,8 @@ def corrected_normals(
         seen = at(where, poles.point).nonzero()[:, 0]
         point = poles.point[seen]
         along = dot(poles.ray[seen], at(normals, point)).abs()
-        most = torch.full_like(length, torch.inf).scatter_reduce(
-            0, point, along, "amax", include_self=False
-        )
+        most = torch.full_like(length, torch.inf)
+        most.scatter_reduce_(0, point, along, "amax", include_self=False)
         return torch.where((most * LONG < length)[:, None], longest, normals)
 
     where = torch.ones(len(points), dtype=torch.bool)

@@ -22,8 +22,6 @@ from torchlb.geometry.thresholds import RING, WIDER
 from torchlb.geometry.vectors import lengths
 from torchlb.linalg.precision import NEGLIGIBLE, TINY
 
-NEAR = 2 * RING
-"""Number of nearest points that give the density around each."""
 SURE = 5.0
 """One cloud in e to this power has a wrong cavity by chance."""
 SHEAR = np.eye(3) + 1e-3 * np.array([[0, 0.9, 0.7], [0, 0, 0.8], [0, 0, 0]])
@@ -38,7 +36,7 @@ def cloud_solid(points: Float[Tensor, "N 3"]) -> Complex:
         raise InputError(
             f"points: all {len(points)} lie in a plane, and fill no solid; a surface has dim=2"
         )
-    near = nearest_neighbors(points, min(NEAR + 1, len(points))).numpy()
+    near = nearest_neighbors(points, min(2 * RING + 1, len(points))).numpy()
     reach = lengths(places[near[:, -1]] - places)
     found = delaunay(places @ SHEAR)
     cells, beside = (x.astype(np.int64) for x in (found.simplices, found.neighbors))

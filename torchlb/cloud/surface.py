@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import torch
@@ -25,7 +25,7 @@ from torchlb.geometry.complex import Faces, components, delaunay, pieces_of
 from torchlb.geometry.frames import vertex_normals
 from torchlb.geometry.neighbors import mesh_graph, nearest_neighbors
 from torchlb.geometry.thresholds import LEVEL, NEAREST, RING
-from torchlb.geometry.vectors import Mask, Near, Vectors, lengths
+from torchlb.geometry.vectors import Frames, Mask, Near, Nearest, Points, Vectors, lengths
 from torchlb.linalg.precision import LOW, NEGLIGIBLE, ROOT_EPS
 
 
@@ -107,10 +107,7 @@ class CloudSurface(Complex):
 
 
 def cloud_surface(
-    points: Float[Tensor, "N 3"],
-    *,
-    normals: Float[Tensor, "N 3"] | None = None,
-    boundary: Bool[Tensor, " N"] | None = None,
+    points: Points, *, normals: Points | None = None, boundary: Bool[Tensor, " N"] | None = None
 ) -> CloudSurface:
     """The surface through all points, as far as they resolve one.
 
@@ -124,18 +121,17 @@ def cloud_surface(
     candidates, oriented = nearest_neighbors(points, min(NEAREST, len(points))), False
     if normals is not None:
         normals, oriented = settled_normals(points, normals, candidates)
-    start = _start(points, candidates, normals, boundary)
-    cloud, found, given, count = start.cloud, start.found, normals, len(points)
-    places, pairs = cloud.points, _neighbor_graph(cloud)
-    outward = given.numpy() if given is not None and oriented else found.outward
-    every, seam = wound_alike(places, _chosen(cloud, found, start.two_sided, pairs))
+    cloud, found, two_sided, frames, noise, lone = _start(points, candidates, normals, boundary)
+    places, pairs, count = cloud.points, _neighbor_graph(cloud), len(points)
+    outward = normals.numpy() if normals is not None and oriented else found.outward
+    every, seam = wound_alike(places, _chosen(cloud, found, two_sided, pairs))
     faces = with_single_fans(every[~seam], count) if seam.any() else every
     faces, done = _completed(cloud, faces, found.small, pairs, outward)
     if _single_seams(every, seam, count) and wound_alike(places, faces)[1].any():
         faces, done = _completed(cloud, every, found.small, pairs, outward)
     # not by the faces, which may lead into a mouth from outside
     cloud = _along(_along(cloud, _of_faces(cloud, faces)), outward)
-    if given is None:
+    if normals is None:
         cloud = _realigned(cloud, faces)
     stars = stars_in_gaps(cloud, faces, pairs)
     if len(faces) == 0:
@@ -144,35 +140,24 @@ def cloud_surface(
         )
     loops = boundary_loops(faces, count)
     pieces = pieces_of(np.concatenate([faces, stars]), count)
-    figures = len(np.unique(faces)), len(stars), len(done), len(loops), int(pieces.max()) + 1
+    figures = len(np.unique(faces)), len(stars), done, len(loops), int(pieces.max()) + 1
     touched = _contacts(cloud, faces)
     contacts = int(touched.sum()), places_of(places, cloud.neighbors, touched)
-    summary = SurfaceSummary(count, *figures, start.noise, *contacts, int(start.lone.sum()))
+    summary = SurfaceSummary(count, *figures, noise, *contacts, int(lone.sum()))
     parts = {"points": places, "cells": faces, "stars": stars, "normals": cloud.normals}
-    parts |= {"neighbors": cloud.neighbors, "lone": start.lone}
+    parts |= {"neighbors": cloud.neighbors, "lone": lone}
     tensors: Any = {name: torch.from_numpy(part) for name, part in parts.items()}
-    frames = _orthogonal_to(start.frames, tensors["normals"])
+    frames = _orthogonal_to(frames, tensors["normals"])
     return CloudSurface(**tensors, frames=frames, summary=summary)
 
 
-class _Start(NamedTuple):
-    """Input of the choice of triangles: the denoised cloud, the candidates, and whether they have two sides."""
-
-    cloud: Cloud
-    found: Candidates
-    two_sided: bool
-    frames: Float[Tensor, "N 3 2"]
-    noise: float
-    lone: Mask
-
-
 def _start(
-    points: Float[Tensor, "N 3"],
-    candidates: Near,
-    given: Float[Tensor, "N 3"] | None,
-    boundary: Bool[Tensor, " N"] | None,
-) -> _Start:
-    """Estimate the normals, that of the plane for planar points, and find candidates among Delaunay triangles."""
+    points: Points, candidates: Near, given: Points | None, boundary: Bool[Tensor, " N"] | None
+) -> tuple[Cloud, Candidates, bool, Frames, float, Mask]:
+    """(denoised cloud; candidates among Delaunay triangles; whether these have two sides; frames; noise; lone points).
+
+    The normals are those given, that of the plane for planar points, or estimated.
+    """
     lone = lone_points(points.numpy(), candidates.numpy())
     if lone.any():
         points = torch.from_numpy(put_beside(points.numpy(), lone))
@@ -181,18 +166,18 @@ def _start(
     on_boundary = np.zeros(len(points), dtype=bool) if boundary is None else boundary.numpy()
 
     def cloud_of(points: Tensor, normals: Tensor) -> Cloud:
-        places = points.numpy()
-        return Cloud(places, normals.numpy(), near, _reaches(places, near), on_boundary)
+        reach = _reaches(points.numpy(), near)
+        return Cloud(points.numpy(), normals.numpy(), near, reach, on_boundary)
 
-    planar, normals = _planar_triangles(points.numpy()), given
-    if planar is not None:
-        faces, normal = planar
-        up = torch.from_numpy(normal if normal[2] >= 0 else -normal).expand_as(points)
+    normals, centered = given, (points - points.mean(0)).numpy()
+    _, spread, axes = np.linalg.svd(centered, full_matrices=False)
+    if spread[2] <= NEGLIGIBLE * spread[0]:
+        up = torch.from_numpy(axes[2] if axes[2, 2] >= 0 else -axes[2]).expand_as(points)
         cloud = cloud_of(points, up if given is None else given)
-        small = cloud.small(faces)
+        small = cloud.small(delaunay(centered @ axes[:2].T).simplices.astype(np.int64))
         every = np.ones(len(small), dtype=bool)
         found = Candidates(small, small, every, every, up.numpy())
-        return _Start(cloud, found, True, frames, 0.0, lone)
+        return cloud, found, True, frames, 0.0, lone
     if normals is None:
         first = torch.linalg.cross(*frames.unbind(-1))
         normals = refined_normals(points, first, candidates, rounds=2)
@@ -207,10 +192,10 @@ def _start(
         normals = corrected_normals(points, normals, candidates, poles)
     side, two_sided = poles.sides(normals)
     cloud = cloud_of(points, normals)
-    return _Start(cloud, tetrahedra.candidates(cloud, side), two_sided, frames, noise, lone)
+    return cloud, tetrahedra.candidates(cloud, side), two_sided, frames, noise, lone
 
 
-def _reaches(points: Vectors, near: Int[np.ndarray, "N K"]) -> Float[np.ndarray, " N"]:
+def _reaches(points: Vectors, near: Nearest) -> Float[np.ndarray, " N"]:
     """Largest circumradius of a triangle at each point, by the `RING` nearest; by all neighbours if these are in a row.
 
     Rings of a scan may be many times farther apart than the points along them.
@@ -223,9 +208,7 @@ def _reaches(points: Vectors, near: Int[np.ndarray, "N K"]) -> Float[np.ndarray,
     return REACH * np.linalg.norm(points[far] - points, axis=1)
 
 
-def _orthogonal_to(
-    frames: Float[Tensor, "N 3 2"], normals: Float[Tensor, "N 3"]
-) -> Float[Tensor, "N 3 2"]:
+def _orthogonal_to(frames: Frames, normals: Points) -> Frames:
     """Frames orthogonal to the normals, from the first given direction that is not along the normal."""
     first, second = (frames - normals[..., None] * (normals[:, None] @ frames)).unbind(-1)
     first = normalize(torch.where(first.norm(dim=1, keepdim=True) > 0.5, first, second))
@@ -252,16 +235,15 @@ def _chosen(cloud: Cloud, found: Candidates, two_sided: bool, pairs: Pairs) -> F
     volume = np.bincount(piece, ((points - centers[piece]) * found.outward).sum(1))
     cavity = (volume < 0)[piece]
     across &= cavity[i] | cavity[j]
-    torn = np.zeros(len(points), dtype=bool)
-    torn[i[across]] = torn[j[across]] = True
+    torn = np.isin(np.arange(len(points)), [i[across], j[across]])
     first = np.where(torn[found.triangles].any(1), found.tangent, first)
     return with_single_fans(best_of(first), len(points)) if torn.any() else faces
 
 
 def _completed(
     cloud: Cloud, bare: Faces, pool: Faces, pairs: Pairs, outward: Vectors
-) -> tuple[Faces, list[list[int]]]:
-    """(faces turned outward, with gaps filled from the pool or closed, and all points; the loops closed)."""
+) -> tuple[Faces, int]:
+    """(faces turned outward, with gaps filled from the pool or closed, and all points; number of loops closed)."""
     places, count = cloud.points, len(cloud.points)
     bare = facing_out(places, bare, outward)
     cloud = _along(cloud, _of_faces(cloud, bare))
@@ -309,17 +291,8 @@ def _realigned(cloud: Cloud, faces: Faces) -> Cloud:
     of_faces = _of_faces(cloud, faces)
     cosine = (cloud.normals * of_faces).sum(1)
     misaligned = (np.abs(cosine) < LEVEL) & of_faces.any(1)
-    realigned = of_faces * np.where(cosine < 0, -1.0, 1.0)[:, None]
-    return replace(cloud, normals=np.where(misaligned[:, None], realigned, cloud.normals))
-
-
-def _planar_triangles(points: Vectors) -> tuple[Faces, Float[np.ndarray, " 3"]] | None:
-    """Delaunay triangles and normal of a planar cloud; None if it is not planar."""
-    centered = points - points.mean(0)
-    _, spread, axes = np.linalg.svd(centered, full_matrices=False)
-    if spread[2] > NEGLIGIBLE * spread[0]:
-        return None
-    return delaunay(centered @ axes[:2].T).simplices.astype(np.int64), axes[2]
+    realigned = replace(cloud, normals=np.where(misaligned[:, None], of_faces, cloud.normals))
+    return _along(realigned, cloud.normals)
 
 
 def _contacts(cloud: Cloud, faces: Faces) -> Mask:
@@ -331,9 +304,8 @@ def _contacts(cloud: Cloud, faces: Faces) -> Mask:
     beyond = sparse.csr_array(graph[nearest[apart]] @ graph)
     # a path of three edges: two from the nearest, one from the point
     met = (beyond * graph[apart]).sum(1)
-    far, touched = apart[met == 0], np.zeros(count, dtype=bool)
-    touched[far] = touched[nearest[far]] = True
-    return touched
+    far = apart[met == 0]
+    return np.isin(np.arange(count), [far, nearest[far]])
 
 
 def _neighbor_graph(cloud: Cloud) -> Pairs:

@@ -2,10 +2,10 @@
 
 The star is that of the Delaunay triangulation of the neighbours, projected there: the tangential Delaunay complex
 (Boissonnat and Ghosh 2014). On a surface the stars nearly agree; where they do not, triangles are taken greedily, those
-of more stars first, unless they overlap around a point or share an edge with two others, and remaining loops are closed
-by ear clipping. In higher dimensions all simplices count, each by its share in the Voronoi cells of the points whose
-stars have it: the share is 1 if all do, and cells of cospherical points do not depend on which of their triangulations
-a star has.
+of more stars first, unless they fold back on another or share an edge with two; one fan around each point stays, and
+short loops are closed by ear clipping. In higher dimensions all simplices count, each by its share in the Voronoi cells
+of the points whose stars have it: the share is 1 if all do, and cells of cospherical points do not depend on which of
+their triangulations a star has.
 """
 
 from __future__ import annotations
@@ -18,14 +18,15 @@ import torch
 from jaxtyping import Float, Int
 from scipy.spatial import QhullError
 
+from torchlb.cloud.cocone import best_manifold
 from torchlb.cloud.complexes import Complex
 from torchlb.cloud.frames import cloud_frames
-from torchlb.cloud.manifold import boundary_loops, ears_of
+from torchlb.cloud.manifold import boundary_loops, ears_of, with_single_fans
 from torchlb.errors import InputError, first_few
 from torchlb.geometry.compatibility import mutually_compatible, planes_of
 from torchlb.geometry.complex import Faces, delaunay, edges_of
 from torchlb.geometry.neighbors import nearest_neighbors
-from torchlb.geometry.thresholds import AROUND, FACTOR, SLIGHT
+from torchlb.geometry.thresholds import AROUND, FACTOR
 from torchlb.geometry.vectors import Frames, Near, Points, lengths
 from torchlb.linalg.precision import NEGLIGIBLE
 
@@ -41,7 +42,7 @@ def cloud_stars(points: Points, dim: int) -> Complex:
     frames = cloud_frames(points, near, dim)
     stars, places, shares = delaunay_stars(points, frames, near), points.numpy(), None
     if dim == 2:
-        cells = glued(places, frames.numpy(), stars)
+        cells = glued(places, stars)
     else:
         cells, parts = shared(places, stars)
         shares = torch.from_numpy(parts)
@@ -123,64 +124,15 @@ def voronoi_shares(corners: Float[np.ndarray, "S corners n"]) -> Float[np.ndarra
     return total
 
 
-def glued(
-    points: Float[np.ndarray, "N n"], frames: Float[np.ndarray, "N n 2"], stars: Faces
-) -> Faces:
-    """Triangles of the stars that form a surface: at most two at an edge, none that overlap around a point.
-
-    Those of three stars come first; short boundary loops are closed, the smallest circumradius first.
-    """
+def glued(points: Float[np.ndarray, "N n"], stars: Faces) -> Faces:
+    """Triangles of the stars that form a surface, those of more stars first, then smaller ones; short loops closed."""
     triangles, votes = np.unique(np.sort(stars, 1), axis=0, return_counts=True)
-    order = np.lexsort((circumradii(points, triangles), -votes))
-    triangles, agreed = triangles[order], votes[order] == 3
-    every = edges_of(triangles, len(points))
-    sides = every.of.reshape(-1, 3)
-    crowded = np.bincount(sides[agreed].ravel(), minlength=len(every.keys)) > 2
-    sure = agreed & ~crowded[sides].any(1)
-    uses = np.bincount(sides[sure].ravel(), minlength=len(every.keys)).tolist()
-    free = edges_of(triangles[sure], len(points)).outer
-    wedges: list[list[tuple[float, float]]] = [[] for _ in points]
-    chosen = []
-    arrays = (triangles, sides, *_wedges(points, frames, triangles))
-    corners, edges, starts, widths = (x.tolist() for x in arrays)
-    for k in np.argsort(~sure, kind="stable").tolist():
-        own = list(zip(corners[k], starts[k], widths[k], strict=True))
-        if not sure[k]:
-            if not free[triangles[k]].all() or any(uses[edge] >= 2 for edge in edges[k]):
-                continue
-            if any(_overlaps(start, width, wedges[point]) for point, start, width in own):
-                continue
-            for edge in edges[k]:
-                uses[edge] += 1
-        chosen.append(k)
-        for point, start, width in own:
-            wedges[point].append((start, width))
-    faces, count = triangles[chosen], len(points)
+    order, count = np.lexsort((circumradii(points, triangles), -votes)), len(points)
+    faces = with_single_fans(best_manifold(points, triangles[order]), count)
     known = set(edges_of(faces, count).keys.tolist())
     loops = [loop for loop in boundary_loops(faces, count) if len(loop) <= LOOP]
     found = [ears_of(loop, known, count, partial(circumradii, points)) for loop in loops]
     return np.concatenate([faces, *(np.array(ears) for ears in found if ears)])
-
-
-def _wedges(
-    points: Float[np.ndarray, "N n"], frames: Float[np.ndarray, "N n 2"], faces: Faces
-) -> tuple[Float[np.ndarray, "F 3"], Float[np.ndarray, "F 3"]]:
-    """First angle and width of every triangle at its corners, in the tangent planes there."""
-    ends = faces[:, [[2, 1], [0, 2], [1, 0]]]
-    x, y = np.moveaxis((points[ends] - points[faces][:, :, None]) @ frames[faces], -1, 0)
-    one, two = np.moveaxis(np.arctan2(y, x), -1, 0)
-    width = (two - one) % (2 * np.pi)
-    turned = width > np.pi
-    return np.where(turned, two, one), np.where(turned, 2 * np.pi - width, width)
-
-
-def _overlaps(start: float, width: float, others: list[tuple[float, float]]) -> bool:
-    """Whether a wedge, by its first angle and width, overlaps one of the others."""
-    for other, theirs in others:
-        ahead, behind = (start - other) % (2 * np.pi), (other - start) % (2 * np.pi)
-        if ahead < theirs - SLIGHT or behind < width - SLIGHT:
-            return True
-    return False
 
 
 def circumradii(points: Float[np.ndarray, "N n"], faces: Faces) -> Float[np.ndarray, " F"]:

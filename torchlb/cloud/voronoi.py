@@ -17,6 +17,7 @@ from jaxtyping import Bool, Float, Int
 from scipy import sparse
 from scipy.spatial import KDTree
 from torch import Tensor
+from torch.nn.functional import normalize
 
 from torchlb.cloud.frames import cloud_frames
 from torchlb.geometry.boundary import BoundaryPlan
@@ -24,7 +25,7 @@ from torchlb.geometry.compatibility import mutually_compatible, planes_of
 from torchlb.geometry.neighbors import adjacency, nearest_neighbors
 from torchlb.geometry.thresholds import CREASE, RING, WIDER
 from torchlb.geometry.vectors import Frames, Near, Points
-from torchlb.linalg.precision import rows_at_once
+from torchlb.linalg.precision import TINY, rows_at_once
 
 
 @cache
@@ -50,8 +51,7 @@ def _directions(
         return table.expand(len(coords), -1, -1)
     square = coords.square().sum(-1).masked_fill(~valid, torch.inf)
     nearest = coords[torch.arange(len(coords)), square.argmin(1)]
-    tiny = torch.finfo(coords.dtype).tiny  # the default, 1e-12, is a length
-    x, y = torch.nn.functional.normalize(nearest, dim=-1, eps=tiny).unbind(-1)
+    x, y = normalize(nearest, dim=-1, eps=TINY).unbind(-1)  # the default, 1e-12, is a length
     x = torch.where((x == 0) & (y == 0), 1.0, x)
     turn = torch.stack([torch.stack([x, y], -1), torch.stack([-y, x], -1)], dim=-2)
     return table @ turn
@@ -61,7 +61,7 @@ def _inverse_radius(
     coords: Float[Tensor, "B K d"], valid: Bool[Tensor, "B K"], directions: Float[Tensor, "B u d"]
 ) -> Float[Tensor, "B K u"]:
     """2 y_j·u / |y_j|², whose maximum over j is 1 / r(u) if positive; 0 for invalid neighbours."""
-    square = coords.square().sum(-1, keepdim=True).clamp_min(torch.finfo(coords.dtype).tiny)
+    square = coords.square().sum(-1, keepdim=True).clamp_min(TINY)
     return (2 * coords / square).masked_fill(~valid[..., None], 0.0) @ directions.mT
 
 
@@ -83,7 +83,7 @@ def cell_volume(coords: Float[Tensor, "B K d"], valid: Bool[Tensor, "B K"]) -> F
     """
     dim = coords.shape[-1]
     distance = coords.norm(dim=-1).masked_fill(~valid, 0)
-    farthest = distance.amax(1, keepdim=True).clamp_min(torch.finfo(coords.dtype).tiny)
+    farthest = distance.amax(1, keepdim=True).clamp_min(TINY)
     directions = _directions(coords, valid)
     inverse = _inverse_radius(coords, valid, directions)
     ahead = (inverse * distance[..., None] / 2).amax(1) > CREASE
@@ -97,7 +97,7 @@ def unrolled(
 ) -> Float[Tensor, "B K d"]:
     """Coordinates in the tangent plane at the true distance, so that neighbours above one another do not collapse."""
     coords = offset @ frames
-    length = coords.norm(dim=-1, keepdim=True).clamp_min(torch.finfo(coords.dtype).tiny)
+    length = coords.norm(dim=-1, keepdim=True).clamp_min(TINY)
     return coords * (offset.norm(dim=-1, keepdim=True) / length)
 
 
@@ -108,21 +108,18 @@ def nearest_graph(points: Points, frames: Frames, candidates: Near) -> sparse.cs
     natural neighbours in the tangent plane, which bridge the voids of an uneven cloud. `candidates` come from
     `nearest_neighbors`; an edge is compatible from both its ends.
     """
-    dim = frames.shape[-1]
-    wanted = 2 ** (dim + 1)
-    others = candidates[:, 1:]
+    dim, others = frames.shape[-1], candidates[:, 1:]
     num_rows, size = others.shape
     if size == 0:  # a single point
         return sparse.csr_array((num_rows, num_rows), dtype=np.float32)
     centers, flat, good = mutually_compatible(points, planes_of(frames), candidates)
-    chosen = good & (good.cumsum(1) <= wanted)
+    chosen = good & (good.cumsum(1) <= 2 ** (dim + 1))
     for rows in torch.arange(num_rows).split(rows_at_once(size * len(unit_directions(dim)))):
         offset = points[others[rows]] - points[rows, None]
         distance = offset.norm(dim=-1)
         near = good[rows]
         if dim > 1:
-            reach = WIDER * (distance * chosen[rows]).amax(1, keepdim=True)
-            near &= distance <= reach
+            near &= distance <= WIDER * (distance * chosen[rows]).amax(1, keepdim=True)
         chosen[rows] |= natural_neighbors(offset @ frames[rows], near)
     pick = chosen.reshape(-1).numpy()
     return adjacency(centers.numpy()[pick], flat.numpy()[pick], num_rows)

@@ -9,7 +9,7 @@ from jaxtyping import Bool, Float, Int
 from scipy.spatial import KDTree
 from torch import Tensor
 
-from torchlb.geometry.boundary import boundary_faces
+from torchlb.geometry.boundary import open_sides
 from torchlb.geometry.vectors import Points
 from torchlb.linalg.csr import Csr
 from torchlb.linalg.precision import LOW
@@ -83,7 +83,7 @@ class PairMatrices(Csr):
         these have the a of the nearest boundary vertex. P1 elements take B lumped to its row sums, but at least to a
         tenth of its absolute row sums.
         """
-        edge = boundary_faces(cells).unique()
+        edge = open_sides(cells)[0].unique()
         if len(self.values) < 3 or not (a[edge] > 0).any():
             return self
         nearest = torch.from_numpy(KDTree(points[edge].numpy()).query(points.numpy())[1])

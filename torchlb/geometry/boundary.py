@@ -12,9 +12,11 @@ from dataclasses import dataclass, replace
 from itertools import combinations
 from math import factorial
 
+import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
 from scipy import sparse
+from scipy.spatial import KDTree
 from torch import Tensor
 from torch.nn.functional import normalize
 
@@ -61,17 +63,21 @@ class BoundaryPlan:
 
     def at(self, points: Points, frames: Frames) -> Boundary:
         """Boundary at these coordinates, of a shape with these frames."""
-        members, own = self.members, points[self.members]
-        tangents = frames.new_zeros(len(members), points.shape[1], 0)
+        frames, (outward, *shares) = frames[self.members], self.measures(points)
+        conormal = frames[..., 0]  # of a curve
         if self.fits is not None:
-            tangents = LocalFits.at(self.fits, own, self.initial(points)).frames
-        outward, sizes, folds = self.measures(points)
-        conormals, every = torch.zeros_like(points), torch.zeros(2, len(points)).to(points)
-        conormals[members] = _conormals(frames[members], tangents, outward, self.crease)
-        every[1] = 1.0
-        every[:, members] = torch.stack([sizes, folds])
-        mask = self.mask.to(points)
-        return Boundary(self.mask, conormals * mask[:, None], every[0] * mask, every[1])
+            tangents = LocalFits.at(self.fits, points[self.members], self.initial(points)).frames
+            along, _ = torch.linalg.qr(frames.mT @ tangents)
+            conormal = (frames @ normals_of_frames(along)[..., None])[..., 0]
+        side = (conormal * outward).sum(-1, keepdim=True)
+        conormal = torch.where(side < 0, -conormal, conormal)
+        within = (frames @ (frames.mT @ outward[..., None]))[..., 0]
+        within = normalize(within, dim=-1, eps=TINY)
+        conormal = torch.where(self.crease[:, None], within, conormal)
+        mask, zero = self.mask.to(points), points.new_zeros(len(points))
+        parts = zip((torch.zeros_like(points), zero, zero + 1), (conormal, *shares), strict=True)
+        conormals, sizes, folds = (x.index_put((self.members,), part) for x, part in parts)
+        return Boundary(self.mask, conormals * mask[:, None], sizes * mask, folds)
 
     def initial(self, points: Points) -> Float[Tensor, "b n d_minus_1"]:
         """Initial tangents of the boundary."""
@@ -110,17 +116,12 @@ def sub_simplices(
     return torch.stack(columns, 1), of, uses
 
 
-def boundary_faces(faces: Int[Tensor, "F v"]) -> Int[Tensor, "G w"]:
-    """Sides that belong to one cell only: edges of triangles, ends of segments.
+def open_sides(cells: Int[Tensor, "F v"]) -> tuple[Int[Tensor, "G w"], Int[Tensor, " G"]]:
+    """(sides of one cell only: edges of triangles, ends of segments; the corner opposite each).
 
-    >>> boundary_faces(torch.tensor([[0, 1, 2], [1, 3, 2]])).tolist()
+    >>> open_sides(torch.tensor([[0, 1, 2], [1, 3, 2]]))[0].tolist()
     [[0, 1], [0, 2], [1, 3], [2, 3]]
     """
-    return open_sides(faces)[0]
-
-
-def open_sides(cells: Int[Tensor, "F v"]) -> tuple[Int[Tensor, "G w"], Int[Tensor, " G"]]:
-    """(`boundary_faces`; the opposite corner of each in its cell)."""
     count = cells.shape[1]
     sides, of, uses = sub_simplices(cells, list(combinations(range(count), count - 1)))
     cell, place = (uses[of] == 1).nonzero(as_tuple=True)
@@ -144,17 +145,10 @@ def folded_sides(points: Points, cells: Int[Tensor, "F 4"]) -> Int[Tensor, "G 3"
     ends = sides[:, [[1, 2], [0, 2], [0, 1]]]
     start, stop = points[ends].unbind(2)
     along, inward = normalize(stop - start, dim=-1), points[sides] - start
-    away = normalize(inward - (inward * along).sum(-1, keepdim=True) * along, dim=-1).flatten(0, 1)
-    key, order = (ends[..., 0] * len(points) + ends[..., 1]).flatten().sort()
-    folded = torch.zeros_like(key, dtype=torch.bool)
-    for shift in range(1, len(key)):
-        one, two = order[:-shift], order[shift:]
-        same = key[:-shift] == key[shift:]
-        if not same.any():
-            break
-        on = same & ((away[one] - away[two]).norm(dim=1) < SMALL)
-        folded[one[on]] = folded[two[on]] = True
-    return sides[folded.view(-1, 3).any(1)]
+    away = normalize(inward - (inward * along).sum(-1, keepdim=True) * along, dim=-1)
+    edge = (ends[..., 0] * len(points) + ends[..., 1]).unique(return_inverse=True)[1]
+    tree = KDTree(torch.cat([edge[..., None], away], -1).flatten(0, 1).numpy())
+    return sides[np.unique(tree.query_pairs(SMALL, output_type="ndarray") // 3)]
 
 
 def boundary_of_mesh(
@@ -200,21 +194,3 @@ def outward_sums(
         outward.index_add_(0, corner, normal)
         total.index_add_(0, corner, size)
     return outward, total
-
-
-def _conormals(
-    frames: Float[Tensor, "b n d"],
-    tangents: Float[Tensor, "b n d_minus_1"],
-    outward: Float[Tensor, "b n"],
-    crease: Bool[Tensor, " b"],
-) -> Float[Tensor, "b n"]:
-    """Unit tangent vectors normal to the boundary, towards `outward`; on a crease the projection of `outward`."""
-    if tangents.shape[-1] == 0:
-        conormal = frames[..., 0]
-    else:
-        along, _ = torch.linalg.qr(frames.mT @ tangents)
-        conormal = (frames @ normals_of_frames(along)[..., None])[..., 0]
-    side = (conormal * outward).sum(-1, keepdim=True)
-    conormal = torch.where(side < 0, -conormal, conormal)
-    within = (frames @ (frames.mT @ outward[..., None]))[..., 0]
-    return torch.where(crease[:, None], normalize(within, dim=-1, eps=TINY), conormal)

@@ -16,12 +16,12 @@ from scipy.sparse import csgraph
 from scipy.spatial import Delaunay
 from torch import Tensor
 
-from torchlb.geometry.vectors import Mask, Vectors, inner
+from torchlb.geometry.vectors import Coords, Mask, Vectors, inner
 
 Faces = Int[np.ndarray, "_ 3"]
 
 
-def delaunay(points: Float[np.ndarray, "N n"]) -> Delaunay:
+def delaunay(points: Coords) -> Delaunay:
     """Delaunay simplices by Qhull, of centred points of size about one, since its tolerances are lengths."""
     centered = points - points.mean(0)
     return Delaunay(np.ldexp(centered, -np.frexp(np.abs(centered).max())[1]))
@@ -84,11 +84,8 @@ class Edges:
     @cached_property
     def outer(self) -> Mask:
         """Points on the boundary or in no face."""
-        result = np.ones(self.count, dtype=bool)
-        result[self.faces.ravel()] = False
-        for end in self.ends:
-            result[end[self.boundary]] = True
-        return result
+        every, rim = np.arange(self.count), [end[self.boundary] for end in self.ends]
+        return np.isin(every, rim) | ~np.isin(every, self.faces)
 
     def find(
         self, tail: np.ndarray, head: np.ndarray
@@ -96,9 +93,8 @@ class Edges:
         """(number of the edge between two points; number of its faces, 0 if there is no such edge)."""
         key = np.minimum(tail, head) * self.count + np.maximum(tail, head)
         place = np.searchsorted(self.keys, key)
-        place[place == len(self.keys)] = 0
-        there = self.keys[place] == key if len(self.keys) else np.zeros(key.shape, dtype=bool)
-        return place, np.where(there, self.uses[place] if len(self.uses) else 0, 0)
+        there = np.append(self.keys, -1)[place] == key
+        return place * there, np.append(self.uses, 0)[place] * there
 
 
 def _order(key: Int[np.ndarray, " K"], count: int) -> Int[np.ndarray, " K"]:
@@ -173,14 +169,12 @@ def seams(faces: Int[Tensor, "F v"], count: int) -> Bool[Tensor, " N"]:
     >>> seams(torch.tensor([[0, 1, 2], [0, 1, 3]]), 4).tolist()
     [True, True, False, False]
     """
-    found = torch.zeros(count, dtype=torch.bool)
     if faces.shape[1] == 2:
         return (torch.stack([torch.bincount(end, minlength=count) for end in faces.T]) > 1).any(0)
     tail, head = faces.flatten(), faces.roll(-1, 1).flatten()
     _, number, uses = torch.unique(tail * count + head, return_inverse=True, return_counts=True)
     again = uses[number] > 1  # a directed edge
-    found[tail[again]] = found[head[again]] = True
-    return found
+    return torch.isin(torch.arange(count), torch.stack([tail[again], head[again]]))
 
 
 def consistently_wound(faces: Int[Tensor, "F v"]) -> bool:

@@ -6,7 +6,7 @@ from collections.abc import Iterator
 from math import ceil
 
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Int
 from torch import Tensor
 
 from torchlb.fits.polynomials import num_monomials
@@ -57,10 +57,10 @@ class FitSearch:
         self.highest = max(frame_degree, *degrees, 0) if degrees else 0
         self.jet, self.reach = (1, 0.5) if max(degrees, default=0) <= 3 else (degrees[0], 1.0)
         self.fits = LocalFits(neighborhoods.points, neighborhoods.frames, self.highest)
-        self.order, self.degree, self.surface_degree, self.size, self.tried, self.owner = (
-            torch.zeros(6, count, dtype=torch.int64)
+        self.order, self.degree, self.surface_degree, self.size, self.tried = torch.zeros(
+            5, count, dtype=torch.int64
         )
-        self.reason, self._takings = torch.ones_like(self.order), 0
+        self.reason = torch.ones_like(self.order)
         self._surface: dict[tuple[int, int], list[tuple[Tensor, ...]]] = {}
         self._functions: dict[tuple[int, int], list[tuple[Tensor, ...]]] = {}
 
@@ -70,23 +70,22 @@ class FitSearch:
         Each centre takes the first candidate whose fit is regular and tilted by less than 60°. On a mesh it keeps its
         initial plane where the points do not follow the fit as those of a stencil have to follow theirs.
         """
-        middles = self.neighborhoods.middles(centers)
+        middles, dim = self.neighborhoods.middles(centers), self.neighborhoods.dim
         search = Search(self.neighborhoods, centers, self.candidates)
         steepest = 1 / CREASE**2 - 1  # |∇H|² of a tilt of 60°, bounded by the Frobenius norm
         for number, rows, index in search:
             block = _block(self.candidates[number].degree, centers[rows], index)
             fit, heights, graph = self.fits.fitted(block)
             regular = is_regular(fit, middles[rows], block.degree)
-            flat_enough = slope_of(fit, graph, self.fits.initial).square().sum((1, 2)) <= steepest
+            flat_enough = slope_of(fit, graph, dim).square().sum((1, 2)) <= steepest
             apart, passed = fit.apart(heights, graph), regular & flat_enough  # false for NaN
             if self.on_mesh:
-                dim = self.neighborhoods.dim
                 bound = resolution(dim, block.degree, on_mesh=True, normals=True)
                 unresolved = regular & (fit.scatter(heights, apart, dim) > bound)
                 search.settle(rows[unresolved])
                 passed &= ~unresolved
             self.order[centers[rows[passed]]] = block.degree
-            self._keep_surface(block, fit, apart, graph, regular, passed)
+            self._keep_surface(block._replace(frame=passed), fit, apart, graph, regular)
             if number == 0 and self.degrees:
                 self._offer(block, fit, apart, graph)
             search.settle(rows[passed])
@@ -112,8 +111,8 @@ class FitSearch:
                 keep = torch.arange(1, few) < count[some, None]
                 self._try(_block(degree, vertices[some], index[some], keep))
         surface, functions = [], []
-        for degree, (*block, owner) in _joined(self._surface):
-            block[-1] &= self.owner[block[0]] == owner
+        for degree, block in _joined(self._surface):
+            block[-1] &= self.surface_degree[block[0]] == degree  # of each, its best graph alone
             kept = block[-1] | block[-2]
             surface.append(Neighborhoods(degree, *(column[kept] for column in block)))
         for degree, (*block, coefficients) in _joined(self._functions):
@@ -147,29 +146,21 @@ class FitSearch:
         degree = min(block.degree, self.jet)
         terms = num_monomials(self.neighborhoods.dim, degree) - 1
         regular = is_regular(fit, self.neighborhoods.middles(block.vertices), degree)
-        good = self._keep_surface(block, fit, apart, graph, regular, torch.zeros_like(regular))
+        good = self._keep_surface(block, fit, apart, graph, regular)
         if good.any():
             found, size = block.vertices[good], block.points.shape[1]
-            none = torch.zeros(2, len(found), dtype=torch.bool)
-            points, kept = block.points[good].int(), fit.coefficients[good, :terms]
-            rows = found, points, block.keep[good], *none, kept
+            columns = *block._replace(points=block.points.int())[1:], fit.coefficients[:, :terms]
+            rows = tuple(column[good] for column in columns)
             self._functions.setdefault((block.degree, size), []).append(rows)
             self.degree[found], self.size[found] = block.degree, size
             self.fits.radius[found] = fit.radius[good]
         return good
 
     def _keep_surface(
-        self,
-        block: Neighborhoods,
-        fit: CenteredFit,
-        apart: Float[Tensor, "b neighbors"],
-        graph: Float[Tensor, "b M n"],
-        regular: Bool[Tensor, " b"],
-        frame: Bool[Tensor, " b"],
+        self, block: Neighborhoods, fit: CenteredFit, apart: Tensor, graph: Tensor, regular: Tensor
     ) -> Bool[Tensor, " b"]:
         """Keep tangent planes, and graphs of a higher degree than before that follow the heights; return which do."""
-        vertices, good = block.vertices, regular
-        new = torch.zeros_like(frame)
+        vertices, good, new = block.vertices, regular, block.surface
         if self.degrees:
             # quadratics are the last resort
             misfit = apart.amax(1) / fit.radius
@@ -180,24 +171,17 @@ class FitSearch:
                 self.reason[vertices] = torch.where(vacant, reason, self.reason[vertices])
             new = good & vacant
             self.surface_degree[vertices[new]] = fit.degree
-        taken = block._replace(frame=frame, surface=new)
+        taken = block._replace(points=block.points.int(), surface=new)
         self.fits.take_surface(taken, fit, graph)
-        rows = (frame | new).nonzero()[:, 0]
+        rows = (block.frame | new).nonzero()[:, 0]
         if len(rows):
-            self._takings += 1
-            self.owner[vertices[new]] = self._takings
-            columns = (vertices, block.points.int(), block.keep, frame, new)
-            owner = torch.full((len(rows),), self._takings)
             kept = self._surface.setdefault((block.degree, block.points.shape[1]), [])
-            kept.append((*(at(column, rows) for column in columns), owner))
+            kept.append(tuple(at(column, rows) for column in taken[1:]))
         return good
 
 
 def _block(
-    degree: int,
-    vertices: Int[Tensor, " b"],
-    points: Int[Tensor, "b K"],
-    keep: Bool[Tensor, "b neighbors"] | None = None,
+    degree: int, vertices: Tensor, points: Tensor, keep: Tensor | None = None
 ) -> Neighborhoods:
     """Neighbourhoods with no flag set; without `keep` all points count."""
     keep = torch.ones_like(points[:, 1:], dtype=torch.bool) if keep is None else keep

@@ -47,14 +47,14 @@ def mesh_frames(vertices: Points, faces: Int[Tensor, "F v"]) -> Frames:
 
 def summed_projectors(vertices: Points, faces: Int[Tensor, "F v"]) -> Float[Tensor, "N n n"]:
     """Sums at each vertex of the projectors onto the planes of its faces, weighted by d! times their areas."""
-    dim = faces.shape[1] - 1
-    edges = _edges(vertices, faces)
+    corners = at(vertices, faces)
+    edges = corners[:, 1:] - corners[:, :1]
     if vertices.requires_grad:  # simplices without volume have no weight, and no derivative
         sound = torch.linalg.det(edges.detach() @ edges.detach().mT) > 0
         faces, edges = faces[sound], edges[sound]
     basis, triangle = torch.linalg.qr(edges.mT)
     area = torch.diagonal(triangle, dim1=-2, dim2=-1).prod(-1).abs()
-    projector = (area[:, None, None] * (basis @ basis.mT)).repeat_interleave(dim + 1, dim=0)
+    projector = (area[:, None, None] * (basis @ basis.mT)).repeat_interleave(faces.shape[1], dim=0)
     total = vertices.new_zeros(len(vertices), *projector.shape[1:])
     return total.index_add_(0, faces.reshape(-1), projector)
 
@@ -115,10 +115,7 @@ def local_offsets(
 
 
 def local_heights(
-    points: Points,
-    frames: Frames,
-    index: Int[Tensor, "B K"],
-    coords: Float[Tensor, "B neighbors d"],
+    points: Points, frames: Frames, index: Int[Tensor, "B K"], coords: Tensor
 ) -> Float[Tensor, "B neighbors n"]:
     """Heights e − E_i y of the neighbours over their coordinates y in the centre's tangent plane, as vectors in Rⁿ."""
     offset = at(points, index[:, 1:]) - at(points, index[:, 0])[:, None]
@@ -144,17 +141,12 @@ def normals_of_frames(frames: Frames) -> Points:
     return torch.stack([(-1) ** (n - 1 + i) * minor for i, minor in enumerate(minors)], 1)
 
 
-def _edges(vertices: Points, faces: Int[Tensor, "F v"]) -> Float[Tensor, "F edges n"]:
-    """Edges from the first corner of each face to the others."""
-    corners = at(vertices, faces)
-    return corners[:, 1:] - corners[:, :1]
-
-
 def summed_normals(
     vertices: Points, faces: Int[Tensor, "F n"]
 ) -> tuple[Points, Float[Tensor, " N"]]:
     """(sums of the normals of the faces at every vertex, weighted by (n − 1)! times their areas; bound of its size)."""
-    edges = _edges(vertices, faces)
+    corners = at(vertices, faces)
+    edges = corners[:, 1:] - corners[:, :1]
     if vertices.shape[1] == 3:
         normal = torch.linalg.cross(edges[:, 0], edges[:, 1])
     else:

@@ -121,9 +121,9 @@ class LocalFits:
         Offsets, (b, K − 1, n), are from the vertex, coordinates, (b, K − 1, d), those of the offsets in the initial
         tangent planes.
         """
-        frame, places = at(self.initial, block.vertices), at(self.points, block.points)
+        places, keep = at(self.points, block.points), None if block.keep.all() else block.keep
         offset = places[:, 1:] - places[:, :1]
-        coords, keep = offset @ frame, None if block.keep.all() else block.keep
+        coords = offset @ at(self.initial, block.vertices)
         return centered_fit(coords, block.degree, keep), offset, coords
 
     def fitted(
@@ -142,30 +142,21 @@ class LocalFits:
         """Store the tangent planes and the graphs of these fits."""
         on = block.frame
         if on.any():
-            slope = slope_of(fit, graph, self.initial)[on].mT
-            tilted = at(self.initial, block.vertices[on]) + slope
+            dim = self.initial.shape[2]
+            tilted = at(self.initial, block.vertices[on]) + slope_of(fit, graph, dim)[on].mT
             self.frames[block.vertices[on]] = orthonormalized(tilted)
             if block.degree > 1:
-                self.second[block.vertices[on]] = second_of(fit, graph, tilted.shape[2])[on]
+                row, column = torch.triu_indices(dim, dim)
+                terms = graph[on, dim : dim + len(row)] / fit.radius[on, None, None] ** 2
+                half = torch.zeros_like(self.second[block.vertices[on]])
+                half[:, row, column] = terms
+                self.second[block.vertices[on]] = half + half.transpose(1, 2)
         on = block.surface
         if on.any():
             self.heights[block.vertices[on], : graph.shape[1]] = graph[on]
             self.surface_radius[block.vertices[on]] = fit.radius[on]
 
 
-def slope_of(
-    fit: CenteredFit, graph: Float[Tensor, "b M n"], frames: Frames
-) -> Float[Tensor, "b d n"]:
+def slope_of(fit: CenteredFit, graph: Float[Tensor, "b M n"], dim: int) -> Float[Tensor, "b d n"]:
     """First derivatives of the fitted heights, vectors in the normal space."""
-    return graph[:, : frames.shape[2]] / fit.radius[:, None, None]
-
-
-def second_of(
-    fit: CenteredFit, graph: Float[Tensor, "b M n"], dim: int
-) -> Float[Tensor, "b d d n"]:
-    """Second derivatives of the fitted heights, vectors in the normal space."""
-    row, column = torch.triu_indices(dim, dim)
-    found = graph.new_zeros(len(graph), dim, dim, graph.shape[2])
-    terms = graph[:, dim : dim + len(row)] / fit.radius[:, None, None] ** 2
-    found[:, row, column] = terms
-    return found + found.transpose(1, 2)
+    return graph[:, :dim] / fit.radius[:, None, None]

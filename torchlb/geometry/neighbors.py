@@ -54,13 +54,10 @@ def mesh_graph(faces: Int[Tensor, "F v"], num_points: int) -> sparse.csr_array:
 
 
 def restricted(
-    graph: sparse.csr_array, starts: Mask, stops: Mask | None = None
+    graph: sparse.csr_array, starts: Mask, stops: Mask | bool = True
 ) -> sparse.csr_array:
     """The edges of a graph from some of its points, and to some of them: a walk ends at the others."""
-    kept = sparse.diags_array(starts.astype(graph.dtype)) @ graph
-    if stops is not None:
-        kept = kept @ sparse.diags_array(stops.astype(graph.dtype))
-    kept = sparse.csr_array(kept)
+    kept = sparse.csr_array(graph.multiply(starts[:, None]).multiply(stops))
     kept.eliminate_zeros()
     return kept
 
@@ -129,26 +126,18 @@ class GraphNeighborhoods:
         index, count = self._kept[largest]
         missing = centers[count[centers] == 0]
         if len(missing):
-            index[missing], count[missing] = self._grown(missing, largest)
+            from torchlb.linalg import kernels
+
+            wanted = WIDER * largest
+            found = kernels.k_hop_neighborhoods(
+                **self._arrays,
+                centers=missing.numpy(),
+                size=largest,
+                wanted=wanted,
+                # twice as many as in a round neighbourhood, so that none grows along a strip alone
+                rings=ceil(wanted ** (1 / self.dim)),
+                slope=HALF_CREASE,
+                alignment=CREASE,
+            )
+            index[missing], count[missing] = map(torch.from_numpy, found)
         return index[centers, :size].long(), count[centers].long().clamp_max(size)
-
-    def _grown(
-        self, centers: Int[Tensor, " B"], size: int
-    ) -> tuple[Int[Tensor, "B K"], Int[Tensor, " B"]]:
-        """(neighbourhoods; numbers of their points).
-
-        The bound on the rings is twice the number in a round neighbourhood, so that none grows along a strip alone.
-        """
-        from torchlb.linalg import kernels
-
-        wanted = WIDER * size
-        index, count = kernels.k_hop_neighborhoods(
-            **self._arrays,
-            centers=centers.numpy(),
-            size=size,
-            wanted=wanted,
-            rings=ceil(wanted ** (1 / self.dim)),
-            slope=HALF_CREASE,
-            alignment=CREASE,
-        )
-        return torch.from_numpy(index), torch.from_numpy(count)

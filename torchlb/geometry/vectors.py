@@ -16,6 +16,10 @@ Frames = Float[Tensor, "N n d"]
 """Orthonormal tangent frame of every point."""
 Near = Int[Tensor, "N K"]
 """Points near every point, itself first."""
+Coords = Float[np.ndarray, "N n"]
+"""`Points` as an array."""
+Nearest = Int[np.ndarray, "N K"]
+"""`Near` as an array."""
 Vectors = Float[np.ndarray, "N 3"]
 """A point or a vector of every point of a surface in R³."""
 Mask = Bool[np.ndarray, " N"]

@@ -10,7 +10,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from torchlb.errors import InputError
-from torchlb.geometry.boundary import boundary_faces
+from torchlb.geometry.boundary import open_sides
 from torchlb.linalg.checks import check_tensor, takes_arrays
 from torchlb.linalg.csr import tensors_of
 from torchlb.operator.report import StencilReport
@@ -220,7 +220,7 @@ class StencilMethods(OperatorStorage):
 
     def _boundary_points(self) -> Bool[Tensor, " N"]:
         """Mask of the boundary points, whether or not a condition holds there."""
-        sides = boundary_faces(self.faces.cpu()).flatten().to(self.mass.device)
+        sides = open_sides(self.faces.cpu())[0].flatten().to(self.mass.device)
         found = torch.zeros_like(self.mass, dtype=torch.bool).index_fill(0, sides, True)
         return found if self.boundary is None else found | self.boundary
 
