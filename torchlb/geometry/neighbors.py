@@ -86,14 +86,12 @@ class GraphNeighborhoods:
         return self.frames.shape[-1]
 
     @cached_property
-    def _arrays(self) -> dict[str, np.ndarray]:
-        """Arguments of the compiled walk."""
+    def _arrays(self) -> tuple[tuple[np.ndarray, ...], tuple[np.ndarray, ...]]:
+        """Shape and graph for the compiled walk."""
         sides = torch.zeros_like(self.points) if self.sides is None else self.sides
-        planes = plucker_coordinates(self.frames)
-        shape = {"points": self.points, "frames": self.frames, "planes": planes, "sides": sides}
-        rows = {"indptr": self.graph.indptr, "indices": self.graph.indices}
-        arrays = {name: x.contiguous().numpy() for name, x in shape.items()}
-        return arrays | {name: x.astype(np.int32) for name, x in rows.items()}
+        shape = self.points, self.frames, plucker_coordinates(self.frames), sides
+        rows = self.graph.indptr, self.graph.indices
+        return tuple(x.contiguous().numpy() for x in shape), tuple(x.astype(np.int32) for x in rows)
 
     @cached_property
     def longest(self) -> Int[Tensor, "N edges"]:
@@ -142,13 +140,7 @@ class GraphNeighborhoods:
         from torchlb.linalg import kernels
 
         wanted = WIDER * size
-        index, count = kernels.k_hop_neighborhoods(
-            **self._arrays,
-            centers=centers.numpy(),
-            size=size,
-            wanted=wanted,
-            rings=ceil(wanted ** (1 / self.dim)),
-            slope=HALF_CREASE,
-            alignment=CREASE,
-        )
-        return torch.from_numpy(index), torch.from_numpy(count)
+        bounds = float(wanted), ceil(wanted ** (1 / self.dim)), HALF_CREASE, CREASE
+        found = kernels.k_hop_neighborhoods(*self._arrays, centers.numpy(), size, bounds)
+        index, count = map(torch.from_numpy, found)
+        return index, count
