@@ -51,14 +51,17 @@ def csr_product(
     """Product A x of a CSR matrix, or Aᵀ x, differentiable any number of times in `values` and in `x`.
 
     The pattern is [crow, col, crow_t, col_t, order_t] of A and, from `transpose_pattern`, of its transpose, int32 or
-    int64. The product is computed in the wider of the types of `values` and `x`, and at least in float32, also under
-    autocast; the result has that type, or that of a half-precision x.
+    int64; [crow, col] for a symmetric A, with derivatives in x alone. The product is computed in the wider of the types
+    of `values` and `x`, and at least in float32, also under autocast; the result has that type, or that of a
+    half-precision x.
 
     >>> crow, col, values = torch.tensor([0, 2, 3]), torch.tensor([0, 1, 1]), torch.tensor([1.0, 2.0, 3.0])
     >>> pattern = [crow, col, *transpose_pattern(crow, col, 2)]
     >>> csr_product(pattern, values, torch.tensor([[1.0], [10.0]])).tolist()
     [[21.0], [30.0]]
     """
+    if len(pattern) == 2:  # as if A were its own transpose, entry by entry
+        pattern = *pattern, *pattern, torch.arange(len(pattern[1]), device=pattern[1].device)
     inputs = *pattern, values, x, transposed
     return _product_op(*inputs) if torch.compiler.is_compiling() else _Product.apply(*inputs)  # pyright: ignore[reportReturnType]
 
@@ -125,24 +128,6 @@ def values_on(
     places = np.arange(count).repeat(np.diff(crow)) * count + col
     values[np.searchsorted(places, row * count + column)] = entries.data
     return values
-
-
-def symmetric_product(
-    crow: Int[Tensor, " N_plus_1"],
-    col: Int[Tensor, " nnz"],
-    values: Float[Tensor, " nnz"],
-    x: Float[Tensor, "N C"],
-) -> Float[Tensor, "N C"]:
-    """A x for a symmetric A, differentiable any number of times in x alone; types as in `csr_product`.
-
-    >>> x = torch.ones(2, 1, requires_grad=True)
-    >>> y = symmetric_product(torch.tensor([0, 1, 2]), torch.tensor([0, 1]), torch.tensor([2.0, 4.0]), x)
-    >>> torch.autograd.grad(y.sum(), x)[0].T
-    tensor([[2., 4.]])
-    """
-    # as if A were its own transpose, entry by entry
-    order = torch.arange(len(col), device=col.device)
-    return csr_product([crow, col, crow, col, order], values, x)
 
 
 def _product(*inputs: Any) -> Tensor:
@@ -299,17 +284,14 @@ def from_scipy(matrix: Any) -> tuple[Tensor, Tensor, Tensor]:
     """
     matrix = sparse.csr_array(matrix, copy=True)
     matrix.sum_duplicates()
-    crow, col = (
-        torch.from_numpy(part.astype(np.int64)) for part in (matrix.indptr, matrix.indices)
-    )
-    return crow, col, torch.from_numpy(matrix.data)
+    crow, col, values = on_device(matrix, torch.device("cpu"))
+    return crow.long(), col.long(), values
 
 
 def on_device(matrix: sparse.csr_array, device: torch.device) -> tuple[Tensor, Tensor, Tensor]:
     """(crow, col, values) of a scipy CSR matrix on a device; on the CPU in the same memory."""
-    crow, col, values = (
-        torch.from_numpy(part).to(device) for part in (matrix.indptr, matrix.indices, matrix.data)
-    )
+    parts = matrix.indptr, matrix.indices, matrix.data
+    crow, col, values = (torch.from_numpy(part).to(device) for part in parts)
     return crow, col, values
 
 

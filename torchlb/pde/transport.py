@@ -197,4 +197,4 @@ def _time(lb: LaplaceBeltrami, distance: Tensor) -> Float[Tensor, ""]:
 
 def _step(fields: Any, b: Float[Tensor, "rows C"], t: Float[Tensor, ""]) -> Float[Tensor, "rows C"]:
     """(M + tK)⁻¹b, as exact as rounding allows, since values far away are tiny."""
-    return solved(fields, b, t.to(b).expand(b.shape[1]), torch.zeros_like(b), None, ROUNDING)
+    return solved(fields, b, t.to(b).expand(b.shape[1]), tolerance=ROUNDING)
