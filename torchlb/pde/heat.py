@@ -51,7 +51,8 @@ def heat_flow(
     """e^{tΔ}f: f after diffusion over the surface for a time t; differentiable in f and t.
 
     Computed in the wider of the types of f and the operator, at least float32; only a half-precision f gets its own
-    type back.
+    type back. Raises InputError for times that are negative or not finite, an unknown method, a wrong shape, a
+    tolerance that is not between 0 and 1, an operator without a weak pair.
 
     Parameters
     ----------
@@ -68,12 +69,6 @@ def heat_flow(
     tolerance
         Bound on the error in the norm of M, relative to |f|. Where all values around are smaller, as far from a heated
         point, they are noise: their logarithms and directions (geodesics) need an implicit step.
-
-    Raises
-    ------
-    InputError
-        For times that are negative or not finite, an unknown method, a wrong shape, a tolerance that is not between 0
-        and 1, an operator without a weak pair.
 
     Examples
     --------

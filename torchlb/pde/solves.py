@@ -94,8 +94,6 @@ def poisson_solve(
     zero, and the data are made compatible: the total of f and flux is subtracted from f, evenly. Arguments and errors
     as for `implicit_step`.
 
-    Examples
-    --------
     >>> from torchlb.surfaces import Sphere
     >>> vertices, faces = Sphere().mesh(300)
     >>> lb = LaplaceBeltrami.from_mesh(vertices, faces)
@@ -210,15 +208,14 @@ def potential(
         ]
     check_pair(lb)
     columns = side_by_side(sum(products[1:], products[0]).double())
-    if source is None and field is not None:
-        source = field[..., 0, :]
-    assert source is not None, "neither field nor source"
+    given = field if source is None else source
+    assert given is not None, "neither field nor source"
     if tolerance == "P1":
         columns = without(lb, columns, "solutions by P1 elements")
         u = _solve(columns, None, None, None, lb, None, tolerance)
     else:
         u = solved(lb, columns, tolerance=tolerance)
-    return shaped_like(u, source).to(source.dtype)
+    return shaped_like(u, products[0]).to(given.dtype)
 
 
 def _with_conductivity(lb: PairMethods, conductivity: Tensor | None) -> PairMethods:
