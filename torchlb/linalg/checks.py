@@ -24,25 +24,30 @@ def takes_arrays(function: Callable[P, T]) -> Callable[P, T]:
 
     Arrays go to the device of the operator or basis; masked values become NaN. Results have no gradients.
     """
-    signature = inspect.signature(function)
-    place, data_name = next(x for x in enumerate(signature.parameters) if x[1] in DATA)
+    names = list(inspect.signature(function).parameters)
+    place = next(i for i, name in enumerate(names) if name in DATA)
+    data_name = names[place]
 
     @wraps(function)
-    def called(*args: Any, **options: Any) -> Any:
+    def called(*args: P.args, **options: P.kwargs) -> T:
         data = args[place] if len(args) > place else options.get(data_name)
-        if not isinstance(data, np.ndarray):
-            return function(*args, **options)
-        given = signature.bind(*args, **options).arguments
-        mass = next((x.mass for x in given.values() if hasattr(x, "mass")), None)
-        for name, x in given.items():
-            if isinstance(x, np.ndarray):
-                x = np.ma.filled(x, np.nan)
-                x = torch.tensor(x.astype(x.dtype.newbyteorder("=")))
-                given[name] = x.to(getattr(mass, "device", None))
-        result: Any = function(**given)  # pyright: ignore[reportCallIssue]
-        return result.detach().cpu().numpy()
+        if isinstance(data, np.ndarray):
+            return _of_arrays(function, *args, **options)
+        return function(*args, **options)
 
     return called
+
+
+def _of_arrays(function: Any, *args: Any, **options: Any) -> Any:
+    """The result as an array, with tensors in the place of the arrays that are given."""
+    given = inspect.signature(function).bind(*args, **options).arguments
+    mass = next((x.mass for x in given.values() if hasattr(x, "mass")), None)
+    for name, x in given.items():
+        if isinstance(x, np.ndarray):
+            x = np.ma.filled(x, np.nan)
+            x = torch.tensor(x.astype(x.dtype.newbyteorder("=")))
+            given[name] = x.to(getattr(mass, "device", None))
+    return function(**given).detach().cpu().numpy()
 
 
 def check_tensor(f: object, what: str = "f") -> None:
