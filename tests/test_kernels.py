@@ -206,10 +206,10 @@ def test_graph_balls_are_what_walks_reach(n, dim):
     graph.eliminate_zeros()
     sides = sides + 2 * torch.eye(n, dtype=torch.float64)[0]
     planes = plucker_coordinates(frames)
-    shape = (x.contiguous().numpy() for x in (points, frames, planes, sides))
+    shape = tuple(x.contiguous().numpy() for x in (points, frames, planes, sides))
     rows = graph.indptr.astype(np.int32), graph.indices.astype(np.int32)
-    bounds = 12, 18.0, 4, HALF_CREASE, CREASE
-    index, count = kernels.k_hop_neighborhoods(*shape, *rows, np.arange(120), *bounds)
+    bounds = 18.0, 4, HALF_CREASE, CREASE
+    index, count = kernels.k_hop_neighborhoods(shape, rows, np.arange(120), 12, bounds)
     for center in range(120):
         expected = grown(points, frames, sides, graph, center, 12, 18.0, 4)
         assert index[center, : count[center]].tolist() == expected

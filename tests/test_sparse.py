@@ -15,8 +15,7 @@ from torch.autograd import grad, gradcheck, gradgradcheck
 from tolerances import TOLERANCE
 from torchlb import LaplaceBeltrami
 from torchlb.linalg.sparse import (
-    _product_op,
-    _values_gradient_op,
+    _form_op,
     csr_product,
     from_scipy,
     to_scipy,
@@ -119,7 +118,7 @@ def test_third_derivative_is_that_of_the_dense_matrix():
 def test_gradient_in_x_alone_does_not_compute_that_in_values(monkeypatch):
     product, x = Product(5, 4), features(4, 2)
     product.requires_grad_(False)
-    monkeypatch.setattr("torchlb.linalg.sparse._values_gradient", None)
+    monkeypatch.setattr("torchlb.linalg.sparse._values", None)
     close(grad(product(x).sum(), x)[0], product.dense().sum(0)[:, None].expand(4, 2))
 
 
@@ -192,9 +191,9 @@ def test_exported_for_any_number_of_columns_it_gives_the_same():
 @pytest.mark.parametrize("dtype", [*FLOATS, torch.bfloat16])
 def test_operations_are_registered_as_pytorch_asks(dtype):
     product, x, y = Product(6, 5, dtype), features(5, 3, dtype), features(6, 3, dtype)
-    torch.library.opcheck(_product_op, (*product.pattern, product.values, x, False))
-    torch.library.opcheck(_product_op, (*product.pattern, product.values, y, True))
-    torch.library.opcheck(_values_gradient_op, (*product.pattern, y, x))
+    given = ("product", product.values, x), ("transposed", product.values, y), ("values", y, x)
+    for kind, a, b in given:
+        torch.library.opcheck(_form_op, (*product.pattern, a, b, kind))
 
 
 def test_a_copied_module_gives_the_same():

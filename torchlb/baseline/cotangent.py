@@ -9,7 +9,6 @@ from scipy import sparse
 from torch import Tensor
 
 from torchlb.errors import InputError, first_few
-from torchlb.linalg.sparse import with_diagonal
 
 
 def cotangent_laplacian(
@@ -33,6 +32,6 @@ def cotangent_laplacian(
             "none, whose cotangents are infinite; remove these triangles, or use LaplaceBeltrami.from_mesh, which "
             "accepts them"
         )
-    return with_diagonal(sparse.csr_array(sparse.diags_array(1 / area) @ weak)), torch.from_numpy(
-        area.copy()
-    )
+    strong = sparse.coo_array(sparse.diags_array(1 / area) @ weak)
+    strong.setdiag(strong.diagonal())  # stored even where it is zero
+    return sparse.csr_array(strong), torch.from_numpy(area.copy())

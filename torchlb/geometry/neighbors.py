@@ -83,14 +83,12 @@ class GraphNeighborhoods:
         return self.frames.shape[-1]
 
     @cached_property
-    def _arrays(self) -> dict[str, np.ndarray]:
-        """Arguments of the compiled walk."""
+    def _arrays(self) -> tuple[tuple[np.ndarray, ...], tuple[np.ndarray, ...]]:
+        """Shape and graph for the compiled walk."""
         sides = torch.zeros_like(self.points) if self.sides is None else self.sides
-        planes = plucker_coordinates(self.frames)
-        shape = {"points": self.points, "frames": self.frames, "planes": planes, "sides": sides}
-        rows = {"indptr": self.graph.indptr, "indices": self.graph.indices}
-        arrays = {name: x.contiguous().numpy() for name, x in shape.items()}
-        return arrays | {name: x.astype(np.int32) for name, x in rows.items()}
+        shape = self.points, self.frames, plucker_coordinates(self.frames), sides
+        rows = self.graph.indptr, self.graph.indices
+        return tuple(x.contiguous().numpy() for x in shape), tuple(x.astype(np.int32) for x in rows)
 
     @cached_property
     def longest(self) -> Int[Tensor, "N edges"]:
@@ -129,15 +127,8 @@ class GraphNeighborhoods:
             from torchlb.linalg import kernels
 
             wanted = WIDER * largest
-            found = kernels.k_hop_neighborhoods(
-                **self._arrays,
-                centers=missing.numpy(),
-                size=largest,
-                wanted=wanted,
-                # twice as many as in a round neighbourhood, so that none grows along a strip alone
-                rings=ceil(wanted ** (1 / self.dim)),
-                slope=HALF_CREASE,
-                alignment=CREASE,
-            )
+            # twice as many rings as in a round neighbourhood, so that none grows along a strip alone
+            bounds = float(wanted), ceil(wanted ** (1 / self.dim)), HALF_CREASE, CREASE
+            found = kernels.k_hop_neighborhoods(*self._arrays, missing.numpy(), largest, bounds)
             index[missing], count[missing] = map(torch.from_numpy, found)
         return index[centers, :size].long(), count[centers].long().clamp_max(size)

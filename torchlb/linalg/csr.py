@@ -105,11 +105,9 @@ class Record(Tensors):
 
     def split(self, sizes: Sequence[int]) -> list[Record]:
         """Records of the shapes of a batch, with `sizes` points."""
-        rows = zip(
-            *(tensor.split(list(sizes)) for tensor in tensors_of(self).values()), strict=True
-        )
-        copies = [map(torch.clone, row) for row in rows]  # do not keep the batch alive
-        return [Record(dict(zip(tensors_of(self), row, strict=True))) for row in copies]
+        parts = {name: tensor.split(list(sizes)) for name, tensor in tensors_of(self).items()}
+        # copies, which do not keep the batch alive
+        return [Record({n: parts[n][s].clone() for n in parts}) for s in range(len(sizes))]
 
 
 class Csr(Tensors):
@@ -167,11 +165,9 @@ class Csr(Tensors):
 
     @property
     def pattern(self) -> list[Tensor]:
-        """crow, col, and those of the transpose, as `csr_product` takes them."""
-        if self.symmetric:
-            order = torch.arange(len(self.col), device=self.col.device)
-            return [self.crow, self.col, self.crow, self.col, order]
-        return [self.crow, self.col, self.crow_t, self.col_t, self.order_t]
+        """The pattern as `csr_product` takes it."""
+        of_transpose = [] if self.symmetric else [self.crow_t, self.col_t, self.order_t]
+        return [self.crow, self.col, *of_transpose]
 
     def tensor(self, channel: int) -> Tensor:
         """Matrix of a channel as a torch sparse CSR tensor that shares its memory."""

@@ -39,7 +39,7 @@ def compiled_for(signature: str) -> Callable[[Any], Any]:
 
 @njit(**INNER)
 @no_type_check
-def _product(x: np.ndarray, y: np.ndarray, total: np.ndarray) -> None:
+def _product(x, y, total):
     """Inner products of columns."""
     size, lanes = x.shape
     for a in range(lanes):
@@ -51,7 +51,7 @@ def _product(x: np.ndarray, y: np.ndarray, total: np.ndarray) -> None:
 
 @njit(**INNER)
 @no_type_check
-def _subtract(factor: np.ndarray, x: np.ndarray, y: np.ndarray) -> None:
+def _subtract(factor, x, y):
     """Subtract multiples of columns from others."""
     size, lanes = x.shape
     for k in range(size):
@@ -61,7 +61,7 @@ def _subtract(factor: np.ndarray, x: np.ndarray, y: np.ndarray) -> None:
 
 @njit(**INNER)
 @no_type_check
-def _scale(x: np.ndarray, factor: np.ndarray) -> None:
+def _scale(x, factor):
     size, lanes = x.shape
     for k in range(size):
         for a in range(lanes):
@@ -76,10 +76,10 @@ def left_inverse(columns: np.ndarray, root: np.ndarray) -> tuple[np.ndarray, np.
     """
     batch, terms, size = columns.shape
     lanes = max(min(LANES, batch), 1)
-    found, condition = np.empty_like(columns), np.empty(batch)
+    found, square = np.empty_like(columns), np.zeros(batch)
     room = np.ones((terms, size, lanes)), np.empty((terms, terms, lanes)), np.empty((terms, lanes))
-    _left_inverse(columns, root, *room, found, condition)
-    return found, condition
+    _left_inverse(columns, root, *room, found, square)
+    return found, np.sqrt(square)
 
 
 # Any allocation in compiled code takes a tenth of a second to compile. @no_type_check keeps checkers off.
@@ -88,15 +88,7 @@ def left_inverse(columns: np.ndarray, root: np.ndarray) -> tuple[np.ndarray, np.
     "float64[:, :, ::1], float64[::1])"
 )
 @no_type_check
-def _left_inverse(
-    columns: np.ndarray,
-    root: np.ndarray,
-    a: np.ndarray,
-    r: np.ndarray,
-    square: np.ndarray,
-    found: np.ndarray,
-    condition: np.ndarray,
-) -> None:
+def _left_inverse(columns, root, a, r, square, found, condition):
     batch, terms, size = columns.shape
     lanes = a.shape[2]
     for first in range(0, batch, lanes):
@@ -119,15 +111,10 @@ def _left_inverse(
             _scale(a[j], r[j, j])
             for i in range(j):
                 _subtract(r[i, j], a[j], a[i])
-        for b in range(count):
-            condition[first + b] = 0.0
         for j in range(terms):
             _product(a[j], a[j], r[j, j])
             for b in range(count):
                 condition[first + b] += r[j, j, b] * square[j, b]
-        for b in range(count):
-            condition[first + b] = np.sqrt(condition[first + b])
-        for j in range(terms):
             for k in range(size):
                 for b in range(count):
                     found[first + b, j, k] = a[j, k, b] * root[first + b, k]
@@ -135,15 +122,7 @@ def _left_inverse(
 
 @njit(**INNER)
 @no_type_check
-def _distance(
-    points: np.ndarray,
-    frames: np.ndarray,
-    planes: np.ndarray,
-    center: int,
-    other: int,
-    slope: float,
-    alignment: float,
-) -> float:
+def _distance(points, frames, planes, center, other, slope, alignment):
     """Squared distance, ℓ², or −1 where `geometry.compatibility.compatible` rejects the other point."""
     square, flat, cosine = 0.0, 0.0, 0.0
     for x in range(points.shape[1]):
@@ -160,7 +139,7 @@ def _distance(
 
 @njit(**INNER)
 @no_type_check
-def _nearest_first(square: np.ndarray, ball: np.ndarray, total: int, size: int) -> int:
+def _nearest_first(square, ball, total, size):
     """Insertion sort of the `size` nearest, ties by their number; return how many these are."""
     kept = 0
     for a in range(total):
@@ -178,59 +157,39 @@ def _nearest_first(square: np.ndarray, ball: np.ndarray, total: int, size: int) 
 
 
 def k_hop_neighborhoods(
-    points: np.ndarray,
-    frames: np.ndarray,
-    planes: np.ndarray,
-    sides: np.ndarray,
-    indptr: np.ndarray,
-    indices: np.ndarray,
+    shape: tuple[np.ndarray, ...],
+    graph: tuple[np.ndarray, ...],
     centers: np.ndarray,
     size: int,
-    wanted: float,
-    rings: int,
-    slope: float,
-    alignment: float,
+    bounds: tuple[float, int, float, float],
 ) -> tuple[np.ndarray, np.ndarray]:
     """The `size` nearest points of each k-hop neighbourhood, padded by the centre, and how many are real.
 
-    Points are (N, n), `frames` those of their tangent planes, (N, n, d), `planes` the Plücker coordinates of these.
-    `sides` are vectors (N, n): a point opposed to the centre's is rejected; they are zero where no sides are known.
-    `indptr` and `indices` are the CSR pattern of the graph, without loops. A neighbourhood stops growing at `wanted`
-    points, or after so many rings; `slope` and `alignment` are the bounds of `compatible`.
+    The `shape` has points (N, n), frames of their tangent planes, (N, n, d), the Plücker coordinates of these planes,
+    and sides, vectors (N, n): a point opposed to the centre's is rejected; they are zero where no sides are known. The
+    `graph` has the row starts and columns of its CSR pattern, without loops. The `bounds` are the number of points and
+    that of rings at which a neighbourhood stops growing, and those of `compatible`.
     """
     index, count = np.empty((len(centers), size), np.int32), np.empty(len(centers), np.int32)
-    seen, ball = np.zeros((2, len(points)), np.int32)
-    room = seen, ball, np.empty(len(points))
-    inputs = points, frames, planes, sides, indptr, indices, centers
-    _k_hop_neighborhoods(*inputs, wanted, rings, slope, alignment, *room, index, count)
+    seen, ball = np.zeros((2, len(shape[0])), np.int32)
+    room = seen, ball, np.empty(len(shape[0]))
+    _k_hop_neighborhoods(shape, graph, centers, bounds, room, index, count)
     return index, count
 
 
 @compiled_for(
-    "void(float64[:, ::1], float64[:, :, ::1], float64[:, ::1], float64[:, ::1], int32[::1], int32[::1], int64[::1], "
-    "float64, int64, float64, float64, int32[::1], int32[::1], float64[::1], int32[:, ::1], int32[::1])"
+    "void(Tuple((float64[:, ::1], float64[:, :, ::1], float64[:, ::1], float64[:, ::1])), UniTuple(int32[::1], 2), "
+    "int64[::1], Tuple((float64, int64, float64, float64)), Tuple((int32[::1], int32[::1], float64[::1])), "
+    "int32[:, ::1], int32[::1])"
 )
 @no_type_check
-def _k_hop_neighborhoods(
-    points: np.ndarray,
-    frames: np.ndarray,
-    planes: np.ndarray,
-    sides: np.ndarray,
-    indptr: np.ndarray,
-    indices: np.ndarray,
-    centers: np.ndarray,
-    wanted: float,
-    rings: int,
-    slope: float,
-    alignment: float,
-    seen: np.ndarray,
-    ball: np.ndarray,
-    square: np.ndarray,
-    index: np.ndarray,
-    count: np.ndarray,
-) -> None:
+def _k_hop_neighborhoods(shape, graph, centers, bounds, room, index, count):
     """Breadth-first search; `seen` holds the last row, plus one, that reached a point."""
     size = index.shape[1]
+    points, frames, planes, sides = shape
+    indptr, indices = graph
+    wanted, rings, slope, alignment = bounds
+    seen, ball, square = room
     for row in range(len(centers)):
         center = centers[row]
         seen[center] = row + 1

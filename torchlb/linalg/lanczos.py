@@ -28,11 +28,7 @@ Pairs = tuple[Float[Tensor, " k"], Float[Tensor, "N k"]]
 
 
 class ShiftTooLarge(Exception):
-    """The shift is far above the requested eigenvalues, the largest of which is at most `bound`."""
-
-    def __init__(self, bound: float) -> None:
-        super().__init__(f"eigenvalues up to {bound:.3g}")
-        self.bound = bound
+    """The shift is far above the requested eigenvalues, the largest of which is at most the argument."""
 
 
 def lanczos_of_pair(
@@ -58,7 +54,7 @@ def lanczos_of_pair(
         try:
             return solve, lanczos(solve, mass, size, k, shift=shift, **kind)
         except ShiftTooLarge as error:
-            shift = error.bound
+            (shift,) = error.args
 
 
 def lanczos(

@@ -12,12 +12,6 @@ from torch.utils.checkpoint import checkpoint
 
 from torchlb.errors import DerivativeError
 
-DIFFERENTIABLE_ONCE = (
-    "second derivatives in points or medium: results are differentiable once in these, by backward(); "
-    "torch.autograd.functional.jvp goes back twice, too; take vjp, or a difference quotient"
-)
-"""Message of the error for second derivatives."""
-
 
 def once_differentiable(backward: Callable[..., Any]) -> Callable[..., Any]:
     """Like torch's decorator of that name, but second derivatives raise an error however they are requested.
@@ -47,7 +41,10 @@ class _Last(torch.autograd.Function):
 
     @staticmethod
     def backward(ctx: Any, *grads: Any) -> Any:
-        raise DerivativeError(DIFFERENTIABLE_ONCE)
+        raise DerivativeError(
+            "second derivatives in points or medium: results are differentiable once in these, by backward(); "
+            "torch.autograd.functional.jvp goes back twice, too; take vjp, or a difference quotient"
+        )
 
 
 _last: Any = _Last.apply

@@ -1,9 +1,9 @@
 """Differentiable products of sparse matrices, on plain tensors.
 
 A sparse CSR tensor as a buffer breaks `deepcopy`, autocast and second derivatives, and its native backward is slow.
-Here the matrix is `crow, col, values`, the transpose's pattern is computed once, and two operations, whose derivatives
-are each other, give derivatives of any order in values and features. `torch.compile` and export see them as custom
-operations, which take twice as long to call: that counts on a GPU, and for small shapes.
+Here the matrix is `crow, col, values`, the transpose's pattern is computed once, and an operation of three kinds, whose
+derivatives are each other, gives derivatives of any order in values and features. `torch.compile` and export see it as
+a custom operation, which takes twice as long to call: that counts on a GPU, and for small shapes.
 """
 
 from __future__ import annotations
@@ -51,16 +51,19 @@ def csr_product(
     """Product A x of a CSR matrix, or Aᵀ x, differentiable any number of times in `values` and in `x`.
 
     The pattern is [crow, col, crow_t, col_t, order_t] of A and, from `transpose_pattern`, of its transpose, int32 or
-    int64. The product is computed in the wider of the types of `values` and `x`, and at least in float32, also under
-    autocast; the result has that type, or that of a half-precision x.
+    int64; [crow, col] for a symmetric A, with derivatives in x alone. The product is computed in the wider of the types
+    of `values` and `x`, and at least in float32, also under autocast; the result has that type, or that of a
+    half-precision x.
 
     >>> crow, col, values = torch.tensor([0, 2, 3]), torch.tensor([0, 1, 1]), torch.tensor([1.0, 2.0, 3.0])
     >>> pattern = [crow, col, *transpose_pattern(crow, col, 2)]
     >>> csr_product(pattern, values, torch.tensor([[1.0], [10.0]])).tolist()
     [[21.0], [30.0]]
     """
-    inputs = *pattern, values, x, transposed
-    return _product_op(*inputs) if torch.compiler.is_compiling() else _Product.apply(*inputs)  # pyright: ignore[reportReturnType]
+    if len(pattern) == 2:  # as if A were its own transpose, entry by entry
+        pattern = *pattern, *pattern, torch.arange(len(pattern[1]), device=pattern[1].device)
+    form: Any = _form_op if torch.compiler.is_compiling() else _Form.apply
+    return form(*pattern, values, x, "transposed" if transposed else "product")
 
 
 def compute_dtype(left: Tensor, right: Tensor) -> torch.dtype:
@@ -127,92 +130,64 @@ def values_on(
     return values
 
 
-def symmetric_product(
-    crow: Int[Tensor, " N_plus_1"],
-    col: Int[Tensor, " nnz"],
-    values: Float[Tensor, " nnz"],
-    x: Float[Tensor, "N C"],
-) -> Float[Tensor, "N C"]:
-    """A x for a symmetric A, differentiable any number of times in x alone; types as in `csr_product`.
-
-    >>> x = torch.ones(2, 1, requires_grad=True)
-    >>> y = symmetric_product(torch.tensor([0, 1, 2]), torch.tensor([0, 1]), torch.tensor([2.0, 4.0]), x)
-    >>> torch.autograd.grad(y.sum(), x)[0].T
-    tensor([[2., 4.]])
-    """
-    # as if A were its own transpose, entry by entry
-    order = torch.arange(len(col), device=col.device)
-    return csr_product([crow, col, crow, col, order], values, x)
+def _form(*inputs: Any) -> Tensor:
+    """A b or Aᵀ b, where A has the values a, or `_values` of a and b; from a pattern, a, b and the kind."""
+    crow, col, crow_t, col_t, order_t, a, b, kind = inputs
+    dtype, result_dtype = compute_dtype(a, b), _result_dtype(a, b)
+    if kind == "values":
+        return _values(crow, col, a.to(dtype), b.to(dtype))
+    if kind == "transposed":
+        crow, col, a = crow_t, col_t, a.index_select(0, order_t)
+    return multiply(crow, col, a.to(dtype), b.to(dtype)).to(result_dtype)
 
 
-def _product(*inputs: Any) -> Tensor:
-    """A x or Aᵀ x, from crow, col, crow_t, col_t, order_t, values, x, transposed."""
-    crow, col, crow_t, col_t, order_t, values, x, transposed = inputs
-    dtype, result_dtype = compute_dtype(values, x), _result_dtype(values, x)
-    if transposed:
-        crow, col, values = crow_t, col_t, values.index_select(0, order_t)
-    return multiply(crow, col, values.to(dtype), x.to(dtype)).to(result_dtype)
-
-
-def _values_gradient(*inputs: Any) -> Tensor:
+def _values(crow: Tensor, col: Tensor, left: Tensor, right: Tensor) -> Tensor:
     """Σ_c left[row, c] right[col, c] at every entry (row, col), without storing the (nnz, C) terms."""
-    crow, col, _, _, _, left, right = inputs
-    dtype = compute_dtype(left, right)
-    matrix = csr_tensor(
-        crow, col, torch.zeros(len(col), dtype=dtype, device=left.device), len(right)
-    )
+    matrix = csr_tensor(crow, col, left.new_zeros(len(col)), len(right))
     with torch.autocast(left.device.type, enabled=False):
-        return torch.sparse.sampled_addmm(matrix, left.to(dtype), right.to(dtype).T).values()
+        return torch.sparse.sampled_addmm(matrix, left, right.T).values()
 
 
-def _save(ctx: Any, inputs: tuple[Any, ...], output: Any = None) -> None:
+DERIVATIVES = {
+    "product": {"a": ("values", "gb"), "b": ("transposed", "ag")},
+    "transposed": {"a": ("values", "bg"), "b": ("product", "ag")},
+    "values": {"a": ("product", "gb"), "b": ("transposed", "ga")},
+}
+"""The gradients of each kind in a and in b, of which kind they are, and of which two of a, b and the cotangent g."""
+
+
+def _save(ctx: Any, inputs: tuple[Any, ...], output: Any) -> None:
     ctx.save_for_backward(*inputs[:7])
-    ctx.transposed = inputs[7:] == (True,)
+    ctx.save_for_forward(*inputs[:7])
+    ctx.kind = inputs[7]
 
 
-def _product_backward(ctx: Any, grad: Tensor, product: Any, values_gradient: Any) -> Any:
-    *pattern, values, x = ctx.saved_tensors
-    grad_values = grad_x = None
-    if ctx.needs_input_grad[5]:
-        left, right = (x, grad) if ctx.transposed else (grad, x)
-        grad_values = values_gradient(*pattern, left, right).to(values.dtype)
-    if ctx.needs_input_grad[6]:
-        grad_x = product(*pattern, values, grad, not ctx.transposed).to(x.dtype)
-    return None, None, None, None, None, grad_values, grad_x, None
+def _backward(ctx: Any, grad: Tensor, form: Any) -> Any:
+    *pattern, a, b = ctx.saved_tensors
+    given, found = {"a": a, "b": b, "g": grad}, []
+    for needed, name in zip(ctx.needs_input_grad[5:7], "ab", strict=True):
+        kind, parts = DERIVATIVES[ctx.kind][name]
+        gradient = form(*pattern, *(given[part] for part in parts), kind) if needed else None
+        found.append(gradient if gradient is None else gradient.to(given[name].dtype))
+    return *(None,) * 5, *found, None
 
 
-def _values_gradient_backward(ctx: Any, grad: Tensor, product: Any) -> Any:
-    *pattern, left, right = ctx.saved_tensors
-    grad_left = grad_right = None
-    if ctx.needs_input_grad[5]:
-        grad_left = product(*pattern, grad, right, False).to(left.dtype)
-    if ctx.needs_input_grad[6]:
-        grad_right = product(*pattern, grad, left, True).to(right.dtype)
-    return None, None, None, None, None, grad_left, grad_right
+class _Form(torch.autograd.Function):
+    """`_form` in eager mode, also under the transforms of `torch.func`."""
 
-
-class _Product(torch.autograd.Function):
-    """A x in eager mode, also under the transforms of `torch.func`."""
-
-    @staticmethod
-    def forward(*inputs: Any) -> Tensor:  # pyright: ignore[reportIncompatibleMethodOverride]
-        return _product(*inputs)
-
-    @staticmethod
-    def setup_context(ctx: Any, inputs: Any, output: Any) -> None:  # pyright: ignore[reportIncompatibleMethodOverride]
-        _save(ctx, inputs)
-        ctx.save_for_forward(*inputs[:7])
+    forward = staticmethod(_form)  # pyright: ignore[reportIncompatibleMethodOverride]
+    setup_context = staticmethod(_save)  # pyright: ignore[reportIncompatibleMethodOverride]
 
     @staticmethod
     def backward(ctx: Any, grad: Tensor) -> Any:  # pyright: ignore[reportIncompatibleMethodOverride]
-        return _product_backward(ctx, grad, _Product.apply, _ValuesGradient.apply)
+        return _backward(ctx, grad, _Form.apply)
 
     @staticmethod
     def jvp(ctx: Any, *tangents: Any) -> Any:  # pyright: ignore[reportIncompatibleMethodOverride]
-        *pattern, values, x = ctx.saved_tensors
-        pairs = (values, tangents[6]), (tangents[5], x)
+        *pattern, a, b = ctx.saved_tensors
+        pairs = (a, tangents[6]), (tangents[5], b)
         parts: Any = [
-            _Product.apply(*pattern, *pair, ctx.transposed)
+            _Form.apply(*pattern, *pair, ctx.kind)
             for pair in pairs
             if not any(part is None for part in pair)
         ]
@@ -220,63 +195,31 @@ class _Product(torch.autograd.Function):
 
     @staticmethod
     def vmap(info: Any, in_dims: Any, *inputs: Any) -> tuple[Tensor, int]:  # pyright: ignore[reportIncompatibleMethodOverride]
-        *rest, x, transposed = inputs
-        if any(place is not None for place in in_dims[:6]):
+        *rest, x, kind = inputs
+        if kind == "values" or any(place is not None for place in in_dims[:6]):
             raise InputError("vmap: over functions, (B, N, C), not over matrices; use a batch")
         x = x.movedim(in_dims[6], 1)  # (N, B, C)
-        result: Any = _Product.apply(*rest, x.flatten(1), transposed)
+        result: Any = _Form.apply(*rest, x.flatten(1), kind)
         return result.unflatten(1, x.shape[1:]), 1
 
 
-class _ValuesGradient(torch.autograd.Function):
-    @staticmethod
-    def forward(*inputs: Any) -> Tensor:  # pyright: ignore[reportIncompatibleMethodOverride]
-        return _values_gradient(*inputs)
-
-    @staticmethod
-    def setup_context(ctx: Any, inputs: Any, output: Any) -> None:  # pyright: ignore[reportIncompatibleMethodOverride]
-        _save(ctx, inputs)
-
-    @staticmethod
-    def backward(ctx: Any, grad: Tensor) -> Any:  # pyright: ignore[reportIncompatibleMethodOverride]
-        return _values_gradient_backward(ctx, grad, _Product.apply)
-
-
-PATTERN = "Tensor crow, Tensor col, Tensor crow_t, Tensor col_t, Tensor order_t"
-_product_op = torch.library.custom_op(
-    "torchlb::csr_product",
-    _product,
+_form_op = torch.library.custom_op(
+    "torchlb::csr_form",
+    _form,
     mutates_args=(),
-    schema=f"({PATTERN}, Tensor values, Tensor x, bool transposed) -> Tensor",
+    schema="(Tensor crow, Tensor col, Tensor crow_t, Tensor col_t, Tensor order_t, Tensor a, Tensor b, str kind)"
+    " -> Tensor",
 )
-_values_gradient_op = torch.library.custom_op(
-    "torchlb::csr_values_gradient",
-    _values_gradient,
-    mutates_args=(),
-    schema=f"({PATTERN}, Tensor left, Tensor right) -> Tensor",
-)
+_form_op.register_autograd(partial(_backward, form=_form_op), setup_context=_save)
 
 
-@_product_op.register_fake
+@_form_op.register_fake
 def _(*inputs: Any) -> Tensor:
-    crow, _, crow_t, _, _, values, x, transposed = inputs
-    num_rows = (crow_t if transposed else crow).shape[0] - 1
-    return x.new_empty(num_rows, x.shape[1], dtype=_result_dtype(values, x))
-
-
-@_values_gradient_op.register_fake
-def _(*inputs: Any) -> Tensor:
-    _, col, *_, left, right = inputs
-    return left.new_empty(col.shape[0], dtype=compute_dtype(left, right))
-
-
-_product_op.register_autograd(
-    partial(_product_backward, product=_product_op, values_gradient=_values_gradient_op),
-    setup_context=_save,
-)
-_values_gradient_op.register_autograd(
-    partial(_values_gradient_backward, product=_product_op), setup_context=_save
-)
+    crow, col, crow_t, _, _, a, b, kind = inputs
+    if kind == "values":
+        return a.new_empty(col.shape[0], dtype=compute_dtype(a, b))
+    num_rows = (crow_t if kind == "transposed" else crow).shape[0] - 1
+    return b.new_empty(num_rows, b.shape[1], dtype=_result_dtype(a, b))
 
 
 def to_scipy(
@@ -299,24 +242,12 @@ def from_scipy(matrix: Any) -> tuple[Tensor, Tensor, Tensor]:
     """
     matrix = sparse.csr_array(matrix, copy=True)
     matrix.sum_duplicates()
-    crow, col = (
-        torch.from_numpy(part.astype(np.int64)) for part in (matrix.indptr, matrix.indices)
-    )
-    return crow, col, torch.from_numpy(matrix.data)
+    crow, col, values = on_device(matrix, torch.device("cpu"))
+    return crow.long(), col.long(), values
 
 
 def on_device(matrix: sparse.csr_array, device: torch.device) -> tuple[Tensor, Tensor, Tensor]:
     """(crow, col, values) of a scipy CSR matrix on a device; on the CPU in the same memory."""
-    crow, col, values = (
-        torch.from_numpy(part).to(device) for part in (matrix.indptr, matrix.indices, matrix.data)
-    )
+    parts = matrix.indptr, matrix.indices, matrix.data
+    crow, col, values = (torch.from_numpy(part).to(device) for part in parts)
     return crow, col, values
-
-
-def with_diagonal(matrix: sparse.csr_array) -> sparse.csr_array:
-    """CSR with every diagonal entry stored, even where it is zero."""
-    entries = sparse.coo_array(matrix)
-    (row, col), every = entries.coords, np.arange(len(matrix.indptr) - 1)
-    where = np.append(row, every), np.append(col, every)
-    data = np.append(entries.data, np.zeros(len(every)))
-    return sparse.csr_array((data, where), shape=matrix.shape)

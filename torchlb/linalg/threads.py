@@ -21,10 +21,7 @@ def threads_for(num_points: int) -> Iterator[None]:
     True
     """
     threads = torch.get_num_threads()
-    if threads == 1 or num_points > FEW:
-        yield
-        return
-    torch.set_num_threads(1)
+    torch.set_num_threads(threads if num_points > FEW else 1)
     try:
         yield
     finally:

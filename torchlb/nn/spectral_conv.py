@@ -64,7 +64,7 @@ class SpectralConv(nn.Module):
             polynomials = chebyshev_vectors(shifted, torch.ones_like(u), self.num_filters)
             polynomials = torch.stack(list(polynomials), -1)
             filters = torch.einsum("...kf,foi->...koi", polynomials, self.weight.to(dtype))
-            coefficients = basis.analyse(basis.left, x.to(dtype))
+            coefficients = basis.analyse(x.to(dtype))
             y = basis.from_basis((filters @ coefficients[..., None])[..., 0])
         y = y.to(x.dtype)
         return y if self.bias is None else y + self.bias.to(y.dtype)

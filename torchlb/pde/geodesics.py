@@ -27,11 +27,6 @@ from torchlb.linalg.precision import NEGLIGIBLE, ROUNDS, SMALL
 from torchlb.operator.laplace_beltrami import LaplaceBeltrami
 from torchlb.operator.through import without
 
-Polar = tuple[Float[np.ndarray, " N"], Float[np.ndarray, " N"]]
-
-FROM_MESH = ("mesh", "cotangent")
-"""Sources of operators for which all edges are those of the faces."""
-
 
 @takes_arrays
 def geodesic_distance(
@@ -42,7 +37,8 @@ def geodesic_distance(
     On smooth surfaces the error falls with the square of the spacing: on a sphere of 2,000 vertices it is 0.06 % in the
     mean. Where triangles do not resolve the curvature, it falls like the spacing. For several sources, the result is
     the least of their distances, with about the same error. It is never below the straight line. On curves, in more
-    dimensions, and without triangles, paths follow edges. Computed on the CPU, without derivatives.
+    dimensions, and without triangles, paths follow edges. Computed on the CPU, without derivatives. Raises InputError
+    for no sources, or indices out of range.
 
     Parameters
     ----------
@@ -54,11 +50,6 @@ def geodesic_distance(
     each
         Whether to return a column for each of S sources, (N, S). A source may then also be indices of several points
         or a mask, such as that of a parcel.
-
-    Raises
-    ------
-    InputError
-        For no sources, or indices out of range.
 
     Examples
     --------
@@ -86,22 +77,16 @@ def logarithmic_map(
     They are geodesic polar coordinates (Melvær, Reimers 2012): the distance, and the angle at the source, which
     is carried along the paths of `geodesic_distance`. On smooth surfaces both are accurate to second order.
 
+    The result is (N, 2) for one source, (N, 2, S) for several: NaN where no path leads to the source, and not smooth
+    where shortest paths meet. Without derivatives in the points. Raises InputError for indices out of range, and where
+    there are no triangles.
+
     Parameters
     ----------
     lb
         Operator of one surface or of a batch.
     sources
         Index of a point, or indices of several.
-
-    Returns
-    -------
-    (N, 2) for one source, (N, 2, S) for several. NaN where no path leads to the source; not smooth where shortest paths
-    meet. Without derivatives in the points.
-
-    Raises
-    ------
-    InputError
-        For indices out of range, and where there are no triangles.
 
     Examples
     --------
@@ -127,7 +112,7 @@ def logarithmic_map(
     return without(lb, found.to(lb.points), "normal coordinates")
 
 
-def _paths(lb: LaplaceBeltrami, starts: Iterable[np.ndarray]) -> Iterator[Polar]:
+def _paths(lb: LaplaceBeltrami, starts: Iterable[np.ndarray]) -> Iterator[Sequence[np.ndarray]]:
     """Polar coordinates for each set of sources: distance, and the angle in the frame of a single source, or NaN."""
     points = np.ascontiguousarray(lb.points.detach().cpu().double().numpy())
     row, col = _edges(lb)
@@ -182,10 +167,8 @@ def _curvature(first: np.ndarray, _: np.ndarray, sides: np.ndarray) -> Float[np.
 def _edges(lb: LaplaceBeltrami) -> tuple[np.ndarray, np.ndarray]:
     """Edges in both directions, of faces and of the P1 pair; without a weak pair, those of the stencils."""
     matrix: Any = mesh_graph(lb.faces.cpu(), lb.num_points)
-    if len(lb.faces) == 0 or lb.source not in FROM_MESH:
-        crow, col = (
-            lb.weak.linear_pair[:2] if lb._has_weak_form else (lb.stencil.crow, lb.stencil.col)
-        )
+    if len(lb.faces) == 0 or lb.source not in ("mesh", "cotangent"):
+        crow, col, *_ = lb.weak.linear_pair if lb._has_weak_form else lb.stencil.pattern
         where = (np.ones(len(col)), col.cpu().numpy(), crow.cpu().numpy())
         near = sparse.csr_array(where, shape=lb.shape)
         matrix = matrix + near + near.T

@@ -8,17 +8,20 @@ eigenvectors; everything beyond the basis is dropped, also as t → 0.
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 from functools import partial
 from numbers import Real
 from typing import Any, Literal
 
+import numpy as np
 import torch
-from jaxtyping import Float, Shaped
+from jaxtyping import Shaped
 from torch import Tensor
 
 from torchlb.errors import InputError, shown
 from torchlb.galerkin.forms import BilinearForm
 from torchlb.linalg.checks import check_choice, check_tensor, takes_arrays
+from torchlb.linalg.conjugate_gradients import Linear
 from torchlb.linalg.csr import shaped_like, side_by_side
 from torchlb.linalg.exponential import chebyshev_vectors, poles, rational_coefficients
 from torchlb.linalg.once import once_differentiable
@@ -28,10 +31,9 @@ from torchlb.operator.checks import check_tolerance
 from torchlb.operator.inputs import check_mask
 from torchlb.operator.laplace_beltrami import LaplaceBeltrami
 from torchlb.operator.pair_methods import PairMethods, check_pair
-from torchlb.operator.systems import pair_system
+from torchlb.operator.systems import PairSystem, pair_system
 from torchlb.operator.through import Origins, origins
 from torchlb.pde.checks import as_columns, as_times, check_shape, uncompiled
-from torchlb.spectral.eigenbasis import Eigenbasis
 
 Method = Literal["rational", "spectral"]
 
@@ -49,7 +51,8 @@ def heat_flow(
     """e^{tΔ}f: f after diffusion over the surface for a time t; differentiable in f and t.
 
     Computed in the wider of the types of f and the operator, at least float32; only a half-precision f gets its own
-    type back.
+    type back. Raises InputError for times that are negative or not finite, an unknown method, a wrong shape, a
+    tolerance that is not between 0 and 1, an operator without a weak pair.
 
     Parameters
     ----------
@@ -66,12 +69,6 @@ def heat_flow(
     tolerance
         Bound on the error in the norm of M, relative to |f|. Where all values around are smaller, as far from a heated
         point, they are noise: their logarithms and directions (geodesics) need an implicit step.
-
-    Raises
-    ------
-    InputError
-        For times that are negative or not finite, an unknown method, a wrong shape, a tolerance that is not between 0
-        and 1, an operator without a weak pair.
 
     Examples
     --------
@@ -134,27 +131,14 @@ def flow(lb: PairMethods, x: Tensor, time: Tensor, method: str, k: int, toleranc
         y = flow(lb, side_by_side(x), time.repeat(len(x)), method, k, tolerance)
         return shaped_like(y, x)
     check_pair(lb)
-    if method == "spectral":
-        return _spectral(lb.eigenbasis(k), x, time)
-    return pair_flow(lb, x, time, tolerance).to(x.dtype)
-
-
-def _spectral(basis: Eigenbasis, x: Tensor, time: Tensor) -> Tensor:
-    """Φ e^{−λt} ΦᵀMx."""
-    decay = torch.exp(-basis.eigenvalues.to(x.dtype)[..., None] * time)
-    return basis.from_basis(decay * basis.analyse(basis.left, x))
-
-
-def pair_flow(
-    lb: PairMethods, x: Float[Tensor, "N C"], time: Float[Tensor, " C"], tolerance: float
-) -> Float[Tensor, "N C"]:
-    """The flow of each column for its own time, differentiable in x and times, and once in points and medium.
-
-    Zero at Dirichlet points. The error is at most `tolerance` in the norm of M, relative to x.
-    """
+    if method == "spectral":  # Φ e^{−λt} ΦᵀMx
+        basis = lb.eigenbasis(k)
+        decay = torch.exp(-basis.eigenvalues.to(x.dtype)[..., None] * time)
+        return basis.from_basis(decay * basis.analyse(x))
     found = origins(lb)
-    variables = () if found is None else found.variables
-    return _flow(x.double(), time.double(), lb, found, tolerance, 0, False, *variables)[0]
+    variables = found.variables if found else ()
+    y, _ = _flow(x.double(), time.double(), lb, found, tolerance, 0, False, *variables)
+    return y.to(x.dtype)
 
 
 class _Flow(torch.autograd.Function):
@@ -211,14 +195,29 @@ def _in_all(ctx: Any, g: Tensor) -> tuple[Any, ...]:
     return *_in_data(ctx, g), *found.gradient(_forms(lb, x, g, time, tolerance))
 
 
+def _poles(
+    solver: PairSystem, time: Tensor, tolerance: float
+) -> Iterator[tuple[float, Tensor, np.ndarray, Linear]]:
+    """Every pole γ with its columns, their t/γ, and the product with S = (M + γK)⁻¹."""
+    times = time.detach().cpu().numpy()
+    for pole, chosen in poles(times):
+        at_pole = time.new_full((len(chosen),), pole)
+        solve = partial(solver.solve, time=at_pole, tolerance=tolerance / 10)
+        yield pole, torch.from_numpy(chosen).to(time.device), times[chosen] / pole, solve
+
+
+def _doubled(solver: PairSystem, solve: Linear, transposed: bool, v: Tensor) -> Tensor:
+    """(2Z − 1)v, Z = SM, or its transpose's product with v."""
+    z = solver.mass_product(solve(v)) if transposed else solve(solver.mass_product(v))
+    return 2 * z - v
+
+
 def _summed(
     lb: PairMethods, x: Tensor, time: Tensor, tolerance: float, order: int, transposed: bool
 ) -> tuple[Tensor, Tensor]:
     """Derivatives of the flow, or of the transposed flow, of an order in t and of the next; at t = 0, (−M⁻¹K)^j x."""
     result, slope = torch.zeros_like(x), torch.zeros_like(x)
-    times = time.detach().cpu().numpy()
-    at_zero = torch.from_numpy(times == 0).to(x.device)
-    solver = pair_system(lb)
+    solver, at_zero = pair_system(lb), time == 0
     x = solver.inside(x)
 
     def generated(v: Tensor) -> Tensor:
@@ -232,17 +231,9 @@ def _summed(
         for _ in range(order):
             start = generated(start)
         result[:, at_zero], slope[:, at_zero] = start, generated(start)
-    for pole, chosen in poles(times):
-        columns = torch.from_numpy(chosen).to(x.device)
-        at_pole = x.new_full((len(chosen),), pole)
-
-        def doubled(v: Tensor, at_pole: Tensor = at_pole) -> Tensor:
-            if transposed:
-                return 2 * solver.mass_product(solver.solve(v, at_pole, tolerance / 10)) - v
-            return 2 * solver.solve(solver.mass_product(v), at_pole, tolerance / 10) - v
-
-        scale = pole ** -float(order)
-        c, derivative = rational_coefficients(times[chosen] / pole, tolerance, order)
+    for pole, columns, ratios, solve in _poles(solver, time, tolerance):
+        doubled, scale = partial(_doubled, solver, solve, transposed), pole ** -float(order)
+        c, derivative = rational_coefficients(ratios, tolerance, order)
         for k, v in enumerate(chebyshev_vectors(doubled, x[:, columns], len(c))):
             result[:, columns] += scale * torch.from_numpy(c[k]).to(x) * v
             slope[:, columns] += scale / pole * torch.from_numpy(derivative[k]).to(x) * v
@@ -258,33 +249,22 @@ def _forms(
     b_k = c_k g + 2Aᵀb_{k+1} − b_{k+2}, A = 2Z − 1, and 2⟨b_{k+1}, dA v_k⟩ add up, the first one once. They are the
     columns of one form for each matrix.
     """
-    solver, times = pair_system(lb), time.detach().cpu().numpy()
+    solver = pair_system(lb)
     terms: list[tuple[Tensor, ...]] = []
-    x = solver.inside(x)
-    for pole, chosen in poles(times):
-        columns = torch.from_numpy(chosen).to(x.device)
-        at_pole = x.new_full((len(chosen),), pole)
-
-        def solve(v: Tensor, at_pole: Tensor = at_pole) -> Tensor:
-            return solver.solve(v, at_pole, tolerance / 10)
-
-        def doubled(v: Tensor) -> Tensor:
-            return 2 * solve(solver.mass_product(v)) - v
-
-        c, _ = rational_coefficients(times[chosen] / pole, tolerance)
+    x, g = solver.inside(x), solver.inside(g)
+    for pole, columns, ratios, solve in _poles(solver, time, tolerance):
+        doubled, own = partial(_doubled, solver, solve, False), g[:, columns]
+        c, _ = rational_coefficients(ratios, tolerance)
         v = list(chebyshev_vectors(doubled, x[:, columns], len(c)))
-        own = solver.inside(g[:, columns])
-        after = before = torch.zeros_like(own)  # b_{k+2}, b_{k+1}
-        applied = torch.zeros_like(own)  # Aᵀb_{k+1}
+        after = before = applied = torch.zeros_like(own)  # b_{k+2}, b_{k+1}, Aᵀb_{k+1}
         for k in range(len(c) - 1, 0, -1):
-            current = torch.from_numpy(c[k]).to(x) * own + 2 * applied - after
-            after, before = before, current
-            solved = solve(current)
-            applied = 2 * solver.mass_product(solved) - current
+            after, before = before, torch.from_numpy(c[k]).to(x) * own + 2 * applied - after
+            solved = solve(before)
+            applied = 2 * solver.mass_product(solved) - before
             # A v_{k−1} by the recurrence, and Z = (1 + A)/2
             advanced = v[1] if k == 1 else (v[k] + v[k - 2]) / 2
             smooth = (v[k - 1] + advanced) / 2
-            weight = torch.full((len(chosen),), 2.0 if k == 1 else 4.0, dtype=x.dtype)
+            weight = x.new_full((len(columns),), 2.0 if k == 1 else 4.0)
             terms.append((solved, smooth, v[k - 1] - smooth, -pole * weight, weight))
     if not terms:
         return []

@@ -20,7 +20,7 @@ from torchlb.operator.laplace_beltrami import LaplaceBeltrami
 from torchlb.operator.medium import elements_of
 from torchlb.operator.stencil_methods import check_surface
 from torchlb.operator.through import without
-from torchlb.pde.solves import TOLERANCE, solved
+from torchlb.pde.solves import solved
 
 
 @dataclass(frozen=True)
@@ -81,12 +81,9 @@ def hodge_decomposition(
     for turned, functions in ((None, free), (normals, held)):
         form = WeakGradient.of(elements, turned)
         right = form.divergence(fields.vectors(c).cpu()).to(c)
-        u = solved(functions, right, None, torch.zeros_like(right), None, TOLERANCE)
+        u = solved(functions, right)
         slope = fields.components(form.gradient(u.cpu()).to(c))
-        none = torch.zeros_like(slope)
-        found.append(
-            (u, solved(fields, slope, slope.new_zeros(slope.shape[1]), none, None, TOLERANCE))
-        )
+        found.append((u, solved(fields, slope, torch.zeros_like(slope[0]))))
     (u, gradient), (w, rotated) = found
     parts = [fields.vectors(x) for x in (gradient, rotated, c - gradient - rotated)]
     results = [without(lb, x, "Hodge parts").to(v) for x in (*parts, u, w)]

@@ -14,7 +14,7 @@ from torchlb.linalg.checks import check_finite, takes_arrays
 from torchlb.linalg.csr import shaped_like, side_by_side, tensors_of
 from torchlb.linalg.once import once_differentiable
 from torchlb.linalg.precision import SINGLE
-from torchlb.linalg.sparse import compute_dtype, symmetric_product
+from torchlb.linalg.sparse import compute_dtype, csr_product
 from torchlb.operator.batching import shapes_of
 from torchlb.operator.checks import check_tolerance
 from torchlb.operator.laplace_beltrami import LaplaceBeltrami
@@ -94,8 +94,6 @@ def poisson_solve(
     zero, and the data are made compatible: the total of f and flux is subtracted from f, evenly. Arguments and errors
     as for `implicit_step`.
 
-    Examples
-    --------
     >>> from torchlb.surfaces import Sphere
     >>> vertices, faces = Sphere().mesh(300)
     >>> lb = LaplaceBeltrami.from_mesh(vertices, faces)
@@ -131,7 +129,7 @@ def _solution(
     if given is not None:
         right = right - share * _product(lb, 0, given)
         right = right if time is None else right - _product(lb, 1, given)
-    u = solved(lb, right, time, columns, given, tolerance)
+    u = solved(lb, right, time, columns, given, tolerance=tolerance)
     return shaped_like(u, f).to(x.dtype)
 
 
@@ -161,7 +159,7 @@ def implicit_by_elements(
         first, *coefficients = torch.linalg.solve(powers, z / (z + (1 - z) * ratio)).to(v)
         u = first * system.inside(v)
         for c in coefficients:
-            v = _Near.apply(symmetric_product(crow, col, mass.to(v), v), system, levels)
+            v = _Near.apply(csr_product([crow, col], mass.to(v), v), system, levels)
             u = u + c * v
         found.append(u)
     return shaped_like(torch.cat(found)[:, order.argsort()], x)
@@ -210,15 +208,14 @@ def potential(
         ]
     check_pair(lb)
     columns = side_by_side(sum(products[1:], products[0]).double())
-    if source is None and field is not None:
-        source = field[..., 0, :]
-    assert source is not None, "neither field nor source"
+    given = field if source is None else source
+    assert given is not None, "neither field nor source"
     if tolerance == "P1":
         columns = without(lb, columns, "solutions by P1 elements")
         u = _solve(columns, None, None, None, lb, None, tolerance)
     else:
-        u = solved(lb, columns, None, torch.zeros_like(columns), None, tolerance)
-    return shaped_like(u, source).to(source.dtype)
+        u = solved(lb, columns, tolerance=tolerance)
+    return shaped_like(u, products[0]).to(given.dtype)
 
 
 def _with_conductivity(lb: PairMethods, conductivity: Tensor | None) -> PairMethods:
@@ -241,7 +238,13 @@ def _data(lb: PairMethods, data: Tensor | float | None, kind: int, f: Tensor) ->
     fixed = torch.zeros_like(lb.mass, dtype=torch.bool) if lb.fixed is None else lb.fixed
     counts = _reached_by_flux(lb, ~fixed) if kind == 1 else fixed
     if not bool(counts.any()):
-        raise InputError(f"{name}: {_missing(lb, kind)}")
+        missing = (
+            "no Dirichlet condition; build with condition='dirichlet'",
+            "a Dirichlet condition holds along the whole boundary; pass a mask as `boundary` that leaves some of it",
+        )[kind]
+        if not lb.weak.has_boundary:
+            missing = "the shape is closed; it has no boundary for them"
+        raise InputError(f"{name}: {missing}")
     values = torch.as_tensor(data, dtype=torch.float64, device=f.device)
     try:
         values = values.expand(f.shape)
@@ -260,36 +263,30 @@ def _reached_by_flux(lb: PairMethods, free: Tensor) -> Tensor:
     if not lb.weak.has_boundary:
         return torch.zeros_like(free)
     size = lb.weak.values[2].abs()
-    return symmetric_product(lb.weak.crow, lb.weak.col, size, free.to(size)[:, None])[:, 0] > 0
-
-
-def _missing(lb: PairMethods, kind: int) -> str:
-    """Reason why there is no point for Dirichlet values (kind 0) or for fluxes (1)."""
-    if not lb.weak.has_boundary:
-        return "the shape is closed; it has no boundary for them"
-    if kind == 0:
-        return "no Dirichlet condition; build with condition='dirichlet'"
-    return "a Dirichlet condition holds along the whole boundary; pass a mask as `boundary` that leaves some of it"
+    return csr_product([lb.weak.crow, lb.weak.col], size, free.to(size)[:, None])[:, 0] > 0
 
 
 def _product(lb: PairMethods, number: int, x: Tensor) -> Tensor:
     """K, with what is added to it, or M times x."""
     crow, col, values = lb.weak.pair
-    return symmetric_product(crow, col, values[number].to(x), x)
+    return csr_product([crow, col], values[number].to(x), x)
 
 
 def solved(
     lb: PairMethods,
     right: Float[Tensor, "N C"],
-    time: Float[Tensor, " C"] | None,
-    f: Float[Tensor, "N C"],
-    given: Float[Tensor, "N C"] | None,
-    tolerance: float,
+    time: Float[Tensor, " C"] | None = None,
+    f: Float[Tensor, "N C"] | None = None,
+    given: Float[Tensor, "N C"] | None = None,
+    *,
+    tolerance: float = TOLERANCE,
 ) -> Float[Tensor, "N C"]:
-    """The solution with the boundary values u₀ that are given, differentiable in data, times, points and medium."""
+    """The solution with the boundary values u₀ that are given, differentiable in data, times, points and medium.
+
+    Mf is the part of the right-hand side that depends on points and medium.
+    """
     found = origins(lb)
-    variables = () if found is None else found.variables
-    u = _solve(right, time, f, given, lb, found, tolerance, *variables)
+    u = _solve(right, time, f, given, lb, found, tolerance, *(found.variables if found else ()))
     return u if given is None else u + given
 
 
@@ -342,19 +339,14 @@ def _gradients_in_all(ctx: Any, g: Tensor) -> tuple[Any, ...]:
     lb, found, tolerance = ctx.rest
     w, one = solve_columns(lb, g, time, tolerance).to(g.dtype), torch.ones_like(g[0])
     whole = u if given is None else u + given
+    less = whole if time is not None else means(lb, b)
+    forms = [
+        BilinearForm("energy", w, whole, -one if time is None else -time),
+        BilinearForm("mass", w, -less if f is None else f - less, one),
+    ]
     if time is None:
-        forms = [
-            BilinearForm("energy", w, whole, -one),
-            BilinearForm("mass", w, f - means(lb, b), one),
-            BilinearForm("mass", means(lb, g), u, -one),
-        ]
-    else:
-        forms = [
-            BilinearForm("energy", w, whole, -time),
-            BilinearForm("mass", w, f - whole, one),
-        ]
-    none = (None,) * 5
-    return w, _in_time(ctx, lb, w, u), *none, *found.gradient(forms)
+        forms.append(BilinearForm("mass", means(lb, g), u, -one))
+    return w, _in_time(ctx, lb, w, u), *(None,) * 5, *found.gradient(forms)
 
 
 _solve: Any = _Solve.apply

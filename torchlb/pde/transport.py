@@ -124,9 +124,8 @@ def _transport(lb: Any, method: Transport | None) -> Any:
         check_choice("method", method, Transport)
     if lb.dim == lb.points.shape[1] and method != "paths":
         return _in_flat_space
-    if method is None and (lb._in_medium or lb._carries or lb.points.requires_grad):
-        method = "heat"
-    if method == "heat":
+    differs = lb._in_medium or lb._carries or lb.points.requires_grad
+    if method == "heat" or (method is None and differs):
         return _by_heat
     in_space = lb.dim == 2 and len(lb.normals) > 0 and len(lb.faces) > 0
     if in_space and not edges_of(lb.faces.cpu().numpy(), lb.num_points).against.any():
@@ -156,8 +155,10 @@ def _by_paths(lb: Any, index: Tensor, local: Float[Tensor, "S 2 C"]) -> Float[Te
 def _by_heat(lb: Any, index: Tensor, local: Float[Tensor, "S d C"]) -> Float[Tensor, "N d C"]:
     """Components by steps of heat, one of the fields and one of ones at the sources; of several also of lengths."""
     count, dim, width = lb.num_points, *local.shape[1:]
-    distance = geodesic_distance(lb, index)
-    t, size = _time(lb, distance), local.norm(dim=1)
+    distance, size = geodesic_distance(lb, index), local.norm(dim=1)
+    t = SHORT * lb.mass.double().mean() ** (2 / lb.dim)
+    far = (distance[distance.isfinite()].max().double() / (1 - LOW) / FARTHEST).square()
+    t = far if bool(far > t) else t  # distances have no derivative in points
     marks = torch.ones_like(size[:, :1])
     if len(index) > 1:
         marks = torch.cat([marks, size], 1)
@@ -187,14 +188,6 @@ def _in_flat_space(lb: Any, index: Tensor, local: Float[Tensor, "S d C"]) -> Flo
     return torch.where(distance.amin(1).isfinite()[:, None, None], found, 0.0)
 
 
-def _time(lb: LaplaceBeltrami, distance: Tensor) -> Float[Tensor, ""]:
-    """Time of the step, ℓ², by the spacing, or by the largest distance from a source where that is far."""
-    short = SHORT * lb.mass.double().mean() ** (2 / lb.dim)
-    longest = distance[distance.isfinite()].max().double()
-    far = (longest / (1 - LOW) / FARTHEST).square()
-    return far if bool(far > short) else short
-
-
 def _step(fields: Any, b: Float[Tensor, "rows C"], t: Float[Tensor, ""]) -> Float[Tensor, "rows C"]:
     """(M + tK)⁻¹b, as exact as rounding allows, since values far away are tiny."""
-    return solved(fields, b, t.to(b).expand(b.shape[1]), torch.zeros_like(b), None, ROUNDING)
+    return solved(fields, b, t.to(b).expand(b.shape[1]), tolerance=ROUNDING)

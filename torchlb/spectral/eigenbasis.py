@@ -31,13 +31,6 @@ def check_num_pairs(k: object) -> int:
 class Spectral(Protocol):
     """An object with an eigenbasis: an operator of one shape or of a batch."""
 
-    sizes: tuple[int, ...] | None
-
-    @property
-    def num_points(self) -> int:
-        """Number of points N."""
-        ...
-
     def eigenbasis(self, k: int) -> Eigenbasis:
         """The k smallest eigenpairs of −Δ."""
         ...
@@ -99,7 +92,7 @@ class Eigenbasis:
         (k,), or (S, k), for f (N,). In the type of f, that of the basis where f are integers; computed in that of f, at
         least float32. InputError for another number of points, and for NaN or infinity in f.
         """
-        coefficients = self.analyse(self.left, f)
+        coefficients = self.analyse(f)
         check_finite(f)
         return coefficients
 
@@ -133,22 +126,20 @@ class Eigenbasis:
             parts = zip(functions.split(self.sizes), c.unbind(-3), strict=True)
             return torch.cat([block @ column for block, column in parts], dim=-2).to(dtype)
 
-    def analyse(
-        self, functionals: Float[Tensor, "N k"], f: Shaped[Tensor, "*B N C"] | Shaped[Tensor, " N"]
-    ) -> Tensor:
-        """Σ_i functionals[i] f_i, over the points of each shape. NaN in f propagate, without waiting for a GPU."""
+    def analyse(self, f: Shaped[Tensor, "*B N C"] | Shaped[Tensor, " N"]) -> Tensor:
+        """The coefficients of `to_basis`, where NaN in f propagate, without waiting for a GPU."""
         check_tensor(f)
         if f.ndim == 1:
-            return self.analyse(functionals, f[:, None])[..., 0]
+            return self.analyse(f[:, None])[..., 0]
         if f.shape[-2:-1] != self.mass.shape:
             raise InputError(
                 f"expected f of shape (N,) or (…, N, C) with N = {len(self.mass)}, got {tuple(f.shape)}"
             )
-        functionals, f, dtype = self._typed(functionals, f)
+        left, f, dtype = self._typed(self.left, f)
         with torch.autocast(f.device.type, enabled=False):
             if self.sizes is None:
-                return (functionals.mT @ f).to(dtype)
-            parts = zip(functionals.split(self.sizes), f.split(self.sizes, dim=-2), strict=True)
+                return (left.mT @ f).to(dtype)
+            parts = zip(left.split(self.sizes), f.split(self.sizes, dim=-2), strict=True)
             return torch.stack([block.mT @ g for block, g in parts], dim=-3).to(dtype)
 
     @staticmethod
@@ -169,10 +160,9 @@ def unstack_eigenbases(basis: Eigenbasis) -> list[Eigenbasis]:
     parts = []
     columns = [t.split(basis.sizes) for t in (basis.eigenvectors, basis.mass, basis.left)]
     for s, (vectors, mass, left) in enumerate(zip(*columns, strict=True)):
-        k = int((vectors != 0).any(0).sum())
-        pairs = (basis.eigenvalues[s, :k], vectors[:, :k], mass, left[:, :k])
-        errors = None if basis.relative_errors is None else basis.relative_errors[s, :k]
-        parts.append(Eigenbasis(*pairs, relative_errors=errors))
+        errors = None if basis.relative_errors is None else basis.relative_errors[s]
+        part = Eigenbasis(basis.eigenvalues[s], vectors, mass, left, relative_errors=errors)
+        parts.append(part.truncate(int((vectors != 0).any(0).sum())))
     return parts
 
 
@@ -186,15 +176,12 @@ def stack_eigenbases(bases: list[Eigenbasis]) -> Eigenbasis:
     def extended(t: Tensor) -> Tensor:
         return torch.cat([t, t[-1:].expand(k - len(t))])
 
-    relative_errors = None
-    if all(basis.relative_errors is not None for basis in bases):
-        errors = [b.relative_errors for b in bases if b.relative_errors is not None]
-        relative_errors = torch.stack([extended(each) for each in errors])
+    errors = [extended(b.relative_errors) for b in bases if b.relative_errors is not None]
     return Eigenbasis(
         torch.stack([extended(b.eigenvalues) for b in bases]),
         torch.cat([padded(b.eigenvectors) for b in bases]),
         torch.cat([b.mass for b in bases]),
         torch.cat([padded(b.left) for b in bases]),
         tuple(len(b.mass) for b in bases),
-        relative_errors,
+        torch.stack(errors) if len(errors) == len(bases) else None,
     )

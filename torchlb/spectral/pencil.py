@@ -38,10 +38,8 @@ class _Part(NamedTuple):
     """One component, without its fixed points."""
 
     points: np.ndarray
-    stiffness: Sparse
-    mass_matrix: Sparse
-    linear: Pair | None  # K₁, M₁
-    conserving: bool  # constants have the eigenvalue 0
+    matrices: list[Sparse]  # K, M; then K₁, M₁, if they differ
+    zero: int  # 1 where constants have the eigenvalue 0
 
 
 def pencil_eigenbasis(
@@ -80,20 +78,22 @@ def pencil_eigenbasis(
     # A power of two as the unit of length: float32 holds the entries, and scaling rounds nothing.
     length = 2.0 ** round(float(np.log2(abs(mass_matrix).sum())) / dim)
     units = length ** (dim - 2), length**dim
-    whole = _narrow(stiffness, units[0]), _narrow(mass_matrix, units[1])
-    near = linear and (_narrow(linear[0], units[0]), _narrow(linear[1], units[1]))
-    component, pattern = _components(whole, near)
-    areas = np.bincount(component, whole[1].sum(axis=1))
+    given = stiffness, mass_matrix, *(linear or ())
+    matrices = [_narrow(m, unit) for m, unit in zip(given, 2 * units, strict=False)]
+    component = csgraph.connected_components(_pattern(*matrices[:2]), directed=False)[1]
+    areas = np.bincount(component, matrices[1].sum(axis=1))
     areas[component[losing]] = 0.0
     zeros = min(int((areas > 0).sum()), k)
     if linear is None:
         tolerance = EPS
     elif tolerance is None:
         tolerance = min(ROOT_EPS * k**2, SMALL)
-    parts = _parts(whole, near, fixed, component, pattern, areas) if zeros < k else []
+    parts = _parts(matrices, fixed, component, areas) if zeros < k else []
     found = [_pairs(part, k, tolerance, mass.device) for part in parts]
     null = constants(component, areas, zeros)
-    return _merged(parts, found, (null, whole[1] @ null), mass, k, tolerance, (length**2, units[1]))
+    return _merged(
+        parts, found, (null, matrices[1] @ null), mass, k, tolerance, (length**2, units[1])
+    )
 
 
 def constants(
@@ -117,32 +117,24 @@ def constants(
     return values[component]
 
 
-def _components(whole: Pair, near: Pair | None) -> tuple[np.ndarray, Sparse]:
-    """The connected component of every point under both matrices, and the pattern of the P1 pair."""
-    patterns = [sparse.csr_array(abs(k) + abs(m)) for k, m in (near or whole, whole)]  # no zeros
-    component = csgraph.connected_components(patterns[1], directed=False)[1]  # fits may connect
-    return component, patterns[0]
+def _pattern(k: Sparse, m: Sparse) -> Sparse:
+    """A matrix with the entries of both, without those that are zero."""
+    return sparse.csr_array(abs(k) + abs(m))
 
 
 def _parts(
-    whole: Pair,
-    near: Pair | None,
-    fixed: np.ndarray,
-    component: np.ndarray,
-    pattern: Sparse,
-    areas: np.ndarray,
+    matrices: list[Sparse], fixed: np.ndarray, component: np.ndarray, areas: np.ndarray
 ) -> list[_Part]:
     """The components without fixed points, numbered by reverse Cuthill–McKee, which halves the time of products."""
+    pattern = _pattern(*matrices[-2:])  # of the P1 pair
     order = csgraph.reverse_cuthill_mckee(pattern, symmetric_mode=True)
     order = order[np.argsort(component[order], kind="stable")]
     parts = []
     for points in np.split(order, np.cumsum(np.bincount(component))[:-1]):
         free = points[~fixed[points]]
         if len(free):
-            matrices = (sparse.csr_array(m[free].T)[free] for m in (*whole, *(near or ())))
-            k, m, *linear = matrices  # symmetric
-            conserving = bool(areas[component[free[0]]] > 0)
-            parts.append(_Part(free, k, m, (linear[0], linear[1]) if linear else None, conserving))
+            own = [sparse.csr_array(m[free].T)[free] for m in matrices]  # symmetric
+            parts.append(_Part(free, own, int(areas[component[free[0]]] > 0)))
     return parts
 
 
@@ -155,30 +147,30 @@ def _narrow(matrix: Sparse, unit: float) -> Sparse:
 
 def _pairs(part: _Part, k: int, tolerance: float, device: torch.device) -> tuple[Tensor, ...]:
     """Eigenvalues of a component without 0, relative errors, U and MU: the k smallest, with groups whole, or all."""
-    size, zero = len(part.points), int(part.conserving)
-    count = min(k + BLOCK, size)
-    mass_matrix = on_device(part.mass_matrix, device)
+    size, zero = len(part.points), part.zero
+    count, linear = min(k + BLOCK, size), part.matrices[2:]
+    mass_matrix = on_device(part.matrices[1], device)
     if size <= max(DENSE, SHARE * count):
-        dense = (part.stiffness.toarray(), part.mass_matrix.toarray())
+        dense = [matrix.toarray() for matrix in part.matrices[:2]]
         found = linalg.eigh(*dense, subset_by_index=(0, count - 1))
         values, u = (torch.from_numpy(x).to(device) for x in found)
         errors, mu = torch.zeros_like(values), multiply(*mass_matrix, u)
     else:
-        k1, m1 = part.linear or (part.stiffness, part.mass_matrix)
+        k1, m1 = part.matrices[-2:]
         null = None
         if zero:
             null = torch.full((size,), float(m1.sum()) ** -0.5, dtype=torch.float64, device=device)
-        accuracy = ROOT_EPS if part.linear is None else START
+        accuracy = START if linear else ROOT_EPS
         settings = {"tolerance": accuracy, "more": BLOCK, "null": null, "device": device}
         solve, (values, u) = lanczos_of_pair(
             k1, m1, k - zero, SHIFT / float(abs(m1).sum()), **settings
         )
         if null is not None:
             values, u = pad(values, (1, 0)), torch.cat([null.to(u)[:, None], u], dim=1)
-        if part.linear is None:
+        if not linear:
             errors, mu = torch.full_like(values, tolerance), multiply(*mass_matrix, u)
         else:
-            matrices = [on_device(part.stiffness, device), mass_matrix, on_device(m1, device)]
+            matrices = [on_device(part.matrices[0], device), mass_matrix, on_device(m1, device)]
             found = swept(matrices, u, k, solve, tolerance, zero)
             if found is None:
                 warn(
@@ -186,7 +178,7 @@ def _pairs(part: _Part, k: int, tolerance: float, device: torch.device) -> tuple
                     "as where spacings change abruptly. Factors of the whole pair take over, at many times the memory "
                     "and time; a larger `tolerance` does without"
                 )
-                return _pairs(part._replace(linear=None), k, EPS, device)
+                return _pairs(part._replace(matrices=part.matrices[:2]), k, EPS, device)
             values, errors, u, mu = found
     values[:zero] = 0.0
     if bool((values[zero:] <= 0).any()):

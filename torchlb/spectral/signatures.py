@@ -200,11 +200,10 @@ def diffusion_distance(
     eigenpairs. The `sources` y are an index, several, or a mask of the points. Raises InputError for others, and for a
     batch.
     """
-    check_operator(lb)
-    if lb.sizes is not None:
-        raise InputError("diffusion_distance: got a batch; ask each shape by itself")
-    index = check_sources(sources, lb.num_points)
     basis, values = _basis(lb, k)
+    if basis.sizes is not None:
+        raise InputError("diffusion_distance: got a batch; ask each shape by itself")
+    index = check_sources(sources, len(basis.mass))
     coordinates = basis.eigenvectors * torch.exp(-values * _numbers("time", time, values))
     # By a matrix product the distance of a point from itself would not be zero.
     mode = "donot_use_mm_for_euclid_dist"

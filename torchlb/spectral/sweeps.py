@@ -9,9 +9,8 @@ the P1 pair.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from functools import partial
-from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -47,6 +46,8 @@ SAFETY = 4.0
 Matrices = Sequence[Matrix]  # K, M, M₁
 Blocks = tuple[Tensor, ...]  # U, KU, MU
 
+_dots = partial(torch.linalg.vecdot, dim=0)
+
 
 def closed(values: Tensor, k: int, tolerance: float) -> int:
     """The least number of pairs, k or more, that splits no group of equal eigenvalues; all if there is none."""
@@ -55,30 +56,23 @@ def closed(values: Tensor, k: int, tolerance: float) -> int:
     return int(gaps.int().argmax()) + 1
 
 
-class _Maps(NamedTuple):
-    """Products with K and M, in float64 and in float32, with K − λM₁, and an approximate inverse of K."""
+class _Maps:
+    """Products with K and M, in float64 and in float32, with K − λM₁, and an approximate inverse of K.
 
-    whole: tuple[Linear, Linear]
-    single: tuple[Linear, Linear]
-    shifted: Callable[[Tensor, Tensor], Tensor]
-    cycle: Linear
+    That is the two-grid cycle around `solve`, a product with the inverse of K₁ + σM₁.
+    """
 
-    @classmethod
-    def of(cls, matrices: Matrices, solve: Linear) -> _Maps:
-        """The maps of K, M and M₁; the inverse is the two-grid cycle around `solve`, that of the P1 pair."""
-        k, m, m1 = matrices
-        single = [partial(multiply, crow, col, v.float()) for crow, col, v in (k, m, m1)]
-        rough = without_small_entries(*k)
-        cycle = two_grid(partial(multiply, *rough), absolute_row_sums(rough[0], rough[2]), solve)
+    def __init__(self, matrices: Matrices, solve: Linear) -> None:
+        single = [partial(multiply, crow, col, v.float()) for crow, col, v in matrices]
+        self.single, self._near = single[:2], single[2]
+        self.whole = [partial(_in_chunks, partial(multiply, *each)) for each in matrices[:2]]
+        rough = without_small_entries(*matrices[0])
+        sums = absolute_row_sums(rough[0], rough[2])
+        self.cycle = two_grid(partial(multiply, *rough), sums, solve)
 
-        def shifted(p: Tensor, shifts: Tensor) -> Tensor:
-            return single[0](p).sub_(single[2](p).mul_(shifts))
-
-        whole = (
-            partial(_in_chunks, partial(multiply, *k)),
-            partial(_in_chunks, partial(multiply, *m)),
-        )
-        return cls(whole, (single[0], single[1]), shifted, cycle)
+    def shifted(self, p: Tensor, shifts: Tensor) -> Tensor:
+        """(K − λM₁)p of every column by its λ."""
+        return self.single[0](p).sub_(self._near(p).mul_(shifts))
 
 
 def _in_chunks(product: Linear, x: Tensor) -> Tensor:
@@ -97,7 +91,7 @@ def swept(
     Of K, M and M₁, and a product with the inverse of K₁ + σM₁; `zero` is the number of eigenvalues 0 among the m. The
     result has the eigenvalues, estimates of their relative errors, U and MU.
     """
-    maps, count = _Maps.of(matrices, solve), u.shape[1]
+    maps, count = _Maps(matrices, solve), u.shape[1]
     u = u.float().contiguous()
     values, known = _ritz([[u], *([on(u)] for on in maps.single)], count)
     for sweep in range(ROUNDS + 1):
@@ -115,9 +109,10 @@ def swept(
         enough = FACTOR * (SMALL * errors).clamp_min(tolerance) / scale.clamp_min(TINY)
         right = [x.float()[..., active] for x in (r, z, values[:keep], enough)]
         del r, z
-        small = known[0].float(), known[2].float()
-        w = _corrections(maps, small, right, 1 if coarse else LONGEST).double()
-        del right, small
+        small, steps = (known[0].float(), known[2].float()), 1 if coarse else LONGEST
+        parts = zip(*(x.split(CHUNK, -1) for x in right), strict=True)
+        w = torch.cat([_correction(maps, small, part, steps) for part in parts], dim=1).double()
+        del right, small, parts
         if sweep:
             new = [w.addmm_(known[0], known[2].T @ w, alpha=-1)]
         else:
@@ -149,14 +144,6 @@ def _residuals(maps: _Maps, known: Blocks, values: Tensor) -> tuple[Tensor, ...]
         z[:, some] = maps.cycle(r[:, some])
         energy[some] = _dots(r[:, some], z[:, some])
     return size, energy, r, z
-
-
-def _corrections(
-    maps: _Maps, known: tuple[Tensor, Tensor], right: list[Tensor], steps: int
-) -> Tensor:
-    """`_correction` of all columns, some at once, to bound the memory."""
-    parts = zip(*(x.split(CHUNK, -1) for x in right), strict=True)
-    return torch.cat([_correction(maps, known, part, steps) for part in parts], dim=1)
 
 
 def _correction(
@@ -191,10 +178,6 @@ def _correction(
         z = maps.cycle(r)
     order, w = (torch.cat(parts, -1) for parts in zip(*found, strict=True))
     return w.index_select(1, order.argsort())
-
-
-def _dots(x: Tensor, y: Tensor) -> Tensor:
-    return torch.linalg.vecdot(x, y, dim=0)
 
 
 def _ritz(space: list[list[Tensor]], count: int) -> tuple[Tensor, Blocks]:
