@@ -13,6 +13,7 @@ import torch
 from jaxtyping import Float, Int
 from scipy.special import roots_jacobi
 from torch import Tensor
+from torch.nn.functional import pad
 
 from torchlb.fits.polynomials import monomial_derivatives, monomials
 
@@ -119,14 +120,10 @@ def simplex(dim: int, degree: int) -> Element:
         points = torch.cat([shares.roll(corner, 1)[:, 1:] for corner in range(dim + 1)])
         weights = weights.repeat(dim + 1) / (dim + 1)
     nodes = lattice(dim, degree)[:, 1:]
-    inverse = torch.linalg.inv(_powers(nodes, degree))
+    at_nodes, powers = (pad(monomials(x, degree), (1, 0), value=1.0) for x in (nodes, points))
+    inverse = torch.linalg.inv(at_nodes)
     slopes = points.new_zeros(len(points), len(nodes), dim)
     if dim:
         slopes[:, 1:] = monomial_derivatives(points, degree)
     gradients = torch.einsum("qmd,mn->qnd", slopes, inverse)
-    return Element(weights, _powers(points, degree) @ inverse, gradients)
-
-
-def _powers(points: Float[Tensor, "Q d"], degree: int) -> Float[Tensor, "Q M"]:
-    ones = points.new_ones(len(points), 1)
-    return torch.cat([ones, monomials(points, degree)], dim=1) if points.shape[1] else ones
+    return Element(weights, powers @ inverse, gradients)
