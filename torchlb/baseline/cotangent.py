@@ -33,6 +33,5 @@ def cotangent_laplacian(
             "none, whose cotangents are infinite; remove these triangles, or use LaplaceBeltrami.from_mesh, which "
             "accepts them"
         )
-    return with_diagonal(sparse.csr_array(sparse.diags_array(1 / area) @ weak)), torch.from_numpy(
-        area.copy()
-    )
+    strong = sparse.csr_array(sparse.diags_array(1 / area) @ weak)
+    return with_diagonal(strong), torch.from_numpy(area.copy())
