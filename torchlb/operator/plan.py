@@ -152,7 +152,6 @@ class Plan:
         cells, options = self.shape.cells, self.options.taken(self.numbering)
         shape = Shape(
             **vars(placed),
-            normal_order=self.shape.fits.order,
             neighborhoods=None,
             mass=areas,
             low_order=MeshLowOrder(placed.points, cells, self.flips, self.shape.shares),
@@ -188,11 +187,11 @@ def operator_parts(
     numbering, options = plan.numbering, plan.options
     given, bending = numbering.restored, points.new_zeros(0, 0, 0)
     if shape.normals is not None:
-        bending = given(shape_operators(shape, rows, shape.normal_order))
+        bending = given(shape_operators(shape, rows, plan.shape.fits.order))
     rows = rows.restored(numbering)
     counts = rows.length.new_zeros(4, len(points))
     counts = counts if plan.pair is None else plan.pair.counts[:, numbering.here]
-    report = {"num_neighbors": rows.length, "normal_order": given(shape.normal_order)}
+    report = {"num_neighbors": rows.length, "normal_order": given(plan.shape.fits.order)}
     report |= vars(rows) | dict(zip(FIELDS[-4:], counts, strict=True))
     values = torch.cat([rows.laplacian[None], rows.gradient.T])
     parts = others | {
