@@ -94,6 +94,7 @@ SHAPES = {
     "cloud": lambda: rough(Sphere().points(200)),
     "curve": lambda: rough(*trefoil()),
     "solid": lambda: rough(*cube()),
+    "held solid": lambda: rough(*cube(), condition="dirichlet"),
     "coarse": lambda: rough(*flat()),
 }
 
