@@ -17,7 +17,7 @@ from torchlb.fits.polynomials import monomials
 from torchlb.galerkin.assembly import area_element, flat_metric, metric
 from torchlb.galerkin.coarse import lying_triangles, reaching_out, without_inside
 from torchlb.galerkin.delaunay import Cover, delaunay_cover, sound_lengths
-from torchlb.galerkin.elements import simplex
+from torchlb.galerkin.elements import edge_lengths, simplex
 from torchlb.galerkin.nodes import Nodes
 from torchlb.geometry.frames import vertex_normals
 from torchlb.geometry.local_fits import FitPlan, LocalFits
@@ -100,7 +100,7 @@ class CurvingPlan:
         near = (standing - start).norm(dim=1) <= FACTOR * ROUGH * _sizes(points, nodes)
         standing = torch.where(near[:, None], standing, start)
         places = torch.cat([points, torch.where(self.bent[:, None], standing, flat)])
-        lengths = sound_lengths(nodes.lengths(points), nodes.cells)
+        lengths = sound_lengths(edge_lengths(points, nodes.cells), nodes.cells)
         shape = simplex(nodes.dim, nodes.degree)
         g = flat_metric(lengths)[:, None].repeat(1, len(shape.weights), 1)
         for part in self.curved[nodes.edge].any(1).nonzero()[:, 0].split(AT_ONCE):
@@ -230,7 +230,7 @@ def _flattened(
     `stand` holds the positions (X, n) on flat cells and on the surface; `curved` flags edges, (E,), and `whole`
     triangles and cells, that may be curved.
     """
-    sides = nodes.lengths(points)
+    sides = edge_lengths(points, nodes.cells)
     lengths = sound_lengths(sides, nodes.cells)
     plane, shape = flat_metric(lengths), simplex(nodes.dim, nodes.degree)
     area = area_element(plane)

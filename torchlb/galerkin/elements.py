@@ -16,6 +16,7 @@ from torch import Tensor
 from torch.nn.functional import pad
 
 from torchlb.fits.polynomials import monomial_derivatives, monomials
+from torchlb.geometry.vectors import Points, at
 
 
 class Element(NamedTuple):
@@ -51,6 +52,12 @@ def subsets(dim: int, size: int) -> tuple[tuple[int, ...], ...]:
     """
     every = combinations(range(dim + 1), size)
     return tuple(sorted(every, key=lambda corners: (corners[-1] - corners[0], corners)))
+
+
+def edge_lengths(points: Points, cells: Int[Tensor, "T corners"]) -> Float[Tensor, "T e"]:
+    """Lengths of the edges of each cell, in the order of `subsets`, ℓ."""
+    first, second = torch.tensor(subsets(cells.shape[1] - 1, 2)).T
+    return (at(points, cells[:, second]) - at(points, cells[:, first])).norm(dim=2)
 
 
 @cache

@@ -14,7 +14,7 @@ from scipy import sparse
 from torch import Tensor
 
 from torchlb.galerkin.assembly import ElementMatrices, Elements, spread, upper_congruence
-from torchlb.galerkin.elements import Element, subsets
+from torchlb.galerkin.elements import Element, edge_lengths
 from torchlb.galerkin.medium import Field, Medium, orthonormal
 from torchlb.geometry.numbering import Numbering
 from torchlb.geometry.vectors import Points, at
@@ -181,12 +181,6 @@ class Forms:
                 own = projector[(..., *form.along)] * own
             total.append(lot.shared(own).sum())
         return torch.stack(total).sum()
-
-
-def edge_lengths(points: Points, cells: Int[Tensor, "T corners"]) -> Float[Tensor, "T e"]:
-    """Lengths of the edges of each cell, in the order of `subsets`, ℓ."""
-    ends = points[cells[:, [list(pair) for pair in subsets(cells.shape[1] - 1, 2)]]]
-    return (ends[:, :, 1] - ends[:, :, 0]).norm(dim=2)
 
 
 def _renumbered(matrix: Any, columns: Int[Tensor, " C"], count: int) -> sparse.csr_array:

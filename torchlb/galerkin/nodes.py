@@ -11,7 +11,6 @@ from torch import Tensor
 
 from torchlb.galerkin.elements import facet_nodes, inner, subsets
 from torchlb.geometry.boundary import sub_simplices
-from torchlb.geometry.vectors import Points, at
 
 
 @dataclass(frozen=True)
@@ -71,11 +70,6 @@ class Nodes:
     def beyond(self) -> list[Sides]:
         """Sub-simplices of dimension 2 and higher, cells included."""
         return [self.sides[size] for size in range(3, self.dim + 2)]
-
-    def lengths(self, points: Points) -> Float[Tensor, "F e"]:
-        """Edge lengths of each cell, ℓ."""
-        ends = at(points, self.edges)
-        return (ends[:, 1] - ends[:, 0]).norm(dim=1)[self.edge]
 
     def at_nodes(self, *values: Tensor) -> Tensor:
         """Repeat values of the edges, of the triangles, … at the nodes inside them, in node order."""

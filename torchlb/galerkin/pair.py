@@ -26,8 +26,8 @@ from torchlb.galerkin.boundary import boundary_nodes
 from torchlb.galerkin.coarse import boundary_shares
 from torchlb.galerkin.curving import CurvedMesh, CurvingPlan, curve
 from torchlb.galerkin.delaunay import sound_lengths
-from torchlb.galerkin.elements import simplex
-from torchlb.galerkin.forms import BilinearForm, Forms, edge_lengths
+from torchlb.galerkin.elements import edge_lengths, simplex
+from torchlb.galerkin.forms import BilinearForm, Forms
 from torchlb.galerkin.matrices import PairMatrices
 from torchlb.galerkin.medium import Medium
 from torchlb.galerkin.nodes import lagrange_nodes

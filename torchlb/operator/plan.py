@@ -21,8 +21,8 @@ from torchlb.errors import DerivativeError, InputError, first_few, renumbered, w
 from torchlb.galerkin.boundary import BoundaryCurves, OnCurves, OnSurface
 from torchlb.galerkin.creases import across_creases, creased_cells
 from torchlb.galerkin.curving import BoundaryNodesPlan, CurvingPlan
-from torchlb.galerkin.elements import subsets
-from torchlb.galerkin.forms import BilinearForm, Forms, edge_lengths
+from torchlb.galerkin.elements import edge_lengths, subsets
+from torchlb.galerkin.forms import BilinearForm, Forms
 from torchlb.galerkin.matrices import PairMatrices
 from torchlb.galerkin.medium import Medium
 from torchlb.galerkin.nodes import lagrange_nodes
