@@ -145,12 +145,14 @@ class _Elements:
         nodes, turns = self.lot.nodes, self.lot.turns
         assert turns is not None
         q, dim = turns @ at(frames, nodes), frames.shape[2]
-        total: Any = 0.0
-        cross = torch.stack([q[..., 1, :], -q[..., 0, :]], -2)  # the quarter turn of ω
-        for other, (slopes, products) in [(q, self.covariant), (cross, self.turning)][: 1 + hodge]:
+        kinds, total = [(q, self.covariant)], torch.zeros((), dtype=q.dtype)
+        if hodge:
+            cross = torch.stack([q[..., 1, :], -q[..., 0, :]], -2)  # the quarter turn of ω
+            kinds.append((cross, self.turning))
+        for other, (slopes, products) in kinds:
             inner = torch.einsum("tika,tjkb->tiajb", q, other)
             blocks = slopes.flatten(1) @ products.flatten(0, 1)
-            total += blocks.view(-1, *2 * (nodes.shape[1], 1)) * inner
+            total = total + blocks.view(-1, *2 * (nodes.shape[1], 1)) * inner
         rows = (dim * nodes[..., None] + torch.arange(dim)).flatten(1)
         whole = summed(total.flatten(1), rows, dim * len(frames))
         return (whole + whole.T) / 2  # symmetric but for rounding
