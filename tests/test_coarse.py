@@ -12,9 +12,8 @@ from scipy.sparse.linalg import eigsh
 from scipy.spatial import Delaunay
 
 from torchlb import LaplaceBeltrami
-from torchlb.galerkin.assembly import element_matrices, flat_metric, summed
+from torchlb.galerkin.assembly import Elements, summed
 from torchlb.galerkin.delaunay import delaunay_cover
-from torchlb.galerkin.elements import simplex
 from torchlb.galerkin.nodes import lagrange_nodes
 from torchlb.surfaces import UnitDisk
 
@@ -250,8 +249,8 @@ def test_the_delaunay_cover_is_that_of_robust_laplacian():
     corners = vertices[nodes.cells]
     lengths = (corners.roll(-1, 1) - corners).norm(dim=2)
     cover = delaunay_cover(nodes.cells, lengths, nodes.edge, torch.zeros(len(nodes.edges)).bool())
-    metric = flat_metric(cover.lengths)[:, None].expand(-1, len(simplex(2, 1).weights), 3)
-    ours = summed(element_matrices(metric, simplex(2, 1)), cover.faces, len(vertices)) / 2
+    matrices = Elements.flat(cover.faces, cover.lengths, share=0.5).matrices()
+    ours = summed(matrices.blocks, cover.faces, len(vertices))
     stiffness, mass = robust_laplacian.mesh_laplacian(vertices.numpy(), faces.numpy(), 0.0)
     assert abs(ours.real - stiffness).max() < 1e-9 * abs(stiffness).max()
     np.testing.assert_allclose(ours.imag.sum(axis=1), mass.diagonal(), atol=1e-9)

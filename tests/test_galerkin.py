@@ -153,9 +153,7 @@ def test_linear_elements_are_the_cotangent_with_its_full_mass(surface):
     vertices, faces = surface.mesh(400)
     frames = complete_frames(vertex_normals(vertices, faces))
     neighborhoods = GraphNeighborhoods(vertices, mesh_graph(faces, len(vertices)), frames)
-    pair = mesh_pair(vertices, faces, *FitSearch(neighborhoods, 0, (2,)).finish(), 2, (2,))[
-        1
-    ].linear
+    pair = mesh_pair(faces, *FitSearch(neighborhoods, 0, (2,)).finish(), 2, (2,))[1].linear
     args = vertices.numpy(), faces.numpy()
     expected = -igl.cotmatrix(*args), igl.massmatrix(*args, igl.MASSMATRIX_TYPE_FULL)
     for values, matrix in zip(pair.values, expected, strict=True):

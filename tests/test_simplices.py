@@ -8,7 +8,7 @@ import torch
 from scipy.spatial import ConvexHull, Delaunay
 
 from torchlb import LaplaceBeltrami, heat_flow, implicit_step, poisson_solve
-from torchlb.galerkin.assembly import area_element, element_matrices, flat_metric, metric
+from torchlb.galerkin.assembly import Elements, area_element, flat_metric, metric
 from torchlb.galerkin.elements import facet_nodes, lattice, simplex, subsets
 from torchlb.galerkin.nodes import lagrange_nodes
 from torchlb.geometry.boundary import folded_sides
@@ -96,7 +96,9 @@ def test_linear_functions_have_their_energy_and_mass(dim):
     torch.testing.assert_close(flat_metric(lengths)[:, None].expand_as(g), g)
     size = (edges @ edges.T).det().sqrt()
     torch.testing.assert_close(area_element(g), size.expand_as(area_element(g)))
-    block = element_matrices(g, shape).view(len(places), -1)
+    block = (
+        Elements(torch.arange(len(places))[None], g, shape).matrices().blocks.view(len(places), -1)
+    )
     x = places[:, 0]
     slope = torch.linalg.lstsq(edges.T, torch.eye(4, dtype=torch.float64)[:, :1]).solution
     square = (edges.T @ slope).square().sum()

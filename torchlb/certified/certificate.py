@@ -199,8 +199,8 @@ def certify(
             bar.update()
             matrix = to_scipy(rows.crow, rows.col, rows.laplacian, (count, count))
             mass, result, feed = check_certificate(matrix, areas, outflow=outflow)
-            free = rows.candidate < bottom
-            marked = _marked(matrix, mass / areas, feed, free, spread=not result.holds)
+            free = (rows.candidate < bottom).numpy()
+            marked = _marked(matrix, mass / areas, feed, free, not result.holds)
             if not marked.any() or rounds == MOST_ROUNDS:
                 break
             rounds, rows = rounds + 1, _lowered(rows, first, marked, lower)
@@ -221,47 +221,29 @@ def certify(
 
 
 def _marked(
-    matrix: sparse.csr_array,
-    density: Float[Tensor, " N"],
-    feed: Float[np.ndarray, "N k"],
-    free: Bool[Tensor, " N"],
-    *,
-    spread: bool,
+    matrix: sparse.csr_array, density: Tensor, feed: np.ndarray, free: np.ndarray, spread: bool
 ) -> Bool[Tensor, " N"]:
     """Rows to widen or lower: those that make π small, or contribute most to a direction v with vᵀSv > 0.
 
-    With `spread`, neighbours are marked too until one is free, since low-order rows are symmetric only together.
+    A small π_i is due to the rows with a considerable negative weight on the point, as π_i |L_ii| = Σ_{j≠i} π_j L_ji;
+    and, if its own is a low-order row, to those of the points in it, which may not refer back, as across a crease. With
+    `spread`, neighbours are marked too until one is free, since low-order rows are symmetric only together.
     """
-    joined = sparse.csr_array(abs(matrix) + abs(matrix).T)
-    joined.data[:] = 1.0
-    marked = _around_small_weights(matrix, density.numpy(), free.numpy())
-    marked |= (feed > LOW * feed.max(axis=0)).any(axis=1)
-    while spread and not (marked & free.numpy()).any():
+    small = np.flatnonzero(density.numpy() <= MARGIN)
+    columns = sparse.coo_array(sparse.csc_array(matrix)[:, small])
+    row, col = columns.coords
+    inflow, worst = np.where(row == small[col], 0.0, columns.data), np.zeros(len(small))
+    np.minimum.at(worst, col, inflow)
+    marked = (feed > LOW * feed.max(axis=0)).any(axis=1)
+    marked[row[inflow < LOW * worst[col]]] = True
+    marked[matrix[small[~free[small]]].indices] = True
+    joined = abs(matrix) + abs(matrix).T
+    while spread and not (marked & free).any():
         wider = joined @ marked > 0
         if (wider == marked).all():
             break
         marked = wider
-    return torch.from_numpy(marked) & free
-
-
-def _around_small_weights(
-    matrix: sparse.csr_array, density: Float[np.ndarray, " N"], free: Bool[np.ndarray, " N"]
-) -> Bool[np.ndarray, " N"]:
-    """Rows to mark for the points of small π.
-
-    For each such point these are the rows with a considerable negative weight on it, as π_i |L_ii| = Σ_{j≠i} π_j L_ji;
-    and, if its own is a low-order row, the rows of the points in it, which may not refer back, as across a crease.
-    """
-    small = np.flatnonzero(density <= MARGIN)
-    columns = sparse.coo_array(sparse.csc_array(matrix)[:, small])
-    row, col = columns.coords
-    inflow = np.where(row == small[col], 0.0, columns.data)
-    worst = np.zeros(len(small))
-    np.minimum.at(worst, col, inflow)
-    marked = np.zeros(len(density), dtype=bool)
-    marked[row[(inflow < LOW * worst[col]) & (inflow < 0)]] = True
-    marked[matrix[small[~free[small]]].indices] = True
-    return marked
+    return torch.from_numpy(marked & free)
 
 
 def _lowered(rows: Rows, first: Rows, marked: Bool[Tensor, " N"], lower: Lower) -> Rows:

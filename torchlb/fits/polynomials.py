@@ -9,7 +9,7 @@ coefficients is a short column of factorials.
 from __future__ import annotations
 
 from functools import lru_cache
-from itertools import combinations_with_replacement
+from itertools import chain, combinations_with_replacement
 from math import comb
 
 import torch
@@ -49,19 +49,16 @@ def monomials(coords: Float[Tensor, "*batch d"], degree: int) -> Float[Tensor, "
     >>> monomials(torch.tensor([2.0, 3.0]), 2).tolist()
     [2.0, 3.0, 4.0, 6.0, 9.0]
     """
-    dim = coords.shape[-1]
-    if degree == 0:
+    if degree * coords.shape[-1] == 0:
         return coords[..., :0]
-    columns = [coords[..., c] for c in range(dim)]
-    first = list(range(dim))  # where the monomials of the previous degree that start with y_c begin
-    previous = list(columns)
+    variables = coords.unbind(-1)
+    columns, last = (
+        list(variables),
+        [[y] for y in variables],
+    )  # of one degree, by the first variable
     for _ in range(degree - 1):
-        current, starts = [], []
-        for c in range(dim):
-            starts.append(len(current))
-            current += [coords[..., c] * monomial for monomial in previous[first[c] :]]
-        columns += current
-        previous, first = current, starts
+        last = [[y * z for z in chain(*last[c:])] for c, y in enumerate(variables)]
+        columns += chain(*last)
     return torch.stack(columns, dim=-2).mT if coords.ndim > 1 else torch.stack(columns)
 
 
@@ -73,9 +70,8 @@ def monomial_derivatives(
     >>> monomial_derivatives(torch.tensor([2.0, 3.0]), 2).tolist()
     [[1.0, 0.0], [0.0, 1.0], [4.0, 0.0], [3.0, 2.0], [0.0, 6.0]]
     """
-    dim = coords.shape[-1]
+    factor, place = _lowered(coords.shape[-1], degree)
     lower = torch.cat([torch.ones_like(coords[..., :1]), monomials(coords, degree - 1)], dim=-1)
-    factor, place = _lowered(dim, degree)
     taken = lower.index_select(-1, place.to(coords.device).flatten())
     return factor.to(coords) * taken.unflatten(-1, place.shape)
 

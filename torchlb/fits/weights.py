@@ -1,7 +1,4 @@
-"""Stencil weights: the derivatives at the centre of a fit to the neighbours (`method.md`, section 2).
-
-Local coordinates y_j of the K − 1 neighbours, centre at the origin. One factorisation serves every functional.
-"""
+"""Stencil weights (`method.md`, section 2): derivatives at the centre of a fit, all by one factorisation."""
 
 from __future__ import annotations
 
@@ -16,6 +13,11 @@ from torch import Tensor
 from torchlb.fits.polynomials import functionals, monomial_derivatives, monomials, num_monomials
 from torchlb.linalg.once import once_differentiable
 from torchlb.linalg.precision import SINGLE
+
+Coords = Float[Tensor, "B neighbors d"]
+"""Local coordinates of the neighbours of each centre of a batch, which is the origin and not among them."""
+Heights = Float[Tensor, "B neighbors n"]
+"""Heights of the neighbours over the tangent planes, ℓ."""
 
 
 @dataclass(frozen=True)
@@ -141,7 +143,7 @@ class CenteredFit:
         return rows.abs().sum(-1).amax(1)
 
     def apart(
-        self, heights: Float[Tensor, "B neighbors n"], graph: Float[Tensor, "B M n"]
+        self, heights: Heights, graph: Float[Tensor, "B M n"]
     ) -> Float[Tensor, "B neighbors"]:
         """Distances √ω |h − V c| of the heights from the polynomials `graph` fitted to them, ℓ."""
         # a product with few long rows takes half the time of one with few long columns
@@ -149,7 +151,7 @@ class CenteredFit:
         return self.root * left.norm(dim=-1)
 
     def scatter(
-        self, heights: Float[Tensor, "B neighbors n"], apart: Float[Tensor, "B neighbors"], dim: int
+        self, heights: Heights, apart: Float[Tensor, "B neighbors"], dim: int
     ) -> Float[Tensor, " B"]:
         """Scatter of the heights about their fit, of which they are `apart`, over root mean square distance.
 
@@ -162,15 +164,10 @@ class CenteredFit:
         return apart.norm(dim=1) / size.sqrt()
 
     def weights(
-        self,
-        weights: Float[Tensor, "B K F"],
-        residual: Float[Tensor, " B"],
-        coords: Float[Tensor, "B neighbors d"],
-        heights: Float[Tensor, "B neighbors n"] | None,
+        self, weights: Float[Tensor, "B K F"], residual: Tensor, dim: int, heights: Heights | None
     ) -> Weights:
         """Weights in units of length, from those in units of the radius."""
-        dim, rho = coords.shape[2], self.radius[:, None, None]
-        left = none = torch.zeros_like(self.radius)
+        left, rho = torch.zeros_like(self.radius), self.radius[:, None, None]
         if heights is not None:
             apart = self.apart(heights, self.coefficients @ heights)
             left = self.scatter(heights, apart, dim)
@@ -181,14 +178,12 @@ class CenteredFit:
             condition=self.condition,
             residual=residual,
             height_residual=left,
-            slope=none.long(),
+            slope=torch.zeros_like(left, dtype=torch.int64),
         )
 
 
 def scaled_system(
-    coords: Float[Tensor, "B neighbors d"],
-    degree: int,
-    keep: Bool[Tensor, "B neighbors"] | None = None,
+    coords: Coords, degree: int, keep: Bool[Tensor, "B neighbors"] | None = None
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Radius ρ of the kept neighbours, the monomials V of y/ρ, and √ω."""
     distance = coords.norm(dim=-1)
@@ -199,9 +194,7 @@ def scaled_system(
 
 
 def centered_fit(
-    coords: Float[Tensor, "B neighbors d"],
-    degree: int,
-    keep: Bool[Tensor, "B neighbors"] | None = None,
+    coords: Coords, degree: int, keep: Bool[Tensor, "B neighbors"] | None = None
 ) -> CenteredFit:
     """Fits of degree m to K − 1 ≥ M − 1 neighbours; those outside `keep` have zero coefficients.
 
@@ -226,11 +219,11 @@ def cardinal(
 
 
 def least_squares_weights(
-    coords: Float[Tensor, "B neighbors d"],
+    coords: Coords,
     degree: int,
     flux: Float[Tensor, "B K d"] | None = None,
     share: float | Float[Tensor, "B K"] = 0.0,
-    heights: Float[Tensor, "B neighbors n"] | None = None,
+    heights: Heights | None = None,
 ) -> Weights:
     r"""Centre-constrained moving least squares, by coordinates of K − 1 ≥ M − 1 neighbours without the centre.
 
@@ -267,7 +260,7 @@ def least_squares_weights(
         residual = torch.where(spread[:, -1] <= SINGLE * spread[:, 0], torch.inf, residual)
     center = -(constant[..., None] * rows.mT).sum(1, keepdim=True)
     weights = torch.cat([center, rows.mT[:, : coords.shape[1]]], dim=1)
-    return fit.weights(weights, residual, coords, heights)
+    return fit.weights(weights, residual, coords.shape[2], heights)
 
 
 def _with_data(

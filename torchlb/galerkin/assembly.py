@@ -18,7 +18,8 @@ from torch import Tensor
 
 from torchlb.galerkin.elements import Element, simplex, subsets
 from torchlb.geometry.vectors import at
-from torchlb.linalg.precision import AT_ONCE
+from torchlb.linalg.once import computed_again
+from torchlb.linalg.precision import AT_ONCE, rows_at_once
 
 
 def metric(
@@ -66,25 +67,15 @@ def cofactors(g: Float[Tensor, "*batch S"]) -> Float[Tensor, "*batch S"]:
         xx, xy, yy = g.unbind(-1)
         return torch.stack([yy, -xy, xx], -1)
     xx, xy, xz, yy, yz, zz = g.unbind(-1)
-    return torch.stack(
-        [
-            yy * zz - yz * yz,
-            xz * yz - xy * zz,
-            xy * yz - xz * yy,
-            xx * zz - xz * xz,
-            xy * xz - xx * yz,
-            xx * yy - xy * xy,
-        ],
-        -1,
-    )
+    first = yy * zz - yz * yz, xz * yz - xy * zz, xy * yz - xz * yy
+    others = xx * zz - xz * xz, xy * xz - xx * yz, xx * yy - xy * xy
+    return torch.stack([*first, *others], -1)
 
 
 def area_element(g: Float[Tensor, "*batch S"]) -> Float[Tensor, "*batch"]:
     """Volume element √det G, ℓ^d; zero where rounding makes the determinant negative."""
     if g.shape[-1] == 0:
         return g.new_ones(g.shape[:-1])
-    if g.shape[-1] == 1:
-        return g[..., 0].sqrt()
     if g.shape[-1] == 3:
         return (g[..., 0] * g[..., 2] - g[..., 1].square()).clamp_min(0).sqrt()
     return (g[..., :3] * cofactors(g)[..., :3]).sum(-1).clamp_min(0).sqrt()
@@ -127,28 +118,6 @@ def in_cells(
     return (inverse @ (q.mT @ a @ q) @ inverse.mT)[..., row, col]
 
 
-def element_matrices(
-    g: Float[Tensor, "T Q S"],
-    shape: Element,
-    conductivity: Tensor | None = None,
-    density: Float[Tensor, "T Q"] | None = None,
-) -> Complex[Tensor, "T n_times_n"]:
-    """Element matrices K + iM: K = ∫ A∇φ_i·∇φ_j, ℓ^{d−2}, and M = ∫ ρφ_i φ_j, ℓ^d; A, as in `conductance`, and ρ are 1.
-
-    Both are real and share a pattern; packed into one complex matrix they are assembled and multiplied together.
-    """
-    gradients, masses = gradient_products(shape).flatten(0, 1), squares(shape)
-    blocks = torch.empty(len(g), masses.shape[1], dtype=torch.complex128)
-    for first in range(0, len(g), AT_ONCE):
-        part = slice(first, first + AT_ONCE)
-        kappa, rho = (None if x is None else x[part] for x in (conductivity, density))
-        entries = shape.weights[:, None] * conductance(g[part], kappa)
-        size = shape.weights * area_element(g[part])
-        mass = (size if rho is None else rho * size) @ masses
-        blocks[part] = torch.complex(entries.flatten(1) @ gradients, mass)
-    return blocks
-
-
 def gradient_products(shape: Element) -> Float[Tensor, "Q S n_times_n"]:
     """∂_a φ_i ∂_b φ_j at the Gauss points for a = b, and its sum with a and b exchanged for a < b."""
     products = []
@@ -175,9 +144,7 @@ def summed(
     size, nodes = nodes.shape[1], nodes.int()
     row, col = nodes.repeat_interleave(size, dim=1).flatten(), nodes.repeat(1, size).flatten()
     entries = blocks.flatten().numpy(), (row.numpy(), col.numpy())
-    del blocks, row, col
     result = sparse.csr_array(entries, shape=(num_nodes, num_nodes))
-    del entries
     result.data, result.indices = result.data.copy(), result.indices.copy()  # without duplicates
     return result
 
@@ -236,30 +203,70 @@ class Elements:
 
     def shared(self, x: Tensor) -> Tensor:
         """Values of the elements, (T, …), times the fractions of these that are integrated."""
-        share = self.share
-        return (share.view(-1, *[1] * (x.ndim - 1)) if isinstance(share, Tensor) else share) * x
+        share = torch.as_tensor(self.share, dtype=torch.float64)
+        return share.view(-1, *[1] * (x.ndim - 1)) * x
 
     def matrices(
         self, conductivity: Tensor | None = None, density: Float[Tensor, "T Q"] | None = None
     ) -> ElementMatrices:
-        """Their matrices, of a conductivity as `conductance` takes it."""
-        blocks = element_matrices(self.metric, self.element, conductivity, density)
+        """Their matrices: K = ∫ A∇φ_i·∇φ_j, ℓ^{d−2}, and M = ∫ ρφ_i φ_j, ℓ^d; A, as in `conductance`, and ρ are 1.
+
+        Packed into one complex matrix they are assembled and multiplied together.
+        """
+        g, shape = self.metric, self.element
+        gradients, masses = gradient_products(shape).flatten(0, 1), squares(shape)
+        blocks = torch.empty(len(g), masses.shape[1], dtype=torch.complex128)
+        for first in range(0, len(g), AT_ONCE):
+            part = slice(first, first + AT_ONCE)
+            kappa, rho = (None if x is None else x[part] for x in (conductivity, density))
+            entries = shape.weights[:, None] * conductance(g[part], kappa)
+            size = shape.weights * area_element(g[part])
+            mass = (size if rho is None else rho * size) @ masses
+            blocks[part] = torch.complex(entries.flatten(1) @ gradients, mass)
         if self.lumped is not None:
             corners, total = self.nodes.shape[1], blocks.imag.sum(1, keepdim=True)
             blocks.imag.zero_()
             blocks.imag[:, :: corners + 1] = self.lumped[self.nodes] * total / corners
         return ElementMatrices(self.nodes, self.shared(blocks))
 
+    def outer(self, values: list[Tensor], c: Float[Tensor, " C"]) -> Float[Tensor, "T n_times_n"]:
+        """Σ_k c_k w_k(i) u_k(j) for all pairs of nodes of each element, of two functions at the nodes."""
+        one, two = values[0] * c, values[1]
+        parts = self.nodes.split(rows_at_once(self.nodes.shape[1] * len(c)))
+        return torch.cat([computed_again(_outer, one, two, part) for part in parts])
+
+    def weighted_slopes(
+        self, blocks: Float[Tensor, "T n_times_n"], conductivity: Tensor | None
+    ) -> Float[Tensor, "T Q"]:
+        """Quadrature weights times Σ_k c_k A∇w_k·∇u_k at the Gauss points, from `outer`."""
+        entries = conductance(self.metric, conductivity).unbind(-1)
+        crosses = gradient_products(self.element).unbind(1)
+        total = [entry * (blocks @ cross.T) for entry, cross in zip(entries, crosses, strict=True)]
+        return self.element.weights * torch.stack(total).sum(0)
+
+    def weighted_products(
+        self, blocks: Float[Tensor, "T n_times_n"], density: Tensor | None = None
+    ) -> Float[Tensor, "T Q"]:
+        """Quadrature weights times Σ_k c_k ρ w_k u_k at the Gauss points."""
+        shape = self.element
+        found = shape.weights * area_element(self.metric) * (blocks @ squares(shape).T)
+        return found if density is None else density * found
+
+
+def _outer(one: Tensor, two: Tensor, nodes: Tensor) -> Tensor:
+    return (at(one, nodes) @ at(two, nodes).mT).flatten(1)
+
 
 def upper_congruence(p: Any, lots: Sequence[ElementMatrices]) -> sparse.csr_array:
     """Upper triangle of PᵀAP, where A is the sum of lots of element matrices; its pattern has no regard to values."""
     from torchlb.linalg.kernels import congruence
 
-    nodes, local, size = (np.concatenate(parts) for parts in zip(*map(_rows, lots), strict=True))
+    nodes = np.concatenate([lot.nodes.flatten().numpy() for lot in lots]).astype(np.uint32)
+    sizes = np.concatenate([np.full(len(lot.nodes), lot.nodes.shape[1]) for lot in lots])
+    size, first = (each.repeat(sizes) for each in (sizes, sizes.cumsum() - sizes))
     order, start = nodes.argsort(kind="stable"), size.cumsum() - size
     ends = np.bincount(nodes, minlength=p.shape[0]).cumsum()
-    parts = (np.arange(len(nodes)) - local)[order], start[order], size[order]
-    rows = np.concatenate([[0], ends]), *parts
+    rows = np.concatenate([[0], ends]), first[order], start[order], size[order]
     elements = nodes, torch.cat([lot.blocks.flatten() for lot in lots]).numpy()
     left, unsigned, count = p.T.tocsr(), np.uint32, p.shape[1]  # unsigned indices are faster
     left, right = (
@@ -270,11 +277,8 @@ def upper_congruence(p: Any, lots: Sequence[ElementMatrices]) -> sparse.csr_arra
         (np.empty(length, complex), np.empty(length, np.int32), np.empty(length, unsigned))
         for length in p.shape
     ]
-    length, done = 64 * count, 0
-    indptr, indices, data = (
-        np.zeros(count + 1, np.int32),
-        *(np.empty(length, t) for t in (unsigned, complex)),
-    )
+    indptr, done = np.zeros(count + 1, np.int32), 0
+    indices, data = np.empty(64 * count, unsigned), np.empty(64 * count, complex)
     while done < count:
         for _, seen, _ in room:
             seen.fill(-1)
@@ -285,15 +289,3 @@ def upper_congruence(p: Any, lots: Sequence[ElementMatrices]) -> sparse.csr_arra
         for x in (indices, data):
             x.resize(length, refcheck=False)
     return sparse.csr_array((data, indices.view(np.int32), indptr), shape=(count, count))
-
-
-def assembled(lots: Sequence[ElementMatrices], count: int) -> sparse.csr_array:
-    """Upper triangle of the sum of element matrices whose nodes are the `count` vertices."""
-    return upper_congruence(sparse.eye_array(count, format="csr"), lots)
-
-
-def _rows(lot: ElementMatrices) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Node of every row of the element matrices, its number in the element, and the length of the row."""
-    count, size = lot.nodes.shape
-    nodes = lot.nodes.flatten().numpy().astype(np.uint32)
-    return nodes, np.tile(np.arange(size), count), np.full(count * size, size)

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
@@ -23,7 +22,7 @@ from torchlb.galerkin.curving import (
 )
 from torchlb.galerkin.elements import inner, subsets
 from torchlb.galerkin.nodes import Nodes, lagrange_nodes
-from torchlb.galerkin.prolongation import prolongation
+from torchlb.galerkin.prolongation import Prolongation
 from torchlb.geometry.boundary import boundary_creases, outer_faces
 from torchlb.geometry.fit_search import MAX_LEBESGUE, FitSearch
 from torchlb.geometry.frames import mesh_frames
@@ -86,8 +85,6 @@ class OnCurves(BoundaryNodesPlan):
         number[outer] = every
         for side, (i, j) in enumerate(subsets(2, 2)):
             face = (number[nodes.edge[:, side]] >= 0).nonzero()[:, 0]
-            if len(face) == 0 or len(within) == 0:
-                continue
             both = within[:, i] + within[:, j]
             share = (within[:, j] / both).expand(len(face), -1)
             part = both.square()[:, None] * bulge(number[nodes.edge[face, side]], share)
@@ -117,11 +114,7 @@ class OnSurface(BoundaryNodesPlan):
 
     @classmethod
     def of(
-        cls,
-        points: Float[Tensor, "N 3"],
-        nodes: Nodes,
-        degrees: tuple[int, ...],
-        held: Bool[Tensor, " N"] | None,
+        cls, points: Points, nodes: Nodes, degrees: tuple[int, ...], held: Bool[Tensor, " N"] | None
     ) -> OnSurface:
         """Plan the boundary surface, with fits of these degrees."""
         facets, on_edge = nodes.sides[3], nodes.degree - 1
@@ -134,7 +127,7 @@ class OnSurface(BoundaryNodesPlan):
         plan, fits = FitSearch(neighborhoods, 0, degrees).finish()
         plan = plan.flattened(boundary_creases(points, nodes.cells)[vertices])
         own = lagrange_nodes(cells, count, nodes.degree)
-        curving, _ = curve(places, plan, fits, own, BoundaryNodesPlan(own))
+        curving, _ = curve(plan, fits, BoundaryNodesPlan(own))
         keys = (e[:, 0] * len(points) + e[:, 1] for e in (nodes.edges, vertices[own.edges]))
         edge = torch.searchsorted(*keys)
         within = outer[:, None] * facets.nodes + torch.arange(facets.nodes)
@@ -150,17 +143,17 @@ class OnSurface(BoundaryNodesPlan):
         """Positions and values of the boundary nodes."""
         places, own = points[self.vertices], self.curving.nodes
         fits = LocalFits.at(self.fits, places, mesh_frames(places, self.cells))
-        surface = self.curving.at(places, self.fits, fits)
+        surface = self.curving.at(self.fits, fits)
         moved = points.new_zeros(len(self.nodes.shares), points.shape[1])
         moved[self.here] = surface.places[len(places) :] - flat_places(places, own)
         if not self.inside.any():
             return super().at(points)._replace(displacement=moved)
-        p = prolongation(self.fits, fits, self.curving, surface)[len(places) :].tocoo()
-        node, vertex = (torch.from_numpy(part.astype(np.int64)) for part in p.coords)
-        kept = self.inside[node]
-        weights = torch.from_numpy(p.data)[kept]
-        entries = self.here[node[kept]], self.vertices[vertex[kept]], weights
-        return BoundaryNodes(moved, self.here[self.inside], entries)
+        p = Prolongation(self.fits, fits, self.curving, surface)
+        row, length, vertex, weights = p.entries()
+        node = row.repeat_interleave(length) - len(places)
+        kept = (node >= 0) & self.inside[node]
+        found = self.here[node[kept]], self.vertices[vertex[kept]], weights[kept]
+        return BoundaryNodes(moved, self.here[self.inside], found)
 
 
 @dataclass(frozen=True)

@@ -38,13 +38,6 @@ def with_area(points: Points, faces: Int[Tensor, "F 3"]) -> Bool[Tensor, " F"]:
     return kept
 
 
-def coarse_triangles(
-    points: Points, nodes: Nodes, fits: FitPlan, free: Bool[Tensor, " E"]
-) -> Bool[Tensor, " F"]:
-    """Triangles that lie along the free boundary, or among creases, boundary and vertices without a fit only."""
-    return lying_triangles(points, nodes, free) | _without_inside(points, nodes, fits)
-
-
 def reaching_out(nodes: Nodes, fits: FitPlan, coarse: Bool[Tensor, " F"]) -> Bool[Tensor, " N"]:
     """Vertices whose fit of functions uses a vertex of coarse triangles only.
 
@@ -77,18 +70,17 @@ def lying_triangles(points: Points, nodes: Nodes, free: Bool[Tensor, " E"]) -> B
         met[nodes.edge[new].flatten()] = True
 
 
-def _without_inside(points: Tensor, nodes: Nodes, fits: FitPlan) -> Bool[Tensor, " F"]:
-    """Triangles without a fit at any corner, or with almost only crease vertices around every corner."""
+def without_inside(points: Points, nodes: Nodes, fits: FitPlan) -> Bool[Tensor, " F"]:
+    """Triangles without a fit at any corner, or with almost only crease or boundary vertices around every corner."""
     lone = fits.degree == 0
     bound = lone.clone()
     if points.shape[1] == 3:
         turn, pairs = _cosines(points, nodes), nodes.edges
         bound[pairs[turn < CREASE].flatten()] = True
-        kinked = torch.zeros_like(bound)
-        kinked[pairs[turn < KINK].flatten()] = True
+        kinked = torch.zeros_like(bound).index_fill(0, pairs[turn < KINK].flatten(), True)
         bound |= kinked & (fits.reason == IN_ROWS)
-    on_boundary = torch.zeros_like(bound)
-    on_boundary[nodes.edges[nodes.sides[2].uses != 2].flatten()] = True
+    rim = nodes.edges[nodes.sides[2].uses != 2].flatten()
+    on_boundary = torch.zeros_like(bound).index_fill(0, rim, True)
     bound |= on_boundary & (_around(nodes, (~bound & ~on_boundary).long()) == 0)
     around = _around(nodes, torch.where(bound, 1, -FACTOR))
     return (around > 0)[nodes.cells].all(1) | lone[nodes.cells].all(1)
@@ -108,10 +100,8 @@ def _cosines(points: Float[Tensor, "N 3"], nodes: Nodes) -> Float[Tensor, " E"]:
 
 def _around(nodes: Nodes, values: Shaped[Tensor, " N"]) -> Shaped[Tensor, " N"]:
     """Sums over each vertex and its neighbours."""
-    total = values.clone()
-    for one, other in nodes.edges.T, nodes.edges.T.flip(0):
-        total.index_add_(0, one, values[other])
-    return total
+    one, other = nodes.edges.T
+    return values.index_add(0, one, values[other]).index_add(0, other, values[one])
 
 
 def boundary_shares(points: Points, ends: Int[Tensor, "G 2"], cover: Cover) -> Float[Tensor, " N"]:
@@ -120,15 +110,17 @@ def boundary_shares(points: Points, ends: Int[Tensor, "G 2"], cover: Cover) -> F
     An edge of the cover that joins a vertex to its own copy crosses a boundary edge, half its length away from the
     vertex. That vertex takes a share of the boundary edge there, and the ends of the edge take less.
     """
-    start, along = points[ends[:, 0]], points[ends[:, 1]] - points[ends[:, 0]]
+    result, start = torch.zeros_like(points[:, 0]), points[ends[:, 0]]
+    if len(ends) == 0:
+        return result
+    along = points[ends[:, 1]] - start
     square = along.square().sum(1).clamp_min(torch.finfo(along.dtype).tiny)
     own = torch.stack([cover.faces[:, i] == cover.faces[:, j] for i, j in EDGES], 1)
     vertex, half = cover.faces[own], cover.lengths[own] / 2
     edge = [torch.arange(len(ends)).repeat(2)]
     where, who = [torch.cat([0 * square, 0 * square + 1])], [ends.T.flatten()]
     few = rows_at_once(ends.numel() * points.shape[1])
-    crossing = list(zip(vertex.split(few), half.split(few), strict=True))
-    for x, distance in crossing if len(ends) else []:
+    for x, distance in zip(vertex.split(few), half.split(few), strict=True):
         offset = points[x, None] - start
         share = ((offset * along).sum(2) / square).clamp(0, 1)
         away = (offset - share[..., None] * along).norm(dim=2)
@@ -138,9 +130,7 @@ def boundary_shares(points: Points, ends: Int[Tensor, "G 2"], cover: Cover) -> F
         where.append(share.gather(1, nearest[:, None])[:, 0])
         who.append(x)
     edge, where, who = torch.cat(edge), torch.cat(where), torch.cat(who)
-    order = where.argsort(stable=True)
-    order = order[edge[order].argsort(stable=True)]
+    order = torch.from_numpy(np.lexsort((where.detach().numpy(), edge.numpy())))
     edge, where, who = edge[order], where[order], who[order]
     piece = torch.where(edge[1:] == edge[:-1], where.diff() * square.sqrt()[edge[1:]], 0.0) / 2
-    result = torch.zeros_like(points[:, 0])
     return result.index_add_(0, who[1:], piece).index_add_(0, who[:-1], piece)

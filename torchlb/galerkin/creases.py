@@ -19,7 +19,8 @@ from torch import Tensor
 
 from torchlb.galerkin.assembly import Elements
 from torchlb.galerkin.delaunay import sound_lengths
-from torchlb.galerkin.forms import Forms, edge_lengths
+from torchlb.galerkin.elements import edge_lengths
+from torchlb.galerkin.forms import Forms
 from torchlb.galerkin.medium import orthonormal
 from torchlb.geometry.complex import consistently_wound
 from torchlb.geometry.frames import summed_normals, summed_projectors, vertex_normals

@@ -15,14 +15,14 @@ from torch import Tensor
 
 from torchlb.fits.polynomials import monomials
 from torchlb.galerkin.assembly import area_element, flat_metric, metric
-from torchlb.galerkin.coarse import coarse_triangles, reaching_out
+from torchlb.galerkin.coarse import lying_triangles, reaching_out, without_inside
 from torchlb.galerkin.delaunay import Cover, delaunay_cover, sound_lengths
-from torchlb.galerkin.elements import simplex
+from torchlb.galerkin.elements import edge_lengths, simplex
 from torchlb.galerkin.nodes import Nodes
 from torchlb.geometry.frames import vertex_normals
 from torchlb.geometry.local_fits import FitPlan, LocalFits
 from torchlb.geometry.thresholds import FACTOR, ROUGH
-from torchlb.geometry.vectors import at
+from torchlb.geometry.vectors import Points, at
 from torchlb.linalg.precision import AT_ONCE, SMALL
 
 ROUNDS = 2
@@ -93,22 +93,17 @@ class CurvingPlan:
     fixed: Bool[Tensor, " E"]
     flips: list[Tensor]
 
-    def at(self, points: Float[Tensor, "N n"], plan: FitPlan, fits: LocalFits) -> CurvedMesh:
-        """Evaluate the curved cells at these points."""
-        nodes, boundary = self.nodes, self.boundary.at(points)
-        ends, flat = node_ends(nodes, len(points)), flat_places(points, nodes)
-        start = flat + boundary.displacement
-        standing, _ = _moved(points, plan, fits, nodes, ends, start, boundary)
+    def at(self, plan: FitPlan, fits: LocalFits) -> CurvedMesh:
+        """Evaluate the curved cells at the points of the fits."""
+        nodes, points, boundary = self.nodes, fits.points, self.boundary.at(fits.points)
+        ends, flat, start, standing, _ = _moved(plan, fits, nodes, boundary)
         near = (standing - start).norm(dim=1) <= FACTOR * ROUGH * _sizes(points, nodes)
         standing = torch.where(near[:, None], standing, start)
         places = torch.cat([points, torch.where(self.bent[:, None], standing, flat)])
-        lengths, some = (
-            sound_lengths(nodes.lengths(points), nodes.cells),
-            self.curved[nodes.edge].any(1),
-        )
+        lengths = sound_lengths(edge_lengths(points, nodes.cells), nodes.cells)
         shape = simplex(nodes.dim, nodes.degree)
         g = flat_metric(lengths)[:, None].repeat(1, len(shape.weights), 1)
-        for part in some.nonzero()[:, 0].split(AT_ONCE):
+        for part in self.curved[nodes.edge].any(1).nonzero()[:, 0].split(AT_ONCE):
             g[part] = metric(places, nodes.elements[part], shape)
         cover = self.cover(lengths, self.flips)
         astray = nodes.corners[self.bent & ~near].unique()
@@ -142,38 +137,33 @@ class CurvedMesh:
 
 
 def curve(
-    points: Float[Tensor, "N n"],
-    plan: FitPlan,
-    fits: LocalFits,
-    nodes: Nodes,
-    edge_nodes: BoundaryNodesPlan,
-    held: Bool[Tensor, " N"] | None = None,
+    plan: FitPlan, fits: LocalFits, rim: BoundaryNodesPlan, held: Bool[Tensor, " N"] | None = None
 ) -> tuple[CurvingPlan, CurvedMesh]:
     """Move the nodes onto the fits of their vertices where these agree, and flatten cells that this would distort.
 
-    Nodes along the boundary of a surface stay on its curves. `held` marks vertices with a Dirichlet condition, along
-    whose boundary edges the sheets of a cover are not glued.
+    The nodes are those of `rim`; along the boundary of a surface they stay on its curves. `held` marks vertices with a
+    Dirichlet condition, along whose boundary edges the sheets of a cover are not glued.
     """
-    boundary, flat = edge_nodes.at(points), flat_places(points, nodes)
-    ends = node_ends(nodes, len(points))
-    start = flat + boundary.displacement
-    standing, sound = _moved(points, plan, fits, nodes, ends, start, boundary)
+    nodes, points, boundary = rim.nodes, fits.points, rim.at(fits.points)
+    ends, flat, start, standing, sound = _moved(plan, fits, nodes, boundary)
     ratio = (start - flat).norm(dim=1) / _sizes(points, nodes)
     curved, *whole = nodes.by_side(sound & (ratio <= ROUGH))
     uses = nodes.sides[2].uses
     coarse, fixed = torch.zeros(len(nodes.cells), dtype=torch.bool), uses == 1
     if nodes.dim == 2:
-        curved &= ~_opposed(points, nodes) & (uses <= 2)
+        curved &= uses <= 2
+        if points.shape[1] == 3:  # flat where the ends' normals differ by 120° or more, or vanish
+            curved &= vertex_normals(points, nodes.faces)[nodes.edges].sum(1).norm(dim=1) > 1
         free = uses == 1
         if held is not None:
             free &= ~held[nodes.edges].all(1)
-        coarse = coarse_triangles(points, nodes, plan, free)
+        coarse = lying_triangles(points, nodes, free) | without_inside(points, nodes, plan)
         curved[nodes.edge[coarse].flatten()] = False
         curved &= ~reaching_out(nodes, plan, coarse)[nodes.edges].any(1)
         fixed &= ~free
         fixed[nodes.edge[~coarse].flatten()] = True
     places, curved, bent, g, lengths = _flattened(points, nodes, (flat, standing), curved, whole)
-    decided = CurvingPlan(nodes, edge_nodes, curved, bent, coarse, fixed, [])
+    decided = CurvingPlan(nodes, rim, curved, bent, coarse, fixed, [])
     cover = decided.cover(lengths, None)
     if cover is not None:
         decided.flips.extend(cover.flips)
@@ -183,13 +173,6 @@ def curve(
 def flat_places(points: Float[Tensor, "N n"], nodes: Nodes) -> Float[Tensor, "X n"]:
     """Positions of the nodes on flat cells."""
     return torch.einsum("xv,xvn->xn", nodes.shares, at(points, nodes.corners))
-
-
-def _opposed(points: Tensor, nodes: Nodes) -> Bool[Tensor, " E"]:
-    """Edges whose vertex normals differ by 120° or more, or vanish."""
-    if points.shape[1] != 3:
-        return torch.zeros(len(nodes.edges), dtype=torch.bool)
-    return vertex_normals(points, nodes.faces)[nodes.edges].sum(1).norm(dim=1) <= 1
 
 
 def node_ends(nodes: Nodes, count: int) -> Ends:
@@ -208,24 +191,27 @@ def _sizes(points: Tensor, nodes: Nodes) -> Float[Tensor, " X"]:
 
 
 def _moved(
-    points: Tensor,
-    plan: FitPlan,
-    fits: LocalFits,
-    nodes: Nodes,
-    ends: Ends,
-    start: Float[Tensor, "X n"],
-    boundary: BoundaryNodes,
-) -> tuple[Float[Tensor, "X n"], Bool[Tensor, " X"]]:
-    """Project every node onto the mean of its vertices' fits; return the positions and whether the fits agree.
+    plan: FitPlan, fits: LocalFits, nodes: Nodes, boundary: BoundaryNodes
+) -> tuple[Ends, Tensor, Tensor, Tensor, Bool[Tensor, " X"]]:
+    """Project every node onto the mean of its vertices' fits.
 
-    A further round would move them by O(h⁶). Nodes along the boundary of a surface stay.
+    Returns the pairs of nodes and vertices, the positions on flat cells, those displaced by the boundary, those on the
+    fits, (X, n), and whether the fits agree. A further round would move them by O(h⁶). Nodes along the boundary of a
+    surface stay.
     """
-    size, place, lots = _sizes(points, nodes), start, list(ends.of(torch.arange(len(points))))
+    points = fits.points
+    ends, flat = node_ends(nodes, len(points)), flat_places(points, nodes)
+    place = start = flat + boundary.displacement
+    size, lots = _sizes(points, nodes), list(ends.of(torch.arange(len(points))))
     apart, moves = torch.zeros_like(at(size, ends.node)), torch.zeros_like(at(start, ends.node))
     for _ in range(ROUNDS):
         for vertices, own, used in lots:
-            asked = at(place, at(ends.node, own))
-            moves[own[used]] = _to_graph(fits, plan.highest, asked, vertices)[used]
+            frame, origin = at(fits.initial, vertices), at(points, vertices)[:, None]
+            offset = at(place, at(ends.node, own)) - origin
+            along = offset @ frame
+            powers = monomials(along / fits.surface_radius[vertices, None, None], plan.highest)
+            graph = powers @ at(fits.heights, vertices) + along @ frame.mT
+            moves[own[used]] = (graph - offset)[used]
         mean = torch.zeros_like(start).index_add_(0, ends.node, ends.share[:, None] * moves)
         place, apart = place + mean, (moves - at(mean, ends.node)).norm(dim=1)
     bad = (apart > AGREE * at(size, ends.node)) | (plan.degree[ends.vertex] == 0)
@@ -233,31 +219,18 @@ def _moved(
     sound[ends.node[bad]] = False
     if nodes.dim == 2:
         place = place.index_copy(0, boundary.nodes, start[boundary.nodes])
-    return place, sound
-
-
-def _to_graph(
-    fits: LocalFits, degree: int, places: Float[Tensor, "c e n"], vertex: Int[Tensor, " c"]
-) -> Float[Tensor, "c e n"]:
-    """Displacement from positions to the fitted graph at each vertex, orthogonal to its frame."""
-    frame, offset = at(fits.initial, vertex), places - at(fits.points, vertex)[:, None]
-    along = offset @ frame
-    powers = monomials(along / fits.surface_radius[vertex, None, None], degree)
-    return powers @ at(fits.heights, vertex) + along @ frame.mT - offset
+    return ends, flat, start, place, sound
 
 
 def _flattened(
-    points: Float[Tensor, "N n"],
-    nodes: Nodes,
-    stand: tuple[Float[Tensor, "X n"], Float[Tensor, "X n"]],
-    curved: Bool[Tensor, " E"],
-    whole: list[Bool[Tensor, " _"]],
+    points: Points, nodes: Nodes, stand: tuple[Tensor, Tensor], curved: Tensor, whole: list[Tensor]
 ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
     """Flatten edges of distorted cells until none is; return positions, curved edges, bent nodes, metric, lengths.
 
-    `stand` holds the positions on flat cells and on the surface; `whole` flags triangles and cells that may be curved.
+    `stand` holds the positions (X, n) on flat cells and on the surface; `curved` flags edges, (E,), and `whole`
+    triangles and cells, that may be curved.
     """
-    sides = nodes.lengths(points)
+    sides = edge_lengths(points, nodes.cells)
     lengths = sound_lengths(sides, nodes.cells)
     plane, shape = flat_metric(lengths), simplex(nodes.dim, nodes.degree)
     area = area_element(plane)

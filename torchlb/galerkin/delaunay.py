@@ -16,7 +16,7 @@ from torch import Tensor
 
 from torchlb.galerkin.assembly import area_element, flat_metric
 from torchlb.geometry.complex import pieces_of
-from torchlb.linalg.precision import EPS, NEGLIGIBLE, SINGLE
+from torchlb.linalg.precision import EPS, NEGLIGIBLE, SINGLE, TINY
 
 EDGES = tuple((i, (i + 1) % 3) for i in range(3))
 """Ends of the edges of a triangle, in the order of `subsets`."""
@@ -66,23 +66,19 @@ def mollified(sides: Float[Tensor, "F 3"], faces: Int[Tensor, "F 3"]) -> Float[T
     return sides + lack[piece, None]
 
 
-def shrunk(sides: Float[Tensor, "F 6"]) -> Float[Tensor, "F 6"]:
-    """Edge lengths, shrunk to almost zero for tetrahedra without volume, which then contribute nothing.
-
-    Delaunay tetrahedra of a grid include such slivers, the four corners of a square; the others fill the solid.
-    """
-    longest = sides.amax(1)
-    none = area_element(flat_metric(sides)) <= NEGLIGIBLE * longest**3
-    return torch.where(none[:, None], EPS**2 * longest[:, None], sides)
-
-
 def sound_lengths(
     sides: Float[Tensor, "F e"], cells: Int[Tensor, "F corners"]
 ) -> Float[Tensor, "F e"]:
-    """Edge lengths with a positive definite metric in every cell: `mollified` triangles, `shrunk` tetrahedra."""
-    if cells.shape[1] == 3:
-        return mollified(sides, cells)
-    return shrunk(sides) if cells.shape[1] == 4 else sides
+    """Edge lengths with a positive definite metric in every cell; those of triangles are `mollified`.
+
+    Tetrahedra without volume are shrunk to almost zero, and contribute nothing: Delaunay tetrahedra of a grid include
+    such slivers, the four corners of a square; the others fill the solid.
+    """
+    if cells.shape[1] != 4:
+        return mollified(sides, cells) if cells.shape[1] == 3 else sides
+    longest = sides.amax(1)
+    none = area_element(flat_metric(sides)) <= NEGLIGIBLE * longest**3
+    return torch.where(none[:, None], EPS**2 * longest[:, None], sides)
 
 
 def delaunay_cover(
@@ -111,7 +107,7 @@ def _lacking(sheets: Tensor, sides: Tensor, twin: Tensor) -> Iterator[Int[Tensor
     active = torch.arange(len(twin))
     while True:
         active = active[(twin[active] > active) & (active // 3 != twin[active] // 3)]
-        weight = _cotangents(sides, active) + _cotangents(sides, twin[active])
+        weight = _foot(sides, active)[2] + _foot(sides, twin[active])[2]
         lacking = weight < -NEGLIGIBLE
         poor = active[lacking]
         chosen = poor[apart(poor // 3, twin[poor] // 3, weight[lacking], len(sheets))]
@@ -147,23 +143,13 @@ def _glued(faces: Tensor, edge: Tensor, fixed: Tensor) -> Int[Tensor, " six_F"]:
     return twin
 
 
-def _foot(
-    sides: Float[Tensor, "T 3"], slot: Int[Tensor, " H"]
-) -> tuple[Float[Tensor, " H"], Float[Tensor, " H"]]:
-    """Foot of the opposite corner on the line of an edge, from the edge's start, and its height, ℓ."""
-    face, side = slot // 3, slot % 3
-    own, after, before = (sides[face, (side + i) % 3] for i in range(3))
+def _foot(sides: Float[Tensor, "T 3"], slot: Int[Tensor, " H"]) -> list[Float[Tensor, " H"]]:
+    """Foot of the opposite corner on the line of a half-edge, from its start, and height, ℓ; cotangent of its angle."""
+    own, after, before = (sides[slot // 3, (slot + i) % 3] for i in range(3))
     foot = ((before - after) * (before + after) / own + own) / 2
-    return foot, ((before - foot) * (before + foot)).clamp_min(0).sqrt()
-
-
-def _cotangents(sides: Tensor, slot: Tensor) -> Float[Tensor, " H"]:
-    """Cotangents of the angles opposite half-edges."""
-    face, side = slot // 3, slot % 3
-    own, after, before = (sides[face, (side + i) % 3] for i in range(3))
-    _, height = _foot(sides, slot)
-    tiny = torch.finfo(sides.dtype).tiny
-    return (after.square() + before.square() - own.square()) / (2 * own * height).clamp_min(tiny)
+    height = ((before - foot) * (before + foot)).clamp_min(0).sqrt()
+    twice = after.square() + before.square() - own.square()
+    return [foot, height, twice / (2 * own * height).clamp_min(TINY)]
 
 
 def apart(one: Tensor, other: Tensor, weight: Tensor, num_faces: int) -> Int[Tensor, " C"]:
@@ -186,7 +172,7 @@ def _flip(
     (ab, bc, ca), (ba, ad, db) = (
         [3 * face + (slot + i) % 3 for i in range(3)] for face, slot in ((f, chosen), (g, other))
     )
-    (x, y), (z, w) = _foot(sides, chosen), _foot(sides, other)
+    (x, y, _), (z, w, _) = _foot(sides, chosen), _foot(sides, other)
     across = torch.hypot(x + z - sides.view(-1)[ab], y + w)
     a, b, c, d = (sheets.view(-1)[slot] for slot in (ab, ba, ca, db))
     length = [sides.view(-1)[slot] for slot in (db, bc, ca, ad)]

@@ -13,8 +13,10 @@ import torch
 from jaxtyping import Float, Int
 from scipy.special import roots_jacobi
 from torch import Tensor
+from torch.nn.functional import pad
 
 from torchlb.fits.polynomials import monomial_derivatives, monomials
+from torchlb.geometry.vectors import Points, at
 
 
 class Element(NamedTuple):
@@ -50,6 +52,12 @@ def subsets(dim: int, size: int) -> tuple[tuple[int, ...], ...]:
     """
     every = combinations(range(dim + 1), size)
     return tuple(sorted(every, key=lambda corners: (corners[-1] - corners[0], corners)))
+
+
+def edge_lengths(points: Points, cells: Int[Tensor, "T corners"]) -> Float[Tensor, "T e"]:
+    """Lengths of the edges of each cell, in the order of `subsets`, ℓ."""
+    first, second = torch.tensor(subsets(cells.shape[1] - 1, 2)).T
+    return (at(points, cells[:, second]) - at(points, cells[:, first])).norm(dim=2)
 
 
 @cache
@@ -119,14 +127,10 @@ def simplex(dim: int, degree: int) -> Element:
         points = torch.cat([shares.roll(corner, 1)[:, 1:] for corner in range(dim + 1)])
         weights = weights.repeat(dim + 1) / (dim + 1)
     nodes = lattice(dim, degree)[:, 1:]
-    inverse = torch.linalg.inv(_powers(nodes, degree))
+    at_nodes, powers = (pad(monomials(x, degree), (1, 0), value=1.0) for x in (nodes, points))
+    inverse = torch.linalg.inv(at_nodes)
     slopes = points.new_zeros(len(points), len(nodes), dim)
     if dim:
         slopes[:, 1:] = monomial_derivatives(points, degree)
     gradients = torch.einsum("qmd,mn->qnd", slopes, inverse)
-    return Element(weights, _powers(points, degree) @ inverse, gradients)
-
-
-def _powers(points: Float[Tensor, "Q d"], degree: int) -> Float[Tensor, "Q M"]:
-    ones = points.new_ones(len(points), 1)
-    return torch.cat([ones, monomials(points, degree)], dim=1) if points.shape[1] else ones
+    return Element(weights, powers @ inverse, gradients)

@@ -6,6 +6,7 @@ a fold do not help: creases of the surface itself have such triangles.
 
 from __future__ import annotations
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -32,16 +33,19 @@ def flipped(vertices: Tensor, faces: Tensor) -> Tensor:
     while True:
         poor = (alignment < CREASE) | (quality < LOW)
         bad = (poor | ((quality < FAIR) & (alignment > 1 - ROOT_EPS))).nonzero()[:, 0]
-        pairs = _flips(faces, bad, gone, size) if len(bad) else None
-        if pairs is None:
+        if len(bad) == 0:
             return faces
-        left, right, after = pairs
+        left, right, after = _flips(faces, bad, gone, size)
         before = torch.stack([faces[left], faces[right]], dim=1)
         gain = _value(vertices, normals, after) - _value(vertices, normals, before)
         even = torch.minimum(alignment[left], alignment[right]) > 1 - ROOT_EPS
         gain[~(poor[left] | even)] = -1.0
         gain[_scores(vertices, normals, after)[0].amin(1) < CREASE] = -1.0
-        chosen = _independent(gain, left, right, after, len(faces))
+        # improving flips, best first, that share neither a face nor the new edge with a better one
+        order = (gain > 1e-9).nonzero()[:, 0]
+        order = order[apart(left[order], right[order], -gain[order], len(faces))]
+        made = _keys(after[order, 0, 0], after[order, 0, 1], size)
+        chosen = order[np.sort(np.unique(made.numpy(), return_index=True)[1])]
         if len(chosen) == 0:
             return faces
         faces[left[chosen]], faces[right[chosen]] = after[chosen, 0], after[chosen, 1]
@@ -81,9 +85,7 @@ def _value(vertices: Tensor, normals: Tensor, pairs: Tensor) -> Tensor:
     return 1e3 * alignment.amin(1).clamp_max(CREASE) + quality.amin(1)
 
 
-def _flips(
-    faces: Tensor, bad: Tensor, gone: Tensor, size: int
-) -> tuple[Tensor, Tensor, Tensor] | None:
+def _flips(faces: Tensor, bad: Tensor, gone: Tensor, size: int) -> tuple[Tensor, Tensor, Tensor]:
     """Flips of edges of the bad faces: the faces (a, b, c) and (b, a, d), and (c, d, b) and (d, c, a) afterwards.
 
     Flips to an edge that exists, or was flipped away before, are excluded.
@@ -102,22 +104,7 @@ def _flips(
     there = torch.from_numpy(edges.find(c.numpy(), d.numpy())[1] > 0)
     wound = start[sides] == end[twin[sides]]
     keep = wound & (c != d) & ~there & ~torch.isin(_keys(c, d, size), gone)
-    if not keep.any():
-        return None
     sides, c, d = sides[keep], c[keep], d[keep]
     a, b = start[sides], end[sides]
     after = torch.stack([torch.stack([c, d, b], 1), torch.stack([d, c, a], 1)], dim=1)
     return around[sides // 3], around[twin[sides] // 3], after
-
-
-def _independent(
-    gain: Tensor, left: Tensor, right: Tensor, after: Tensor, num_faces: int
-) -> Tensor:
-    """Improving flips, best first, that share neither a face nor the new edge with a better one."""
-    order = (gain > 1e-9).nonzero()[:, 0]
-    order = order[apart(left[order], right[order], -gain[order], num_faces)]
-    made = _keys(after[order, 0, 0], after[order, 0, 1], int(after.max()) + 1)
-    _, place = torch.unique(made, return_inverse=True)
-    best = torch.full((int(place.max()) + 1 if len(place) else 0,), len(order))
-    best.scatter_reduce_(0, place, torch.arange(len(order)), "amin")
-    return order[best[place] == torch.arange(len(order))]

@@ -13,26 +13,12 @@ from jaxtyping import Float, Int
 from scipy import sparse
 from torch import Tensor
 
-from torchlb.galerkin.assembly import (
-    ElementMatrices,
-    Elements,
-    area_element,
-    conductance,
-    gradient_products,
-    spread,
-    squares,
-    upper_congruence,
-)
-from torchlb.galerkin.curving import CurvedMesh, CurvingPlan
-from torchlb.galerkin.delaunay import sound_lengths
-from torchlb.galerkin.elements import Element, simplex, subsets
+from torchlb.galerkin.assembly import ElementMatrices, Elements, spread, upper_congruence
+from torchlb.galerkin.elements import Element, edge_lengths
 from torchlb.galerkin.medium import Field, Medium, orthonormal
-from torchlb.galerkin.prolongation import prolongation
-from torchlb.geometry.local_fits import FitPlan, LocalFits
 from torchlb.geometry.numbering import Numbering
 from torchlb.geometry.vectors import Points, at
 from torchlb.linalg.once import computed_again, once_differentiable
-from torchlb.linalg.precision import rows_at_once
 
 Linear = Callable[[Tensor], Tensor]
 Values = list[Tensor] | None
@@ -69,41 +55,6 @@ class Forms:
     prolongation: Any
     lots: list[Elements]
     linear: Elements
-
-    @classmethod
-    def curved(
-        cls,
-        fit_plan: FitPlan,
-        fits: LocalFits,
-        plan: CurvingPlan,
-        mesh: CurvedMesh,
-        stars: Int[Tensor, "S corners"],
-        shares: Float[Tensor, " F"] | None,
-        *,
-        prolong: bool = True,
-    ) -> Forms:
-        """Build the elements of curved cells, of the cover that replaces coarse triangles, and of local stars.
-
-        A simplex belongs to the stars of all its corners, each of which counts an equal share of it.
-        """
-        nodes, own, count = plan.nodes, ~plan.coarse, len(fits.points)
-        mix: Any = sparse.eye_array(len(own), format="csr")
-        parts, flats = (nodes.cells, mesh.lengths, nodes.elements, mesh.metric), []
-        if mesh.cover is not None:
-            cover, beside = mesh.cover, {"share": 0.5, "lumped": torch.ones(count).double()}
-            beside["mix"] = cover.mixed() @ mix[plan.coarse.numpy()]
-            flats.append(Elements.flat(cover.faces, cover.lengths, **beside))
-            parts, mix = (x[own] for x in parts), mix[own.numpy()]
-            shares = None if shares is None else shares[own]
-        if len(stars):
-            lengths = sound_lengths(edge_lengths(fits.points, stars), stars)
-            flats.append(Elements.flat(stars, lengths, share=1 / stars.shape[1]))
-        share = 1.0 if shares is None else shares
-        cells, lengths, elements, metric = parts
-        bent = Elements(elements, metric, simplex(nodes.dim, nodes.degree), share, mix)
-        linear = Elements.flat(cells, lengths, share=share)
-        p = prolongation(fit_plan, fits, plan, mesh) if prolong else None
-        return cls(torch.arange(count), mesh.places, p, [bent, *flats], linear)
 
     @classmethod
     def flat(
@@ -159,11 +110,11 @@ class Forms:
         return found
 
     def factors(
-        self, forms: Sequence[BilinearForm], medium: Medium, prolong: Linear | None = None
+        self, medium: Medium, along: bool, prolong: Linear | None = None
     ) -> dict[str, list[Tensor]]:
-        """`values` of the fields of a medium, and the projectors Π onto the tangent plane, if a form has them."""
+        """`values` of the fields of a medium, and, for forms `along`, the projectors Π onto the tangent plane."""
         found = {name: self.values(field, prolong) for name, field in medium.items()}
-        if any(form.along for form in forms):
+        if along:
             found["projectors"] = [frame @ frame.mT for frame in self.tangents()]
         return found
 
@@ -198,7 +149,7 @@ class Forms:
 
     def bilinear(self, forms: Sequence[BilinearForm], medium: Medium) -> Float[Tensor, ""]:
         """Σ of bilinear forms, differentiable in the medium; of "lumped" and "boundary", which depend on none, 0."""
-        values = self.factors(forms, medium)
+        values = self.factors(medium, any(form.along for form in forms))
         total = [torch.zeros((), dtype=torch.float64)]
         # a function that stands in two forms is one
         prolong = cache(partial(times, self.prolongation))
@@ -211,33 +162,25 @@ class Forms:
         self, form: BilinearForm, nodes: list[Tensor], medium: Mapping[str, list[Tensor]]
     ) -> Float[Tensor, ""]:
         """The value of a form, from its functions at the nodes and the values of the medium; differentiable in all."""
-        stiffness, values, total = (
-            form.name == "stiffness",
-            medium.get(FIELDS.get(form.name, "")),
-            [],
-        )
-        density = weighted_slopes if stiffness else weighted_products
-        for number, lot in enumerate(self.lots):
-            a = None if values is None else values[number]
+        stiffness, total = form.name == "stiffness", []
+        none: list[Any] = [None] * len(self.lots)
+        values = medium.get(FIELDS.get(form.name, ""), none)
+        projectors = medium.get("projectors", none)
+        for lot, a, projector in zip(self.lots, values, projectors, strict=True):
             a = lot.conductivity(a, self.places) if stiffness else a
-            blocks = outer(lot.nodes, nodes, form.c)
+            blocks = lot.outer(nodes, form.c)
             if lot.lumped is not None and not stiffness:
                 corners = lot.lumped[lot.nodes] * blocks[:, :: lot.nodes.shape[1] + 1]
                 blocks = corners.mean(1, keepdim=True).expand_as(blocks)
             if form.along is not None and lot.turns is not None:
                 one, two = (lot.turns[..., k] for k in form.along)
                 blocks = blocks * (one @ two.mT).flatten(1)
-            own = computed_again(density, lot.metric, lot.element, blocks, a)
+            density = lot.weighted_slopes if stiffness else lot.weighted_products
+            own = computed_again(density, blocks, a)
             if form.along is not None and lot.turns is None:
-                own = medium["projectors"][number][(..., *form.along)] * own
+                own = projector[(..., *form.along)] * own
             total.append(lot.shared(own).sum())
         return torch.stack(total).sum()
-
-
-def edge_lengths(points: Points, cells: Int[Tensor, "T corners"]) -> Float[Tensor, "T e"]:
-    """Lengths of the edges of each cell, in the order of `subsets`, ℓ."""
-    ends = points[cells[:, [list(pair) for pair in subsets(cells.shape[1] - 1, 2)]]]
-    return (ends[:, :, 1] - ends[:, :, 0]).norm(dim=2)
 
 
 def _renumbered(matrix: Any, columns: Int[Tensor, " C"], count: int) -> sparse.csr_array:
@@ -271,40 +214,3 @@ class _Times(torch.autograd.Function):
 
 
 times: Any = _Times.apply
-
-
-def outer(
-    nodes: Int[Tensor, "T n"], values: list[Tensor], c: Float[Tensor, " C"]
-) -> Float[Tensor, "T n_times_n"]:
-    """Σ_k c_k w_k(i) u_k(j) for all pairs of nodes of each element."""
-    one, two = values[0] * c, values[1]
-    parts = nodes.split(rows_at_once(nodes.shape[1] * len(c)))
-    return torch.cat([computed_again(_outer, one, two, part) for part in parts])
-
-
-def _outer(one: Tensor, two: Tensor, nodes: Tensor) -> Tensor:
-    return (at(one, nodes) @ at(two, nodes).mT).flatten(1)
-
-
-def weighted_slopes(
-    metric: Float[Tensor, "T Q S"],
-    element: Element,
-    blocks: Float[Tensor, "T n_times_n"],
-    conductivity: Tensor | None,
-) -> Float[Tensor, "T Q"]:
-    """Quadrature weights times Σ_k c_k A∇w_k·∇u_k at the Gauss points."""
-    entries = conductance(metric, conductivity).unbind(-1)
-    crosses = gradient_products(element).unbind(1)
-    total = [entry * (blocks @ cross.T) for entry, cross in zip(entries, crosses, strict=True)]
-    return element.weights * torch.stack(total).sum(0)
-
-
-def weighted_products(
-    metric: Float[Tensor, "T Q S"],
-    element: Element,
-    blocks: Float[Tensor, "T n_times_n"],
-    density: Tensor | None,
-) -> Float[Tensor, "T Q"]:
-    """Quadrature weights times Σ_k c_k ρ w_k u_k at the Gauss points."""
-    found = element.weights * area_element(metric) * (blocks @ squares(element).T)
-    return found if density is None else density * found

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from functools import partial
 from typing import Any, Literal, NamedTuple
 
 import torch
@@ -29,9 +30,14 @@ class Field(NamedTuple):
 
     @property
     def transforms(self) -> tuple[Map, Map]:
-        """What is prolonged of the values, and its inverse, which makes the result as positive as the field is."""
+        """What is prolonged of the values, and its inverse, which makes the result as positive as the field is.
+
+        >>> log, exp = Field(torch.eye(2)[None], on_faces=False, positive=True).transforms
+        >>> exp(log(torch.tensor([[2.0, 1.0], [1.0, 2.0]]))).round(decimals=4).tolist()
+        [[2.0, 1.0], [1.0, 2.0]]
+        """
         if self.values.ndim == 3:
-            return symmetric_log, symmetric_exp
+            return partial(_spectral, "log"), partial(_spectral, "exp")
         if self.positive:
             return torch.log, torch.exp
         return torch.clone, lambda x: x.clamp_min(0.0)
@@ -42,13 +48,13 @@ Medium = Mapping[str, Field]
 
 
 class _SpectralFunction(torch.autograd.Function):
-    """f(A) = Q f(Λ) Qᵀ, "log" or "exp", of symmetric matrices.
+    """f(A) = Q f(Λ) Qᵀ, "log" or "exp", of symmetric matrices, differentiable once.
 
     The derivative is that of Daleckii and Krein (1965), by divided differences of f; equal eigenvalues do no harm.
     """
 
     @staticmethod
-    def forward(ctx: Any, matrix: Tensor, name: str) -> Tensor:  # pyright: ignore[reportIncompatibleMethodOverride]
+    def forward(ctx: Any, name: str, matrix: Tensor) -> Tensor:  # pyright: ignore[reportIncompatibleMethodOverride]
         values, vectors = torch.linalg.eigh(matrix)
         images = getattr(torch, name)(values)
         ctx.save_for_backward(values, vectors, images)
@@ -66,21 +72,10 @@ class _SpectralFunction(torch.autograd.Function):
         slope = mean * torch.where(half == 0, 1.0, half.sinh() / half)
         slope = 1 / slope if ctx.name == "log" else slope
         inside = vectors.mT @ ((g + g.mT) / 2) @ vectors
-        return vectors @ (slope * inside) @ vectors.mT, None
+        return None, vectors @ (slope * inside) @ vectors.mT
 
 
-def symmetric_log(matrix: Float[Tensor, "*batch n n"]) -> Float[Tensor, "*batch n n"]:
-    """Logarithm of symmetric positive matrices, differentiable once."""
-    return _SpectralFunction.apply(matrix, "log")  # pyright: ignore[reportReturnType]
-
-
-def symmetric_exp(matrix: Float[Tensor, "*batch n n"]) -> Float[Tensor, "*batch n n"]:
-    """Exponential of symmetric matrices, differentiable once.
-
-    >>> symmetric_exp(symmetric_log(torch.tensor([[2.0, 1.0], [1.0, 2.0]]))).round(decimals=4).tolist()
-    [[2.0, 1.0], [1.0, 2.0]]
-    """
-    return _SpectralFunction.apply(matrix, "exp")  # pyright: ignore[reportReturnType]
+_spectral: Any = _SpectralFunction.apply
 
 
 def orthonormal(slopes: Float[Tensor, "*batch n d"]) -> Float[Tensor, "*batch n d"]:

@@ -11,7 +11,6 @@ from torch import Tensor
 
 from torchlb.galerkin.elements import facet_nodes, inner, subsets
 from torchlb.geometry.boundary import sub_simplices
-from torchlb.geometry.vectors import Points, at
 
 
 @dataclass(frozen=True)
@@ -72,19 +71,14 @@ class Nodes:
         """Sub-simplices of dimension 2 and higher, cells included."""
         return [self.sides[size] for size in range(3, self.dim + 2)]
 
-    def lengths(self, points: Points) -> Float[Tensor, "F e"]:
-        """Edge lengths of each cell, ℓ."""
-        ends = at(points, self.edges)
-        return (ends[:, 1] - ends[:, 0]).norm(dim=1)[self.edge]
-
     def at_nodes(self, *values: Tensor) -> Tensor:
         """Repeat values of the edges, of the triangles, … at the nodes inside them, in node order."""
-        parts = zip(values, range(2, self.dim + 2), strict=True)
-        return torch.cat([x.repeat_interleave(self.sides[s].nodes, 0) for x, s in parts])
+        parts = zip(values, [self.sides[2], *self.beyond], strict=True)
+        return torch.cat([x.repeat_interleave(side.nodes, 0) for x, side in parts])
 
     def by_side(self, values: Bool[Tensor, " X"]) -> list[Bool[Tensor, " _"]]:
         """Whether a flag holds at all nodes inside each edge, each triangle, and so on."""
-        sides = [self.sides[size] for size in range(2, self.dim + 2)]
+        sides = [self.sides[2], *self.beyond]
         parts = values.split([len(side.uses) * side.nodes for side in sides])
         return [x.view(len(s.uses), s.nodes).all(1) for s, x in zip(sides, parts, strict=True)]
 
@@ -104,12 +98,11 @@ def lagrange_nodes(
     >>> lagrange_nodes(torch.tensor([[0, 1, 2], [1, 3, 2]]), 4, 2).elements.tolist()
     [[0, 1, 2, 4, 6, 5], [1, 2, 3, 6, 8, 7]]
     """
-    faces, cells = cells, cells.sort(1).values
+    faces, cells, count, sides = cells, cells.sort(1).values, num_points, {}
     corners_of_cell = cells.shape[1]
-    dim, count = corners_of_cell - 1, num_points
-    sides = {1: _vertices(cells, num_points)} if dim == 1 else {}
+    dim = corners_of_cell - 1
     corners, shares, elements = [], [], [cells]
-    for size in range(2, corners_of_cell + 1):
+    for size in range(min(dim, 2), corners_of_cell + 1):
         side = sides[size] = _sides(cells, size, degree, sides.get(2))
         if side.nodes == 0:
             continue
@@ -135,15 +128,9 @@ def lagrange_nodes(
     )
 
 
-def _vertices(cells: Int[Tensor, "F corners"], num_points: int) -> Sides:
-    every = torch.arange(num_points)[:, None]
-    uses = torch.bincount(cells.flatten(), minlength=num_points)
-    return Sides(every, cells, every[:, :0], uses, 0)
-
-
 def _sides(cells: Int[Tensor, "F corners"], size: int, degree: int, edges: Sides | None) -> Sides:
     """Sub-simplices with `size` corners, sorted by their corners; cells keep their order."""
-    dim, nodes = cells.shape[1] - 1, len(inner(size, degree))
+    dim, nodes = cells.shape[1] - 1, len(inner(size, degree)) if size > 1 else 0
     if size == dim + 1:
         corners, of = cells, torch.arange(len(cells))[:, None]
         uses = torch.ones(len(cells), dtype=torch.int64)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property, partial
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -17,7 +17,6 @@ from torchlb.errors import first_few, warn
 from torchlb.galerkin.assembly import (
     Elements,
     area_element,
-    assembled,
     metric,
     squares,
     summed,
@@ -26,15 +25,15 @@ from torchlb.galerkin.assembly import (
 from torchlb.galerkin.boundary import boundary_nodes
 from torchlb.galerkin.coarse import boundary_shares
 from torchlb.galerkin.curving import CurvedMesh, CurvingPlan, curve
-from torchlb.galerkin.elements import simplex
-from torchlb.galerkin.forms import BilinearForm, Forms, outer, weighted_products
+from torchlb.galerkin.delaunay import sound_lengths
+from torchlb.galerkin.elements import edge_lengths, simplex
+from torchlb.galerkin.forms import BilinearForm, Forms
 from torchlb.galerkin.matrices import PairMatrices
 from torchlb.galerkin.medium import Medium
 from torchlb.galerkin.nodes import lagrange_nodes
-from torchlb.galerkin.prolongation import prolonged
+from torchlb.galerkin.prolongation import Prolongation
 from torchlb.geometry.local_fits import FitPlan, LocalFits
 from torchlb.geometry.numbering import Numbering
-from torchlb.geometry.vectors import Points
 from torchlb.linalg.csr import Csr
 from torchlb.linalg.precision import LOW
 
@@ -116,10 +115,31 @@ class PairPlan:
     def forms(
         self, fits: LocalFits, mesh: CurvedMesh | None = None, *, prolong: bool = True
     ) -> Forms:
-        """Elements from the fits at given points; `mesh` has the curved cells there, if they are known already."""
-        mesh = self.curving.at(fits.points, self.fits, fits) if mesh is None else mesh
-        rest = mesh, self.stars, self.shares
-        return Forms.curved(self.fits, fits, self.curving, *rest, prolong=prolong)
+        """Elements of curved cells, of the cover that replaces coarse triangles, and of local stars.
+
+        They are from the fits at given points; `mesh` has the curved cells there, if they are known already. A simplex
+        belongs to the stars of all its corners, each of which counts an equal share of it.
+        """
+        mesh = self.curving.at(self.fits, fits) if mesh is None else mesh
+        plan, shares, stars, count = self.curving, self.shares, self.stars, len(fits.points)
+        nodes, own = plan.nodes, ~plan.coarse
+        mix: Any = sparse.eye_array(len(own), format="csr")
+        parts, flats = (nodes.cells, mesh.lengths, nodes.elements, mesh.metric), []
+        if mesh.cover is not None:
+            cover, beside = mesh.cover, {"share": 0.5, "lumped": torch.ones(count).double()}
+            beside["mix"] = cover.mixed() @ mix[plan.coarse.numpy()]
+            flats.append(Elements.flat(cover.faces, cover.lengths, **beside))
+            parts, mix = (x[own] for x in parts), mix[own.numpy()]
+            shares = None if shares is None else shares[own]
+        if len(stars):
+            lengths = sound_lengths(edge_lengths(fits.points, stars), stars)
+            flats.append(Elements.flat(stars, lengths, share=1 / stars.shape[1]))
+        share = 1.0 if shares is None else shares
+        cells, lengths, elements, metric = parts
+        bent = Elements(elements, metric, simplex(nodes.dim, nodes.degree), share, mix)
+        linear = Elements.flat(cells, lengths, share=share)
+        p = Prolongation(self.fits, fits, plan, mesh).matrix() if prolong else None
+        return Forms(torch.arange(count), mesh.places, p, [bent, *flats], linear)
 
     def at(
         self, fits: LocalFits, numbering: Numbering, warned: set[Any]
@@ -129,7 +149,7 @@ class PairPlan:
         The plan returned with them also has the rows of P that a positive lumped mass wants lowered at these points.
         Warns once for a line of a program, in `warned`, of nodes that are flat since the points moved too far.
         """
-        mesh = self.curving.at(fits.points, self.fits, fits)
+        mesh = self.curving.at(self.fits, fits)
         if len(mesh.astray):
             warn(
                 f"at: {len(mesh.astray)} points ({first_few(mesh.astray)}) moved too far from where degrees and "
@@ -137,7 +157,7 @@ class PairPlan:
                 "build the operator of these points anew",
                 once=warned,
             )
-        pair, mass, lowered = assembled_pair(self, fits, mesh, numbering, self.patterns)
+        pair, mass, lowered = self.assembled(fits, mesh, numbering)
         plan = self if len(lowered) == len(self.lowered) else replace(self, lowered=lowered)
         return plan, pair, mass
 
@@ -153,43 +173,64 @@ class PairPlan:
         "lumped" is "mass" with the rows of P that the mass of the vertices is found by: with w = 1 it is Σ_i m_i u_i.
         `for_fields` gives the elements of forms `along` components of tangent fields.
         """
-        mesh = self.curving.at(fits.points, self.fits, fits)
+        mesh = self.curving.at(self.fits, fits)
         elements = self.forms(fits, mesh, prolong=False)
-        prolong = partial(prolonged, self.fits, fits, self.curving, mesh)
-        kinds = {False: elements}
-        if any(form.along for form in forms):
-            kinds[True] = for_fields(elements)
-        values = {
-            kind: own.factors([f for f in forms if bool(f.along) == kind], medium, prolong)
-            for kind, own in kinds.items()
-        }
+        p = Prolongation(self.fits, fits, self.curving, mesh)
+        needed = {bool(form.along) for form in forms}
+        kinds = {along: for_fields(elements) if along else elements for along in needed}
+        values = {along: own.factors(medium, along, p.times) for along, own in kinds.items()}
         flat = self.curving.bent.index_fill(0, self.lowered, False)
         total = []
-        for lumped, curving in ((False, self.curving), (True, replace(self.curving, bent=flat))):
+        lower = p._replace(curving=replace(self.curving, bent=flat))
+        for lumped, here in ((False, p), (True, lower)):
             chosen = [form for form in forms if (form.name == "lumped") == lumped]
             functions = {id(f): f for form in chosen for f in (form.w, form.u)}
-            if functions:
-                widths = [f.shape[1] for f in functions.values()]
-                every = torch.cat(list(functions.values()), 1)
-                at_nodes = prolonged(self.fits, fits, curving, mesh, every).split(widths, 1)
-                nodes = dict(zip(functions, at_nodes, strict=True))
-                for form in chosen:
-                    both = [nodes[id(form.w)], nodes[id(form.u)]]
-                    if form.name == "boundary":
-                        total.append(self._on_boundary(form, both, fits.points, mesh))
-                    else:
-                        kind = bool(form.along)
-                        total.append(kinds[kind].form(form, both, values[kind]))
+            if not chosen:
+                continue
+            widths = [f.shape[1] for f in functions.values()]
+            every = torch.cat(list(functions.values()), 1)
+            at_nodes = here.times(every).split(widths, 1)
+            nodes = dict(zip(functions, at_nodes, strict=True))
+            for form in chosen:
+                both, along = [nodes[id(form.w)], nodes[id(form.u)]], bool(form.along)
+                if form.name == "boundary":
+                    total.append(self._on_boundary(form, both, mesh))
+                else:
+                    total.append(kinds[along].form(form, both, values[along]))
         return torch.stack(total).sum()
 
-    def _on_boundary(
-        self, form: BilinearForm, nodes: list[Tensor], points: Tensor, mesh: CurvedMesh
-    ) -> Float[Tensor, ""]:
+    def _on_boundary(self, form: BilinearForm, nodes: list[Tensor], mesh: CurvedMesh) -> Tensor:
         """The value of a form of the boundary mass, as `boundary_mass` has it."""
-        rim, shares = boundary_elements(points, self.curving, mesh)
-        blocks = outer(rim.nodes, nodes, form.c)
-        total = weighted_products(rim.metric, rim.element, blocks, None).sum()
+        rim, shares = boundary_elements(self.curving, mesh)
+        total = rim.weighted_products(rim.outer(nodes, form.c)).sum()
         return total + (shares[:, None] * form.w * form.u * form.c).sum()
+
+    def assembled(
+        self, fits: LocalFits, mesh: CurvedMesh, numbering: Numbering | None
+    ) -> tuple[PairMatrices, Float[Tensor, " N"], Int[Tensor, " L"]]:
+        """The matrices in the user's numbers, and the lumped mass with the rows of P lowered for it."""
+        forms = self.forms(fits, mesh)
+        p, count = forms.prolongation, len(fits.points)
+        given = torch.arange(count) if numbering is None else numbering.given
+        boundary = boundary_mass(self.curving, mesh, p)
+        lots = forms.lots[0], forms.linear, *forms.lots[1:]
+        own, linear, *flats = (lot.matrices() for lot in lots)
+        del forms, lots, mesh  # some of these are as large as the pair
+        fits.let_go()
+        weights = own.row_sums(p.shape[0])
+        mass, lowered = positive_mass(p, weights, self, linear.row_sums(count))
+        mass += sum(lot.row_sums(count) for lot in flats)
+        same: Any = sparse.eye_array(count, format="csr")
+        near, upper = upper_congruence(same, [linear, *flats]), upper_congruence(p, [own, *flats])
+        del p, own, linear, flats
+        found = {}
+        for name, matrix in {"linear": near, "whole": upper}.items():
+            if name not in self.patterns or not self.patterns[name].is_of(matrix):
+                self.patterns[name] = Pattern.of(matrix, given)
+            found[name] = self.patterns[name].pair(matrix)
+        whole = found["whole"].beside([] if boundary is None else [boundary], given.numpy())
+        matrices = PairMatrices(whole.crow, whole.col, whole.values, found["linear"])
+        return matrices, torch.from_numpy(mass), lowered
 
     @property
     def counts(self) -> Int[Tensor, "4 N"]:
@@ -203,7 +244,6 @@ class PairPlan:
 
 
 def mesh_pair(
-    points: Points,
     cells: Int[Tensor, "F corners"],
     fit_plan: FitPlan,
     fits: LocalFits,
@@ -220,46 +260,13 @@ def mesh_pair(
     column rank. `degrees` lists the degrees of the fits of functions, best first; `held` marks vertices with a
     Dirichlet condition. Cells with `shares` may overlap, and have no boundary.
     """
-    nodes = lagrange_nodes(cells, len(points), degree, closed=shares is not None)
-    boundary = boundary_nodes(points, nodes, degrees, held)
-    curving, *mesh = curve(points, fit_plan, fits, nodes, boundary, held)
+    nodes = lagrange_nodes(cells, len(fits.points), degree, closed=shares is not None)
+    boundary = boundary_nodes(fits.points, nodes, degrees, held)
+    curving, *mesh = curve(fit_plan, fits, boundary, held)
     stars = cells[:0] if stars is None else stars
     plan = PairPlan(fit_plan, curving, stars, shares, torch.zeros(0, dtype=torch.int64))
-    found = assembled_pair(plan, fits, mesh.pop(), numbering, {})  # keeps no reference
+    found = plan.assembled(fits, mesh.pop(), numbering)  # keeps no reference
     return replace(plan, lowered=found[2]), *found[:2]
-
-
-def assembled_pair(
-    plan: PairPlan,
-    fits: LocalFits,
-    mesh: CurvedMesh,
-    numbering: Numbering | None,
-    patterns: dict[str, Pattern],
-) -> tuple[PairMatrices, Float[Tensor, " N"], Int[Tensor, " L"]]:
-    """Assemble the matrices in the user's numbers, and the lumped mass; return also the rows of P lowered for it.
-
-    Missing `patterns` are computed and added.
-    """
-    forms = plan.forms(fits, mesh)
-    p, count = forms.prolongation, len(fits.points)
-    given = torch.arange(count) if numbering is None else numbering.given
-    boundary = boundary_mass(fits.points, plan.curving, mesh, p)
-    own, linear, *flats = (lot.matrices() for lot in (forms.lots[0], forms.linear, *forms.lots[1:]))
-    del forms, mesh  # some of these are as large as the pair
-    fits.let_go()
-    weights = own.row_sums(p.shape[0])
-    mass, lowered = positive_mass(p, weights, plan, linear.row_sums(count))
-    mass += sum(lot.row_sums(count) for lot in flats)
-    near, upper = assembled([linear, *flats], count), upper_congruence(p, [own, *flats])
-    del p, own, linear, flats
-    found = {}
-    for name, matrix in {"linear": near, "whole": upper}.items():
-        if name not in patterns or not patterns[name].is_of(matrix):
-            patterns[name] = Pattern.of(matrix, given)
-        found[name] = patterns[name].pair(matrix)
-    whole = found["whole"].beside([] if boundary is None else [boundary], given.numpy())
-    matrices = PairMatrices(whole.crow, whole.col, whole.values, found["linear"])
-    return matrices, torch.from_numpy(mass), lowered
 
 
 def positive_mass(
@@ -290,23 +297,22 @@ def positive_mass(
     return mass, torch.from_numpy(np.flatnonzero(lowered) - count)
 
 
-def boundary_elements(
-    points: Points, plan: CurvingPlan, mesh: CurvedMesh
-) -> tuple[Elements, Float[Tensor, " N"]]:
+def boundary_elements(plan: CurvingPlan, mesh: CurvedMesh) -> tuple[Elements, Float[Tensor, " N"]]:
     """Elements along the boundary, and the lumped boundary mass of the vertices at coarse triangles."""
     nodes, (cell, elements) = plan.nodes, plan.nodes.boundary()
     coarse, shape = plan.coarse[cell], simplex(nodes.dim - 1, nodes.degree)
-    own, shares = elements[~coarse], torch.zeros_like(points[:, 0])
+    own, points = elements[~coarse], mesh.places[: nodes.count]
+    shares = torch.zeros_like(points[:, 0])
     if mesh.cover is not None:
         shares = boundary_shares(points, elements[coarse, :2], mesh.cover)
     return Elements(own, metric(mesh.places, own, shape), shape), shares
 
 
-def boundary_mass(points: Points, plan: CurvingPlan, mesh: CurvedMesh, p: Any) -> Any:
+def boundary_mass(plan: CurvingPlan, mesh: CurvedMesh, p: Any) -> Any:
     """Boundary mass ∫ φ_i φ_j, 1 at the end of a curve, lumped at coarse triangles; None for a closed shape."""
     if len(plan.nodes.boundary()[0]) == 0:
         return None
-    rim, shares = boundary_elements(points, plan, mesh)
+    rim, shares = boundary_elements(plan, mesh)
     blocks = (rim.element.weights * area_element(rim.metric)) @ squares(rim.element)
     result = p.T @ summed(blocks, rim.nodes, len(mesh.places)) @ p
     return (result + result.T) / 2 + sparse.diags_array(shares.numpy(), format="csr")

@@ -20,7 +20,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Float
 from scipy import sparse
 from torch import Tensor
 
@@ -36,7 +36,7 @@ from torchlb.galerkin.assembly import (
 from torchlb.galerkin.forms import BilinearForm, Forms, times
 from torchlb.galerkin.medium import orthonormal
 from torchlb.galerkin.pair import Pattern
-from torchlb.geometry.vectors import Frames, at, dot
+from torchlb.geometry.vectors import Frames, Points, at, dot
 from torchlb.linalg.csr import Csr
 from torchlb.linalg.precision import AT_ONCE
 from torchlb.linalg.sparse import values_on
@@ -60,16 +60,12 @@ def in_space(forms: Sequence[BilinearForm], frames: Frames) -> list[BilinearForm
     return found
 
 
-class _Part(NamedTuple):
-    """One of the matrices of functions that the stiffness of tangent fields is made of.
+Part = tuple[int, int, bool]
+"""One of the matrices of functions that the stiffness of tangent fields is made of, as (k, l, whether it is turning).
 
-    It is S_kl = ∫κΠ_kl ∇φ_i·∇φ_j; if `turning`, ∫κω_kl det(∇φ_i, ∇φ_j) with ω = e₁e₂ᵀ − e₂e₁ᵀ, which Hodge's
-    ∫κ(div u)² + κ(curl u)² has besides. The latter is antisymmetric both in i and j and in k and l.
-    """
-
-    k: int
-    m: int
-    turning: bool
+It is S_kl = ∫κΠ_kl ∇φ_i·∇φ_j; if turning, ∫κω_kl det(∇φ_i, ∇φ_j) with ω = e₁e₂ᵀ − e₂e₁ᵀ, which Hodge's
+∫κ(div u)² + κ(curl u)² has besides. The latter is antisymmetric both in i and j and in k and l.
+"""
 
 
 def tangent_matrices(
@@ -86,8 +82,8 @@ def tangent_matrices(
     which are of functions.
     """
     axes = range(frames.shape[1])
-    parts = [_Part(k, m, False) for k, m in combinations_with_replacement(axes, 2)]
-    parts += [_Part(k, m, True) for k, m in combinations(axes, 2)] if hodge else []
+    parts = [(k, m, False) for k, m in combinations_with_replacement(axes, 2)]
+    parts += [(k, m, True) for k, m in combinations(axes, 2)] if hodge else []
     tangents, found = forms.tangents(), []
     kinds = [(forms.prolongation, forms.lots, tangents, conductivity)]
     if len(others) > 1:
@@ -102,8 +98,7 @@ def tangent_matrices(
         ]
         upper, values = _assembled(forms, p, elements, parts)
         matrix = _framed(upper, values, forms.given, frames, other)
-        turned = [x for x in elements if x.lot.turns is not None]
-        for x in turned:
+        for x in (x for x in elements if x.lot.turns is not None):
             own = values_on(matrix.crow.numpy(), matrix.col.numpy(), x.turned(frames, hodge=hodge))
             matrix.values[0] += torch.from_numpy(own)
         found.append(matrix)
@@ -134,13 +129,13 @@ class _Elements:
         slopes = self.lot.shared((shape.weights * kappa)[..., None])
         return slopes, (cross - cross.mT).flatten(1)[:, None]
 
-    def blocks(self, part: _Part) -> Float[Tensor, "T n_times_n"]:
-        """Element matrices of a part; zero for elements with turned vectors, see `turned`."""
+    def blocks(self, k: int, m: int, turning: bool) -> Float[Tensor, "T n_times_n"]:
+        """Element matrices of a `Part`; zero for elements with turned vectors, see `turned`."""
         if self.lot.turns is not None:
             return self.lot.metric.new_zeros(len(self.lot.nodes), self.lot.nodes.shape[1] ** 2)
-        one, two = self.tangents[..., part.k, :], self.tangents[..., part.m, :]
+        one, two = self.tangents[..., k, :], self.tangents[..., m, :]
         direction, (slopes, products) = dot(one, two), self.covariant
-        if part.turning:
+        if turning:
             direction = one[..., 0] * two[..., 1] - one[..., 1] * two[..., 0]
             slopes, products = self.turning
         return (direction[..., None] * slopes).flatten(1) @ products.flatten(0, 1)
@@ -149,35 +144,29 @@ class _Elements:
         """The stiffness (N d, N d) of elements at whose corners vectors are turned into their plane."""
         nodes, turns = self.lot.nodes, self.lot.turns
         assert turns is not None
-        q = turns @ at(frames, nodes)
-        slopes, products = self.covariant
-        inner = torch.einsum("tika,tjkb->tijab", q, q)
-        size = nodes.shape[1]
-        total = (slopes.flatten(1) @ products.flatten(0, 1)).view(-1, size, size, 1, 1) * inner
+        q, dim = turns @ at(frames, nodes), frames.shape[2]
+        kinds, total = [(q, self.covariant)], torch.zeros((), dtype=q.dtype)
         if hodge:
-            slopes, products = self.turning
             cross = torch.stack([q[..., 1, :], -q[..., 0, :]], -2)  # the quarter turn of ω
-            inner = torch.einsum("tika,tjkb->tijab", q, cross)
-            total += (slopes.flatten(1) @ products.flatten(0, 1)).view(-1, size, size, 1, 1) * inner
-        dim = frames.shape[2]
+            kinds.append((cross, self.turning))
+        for other, (slopes, products) in kinds:
+            inner = torch.einsum("tika,tjkb->tiajb", q, other)
+            blocks = slopes.flatten(1) @ products.flatten(0, 1)
+            total = total + blocks.view(-1, *2 * (nodes.shape[1], 1)) * inner
         rows = (dim * nodes[..., None] + torch.arange(dim)).flatten(1)
-        whole = summed(total.transpose(2, 3).flatten(1), rows, dim * len(frames))
+        whole = summed(total.flatten(1), rows, dim * len(frames))
         return (whole + whole.T) / 2  # symmetric but for rounding
 
 
 def _assembled(
-    forms: Forms, p: Any, elements: list[_Elements], parts: list[_Part]
+    forms: Forms, p: Any, elements: list[_Elements], parts: list[Part]
 ) -> tuple[Any, Float[Tensor, "n n upper"]]:
     """Upper triangles on one pattern, the last of them, and S for all k and l; two are computed at a time."""
     values, upper = [], None
     for pair in zip(parts[::2], [*parts[1::2], parts[-1]], strict=False):
-        upper = forms.upper(
-            p,
-            [
-                ElementMatrices(x.lot.nodes, torch.complex(*(x.blocks(part) for part in pair)))
-                for x in elements
-            ],
-        )
+        blocks = [torch.complex(*(x.blocks(*part) for part in pair)) for x in elements]
+        lots = (x.lot.nodes for x in elements)
+        upper = forms.upper(p, list(map(ElementMatrices, lots, blocks)))
         both = torch.from_numpy(upper.data)
         values += [both.real, both.imag]
     size = forms.places.shape[1]
@@ -190,11 +179,7 @@ def _assembled(
 
 
 def _framed(
-    upper: Any,
-    stiffness: Float[Tensor, "n n upper"],
-    given: Int[Tensor, " N"],
-    frames: Frames,
-    others: Csr,
+    upper: Any, stiffness: Float[Tensor, "n n upper"], given: Tensor, frames: Frames, others: Csr
 ) -> Csr:
     """Σ_kl E_kᵀ S_kl E_l of the upper triangles of S_kl, with Σ_k E_kᵀ A E_k of the other channels A."""
     count, _, dim = frames.shape
@@ -211,7 +196,10 @@ def _framed(
     crow, col, order = pattern.crow, pattern.col, torch.from_numpy(pattern.order).long()
     turned = given[starts][order] != torch.arange(count).repeat_interleave(crow.diff())
     whole, inner = (at(torch.cat([x, x.mT]), order + len(x) * turned) for x in (whole, inner))
-    place = _rows_of_blocks(crow, dim)
+    # where the d rows of each block stand when the rows of a block row are written one after the other
+    start, length = (x.repeat_interleave(crow.diff()) for x in (crow[:-1], crow.diff()))
+    first = (dim - 1) * start + torch.arange(len(col))
+    place = (first[:, None] + torch.arange(dim) * length[:, None]).view(-1)
     values = inner.new_empty(len(others.values), len(place), dim)
     for channel in range(len(values)):
         if channel:
@@ -222,14 +210,6 @@ def _framed(
     columns[place] = (dim * col[:, None] + torch.arange(dim)).repeat_interleave(dim, 0)
     rows = torch.cat([crow[:1], (dim * crow.diff()).repeat_interleave(dim).cumsum(0)])
     return Csr(rows, columns.view(-1), values.flatten(1))
-
-
-def _rows_of_blocks(crow: Int[Tensor, " N_plus_1"], dim: int) -> Int[Tensor, " d_nnz"]:
-    """Where the d rows of each block stand when the rows of a block row are written one after the other."""
-    length, number = crow.diff(), torch.arange(int(crow[-1]))
-    start, length = (x.repeat_interleave(length) for x in (crow[:-1], length))
-    first = dim * start + number - start
-    return (first[:, None] + torch.arange(dim) * length[:, None]).view(-1)
 
 
 class WeakGradient(NamedTuple):
@@ -268,10 +248,7 @@ class WeakGradient(NamedTuple):
 
 
 def _directions(
-    g: Float[Tensor, "T Q 3"],
-    slopes: Float[Tensor, "T Q n 2"],
-    cells: Any,
-    normals: Float[Tensor, "N 3"] | None,
+    g: Tensor, slopes: Float[Tensor, "T Q n 2"], cells: Any, normals: Points | None
 ) -> Float[Tensor, "T Q n 2"]:
     """√det G times the vectors d_a with ∇u = Σ_a d_a ∂_a u, or with ν × ∇u: the tangent vectors, turned or dual."""
     one, two = slopes.unbind(-1)

@@ -214,7 +214,7 @@ def finished(
         rest = stars, shape.held, plan.shape.shares, plan.numbering
         assert shape.fits is not None
         own = fits, shape.fits, *options.elements
-        pair_plan, pair, mass = mesh_pair(shape.points, cells, *own, *rest)
+        pair_plan, pair, mass = mesh_pair(cells, *own, *rest)
         plan, shape = replace(plan, pair=pair_plan), replace(shape, mass=mass)
     if surface is not None:
         if pair is not None:

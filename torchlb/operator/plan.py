@@ -21,8 +21,8 @@ from torchlb.errors import DerivativeError, InputError, first_few, renumbered, w
 from torchlb.galerkin.boundary import BoundaryCurves, OnCurves, OnSurface
 from torchlb.galerkin.creases import across_creases, creased_cells
 from torchlb.galerkin.curving import BoundaryNodesPlan, CurvingPlan
-from torchlb.galerkin.elements import subsets
-from torchlb.galerkin.forms import BilinearForm, Forms, edge_lengths
+from torchlb.galerkin.elements import edge_lengths, subsets
+from torchlb.galerkin.forms import BilinearForm, Forms
 from torchlb.galerkin.matrices import PairMatrices
 from torchlb.galerkin.medium import Medium
 from torchlb.galerkin.nodes import lagrange_nodes
@@ -140,7 +140,6 @@ class Plan:
         cells, options = self.shape.cells, self.options.taken(self.numbering)
         shape = Shape(
             **vars(placed),
-            normal_order=self.shape.fits.order,
             neighborhoods=None,
             mass=areas,
             low_order=MeshLowOrder(placed.points, cells, self.flips, self.shape.shares),
@@ -176,11 +175,11 @@ def operator_parts(
     numbering, options = plan.numbering, plan.options
     given, bending = numbering.restored, points.new_zeros(0, 0, 0)
     if shape.normals is not None:
-        bending = given(shape_operators(shape, rows, shape.normal_order))
+        bending = given(shape_operators(shape, rows, plan.shape.fits.order))
     rows = rows.restored(numbering)
     counts = rows.length.new_zeros(4, len(points))
     counts = counts if plan.pair is None else plan.pair.counts[:, numbering.here]
-    report = {"num_neighbors": rows.length, "normal_order": given(shape.normal_order)}
+    report = {"num_neighbors": rows.length, "normal_order": given(plan.shape.fits.order)}
     report |= vars(rows) | dict(zip(FIELDS[-4:], counts, strict=True))
     values = torch.cat([rows.laplacian[None], rows.gradient.T])
     parts = others | {

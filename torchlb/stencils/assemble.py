@@ -131,7 +131,7 @@ class Stencils:
         rows, shape = Rows.stack(parts)[torch.cat(taken).argsort()], self.shape
         if shape.boundary is None:
             return rows
-        return shape.condition.finish(shape.points, shape.areas, shape.boundary, centers, rows)
+        return shape.condition.finish(shape, centers, rows)
 
     def _touching(self, index: Int[Tensor, "B K"]) -> Bool[Tensor, " B"]:
         """Whether stencils have boundary points."""
@@ -178,11 +178,7 @@ class Stencils:
         return (bound if candidate.factor else widest), widest
 
     def _weights(
-        self,
-        index: Int[Tensor, "B K"],
-        candidate: Candidate,
-        touching: Bool[Tensor, " B"],
-        slope: Int[Tensor, " B"] | None = None,
+        self, index: Tensor, candidate: Candidate, touching: Tensor, slope: Tensor | None = None
     ) -> Weights:
         """Weights of a batch, where it is `touching` with boundary data, if the condition has some.
 
@@ -191,9 +187,8 @@ class Stencils:
         data = touching & (self.share is not None)
         if not data.any():
             return self._free_weights(index, candidate, slope is None)
-        beside = self._weights_with_data(
-            index[data], candidate, None if slope is None else slope[data]
-        )
+        own = None if slope is None else slope[data]
+        beside = self._weights_with_data(index[data], candidate, own)
         if data.all():
             return beside
         free = self._free_weights(index[~data], candidate, slope is None)

@@ -12,8 +12,6 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from torchlb.errors import InputError, first_few
-from torchlb.geometry.boundary import Boundary
-from torchlb.geometry.vectors import Points
 from torchlb.linalg.precision import LOW
 from torchlb.stencils.rows import Rows
 
@@ -73,18 +71,11 @@ class Condition:
         other.share = self.share[points]
         return other
 
-    def finish(
-        self,
-        points: Points,
-        areas: Float[Tensor, " N"],
-        boundary: Boundary,
-        centers: Int[Tensor, " B"],
-        rows: Rows,
-    ) -> Rows:
-        """Adapt the rows of `centers`: low-order ones, without data, lose a f over their share of the boundary."""
+    def finish(self, shape: Any, centers: Int[Tensor, " B"], rows: Rows) -> Rows:
+        """Adapt the rows of a `Shape`: low-order ones, without data, lose a f over their share of the boundary."""
         if self.share is None or self.conserves:
             return rows
-        lost = self.share * boundary.sizes / areas
+        lost = self.share * shape.boundary.sizes / shape.areas
         own = (centers[rows.row] == rows.col) & (rows.order == 0)[rows.row]
         return replace(rows, laplacian=rows.laplacian - torch.where(own, lost[rows.col], 0.0))
 
@@ -110,16 +101,9 @@ class Dirichlet(Condition):
     conserves = False
     fixes = True
 
-    def finish(
-        self,
-        points: Points,
-        areas: Float[Tensor, " N"],
-        boundary: Boundary,
-        centers: Int[Tensor, " B"],
-        rows: Rows,
-    ) -> Rows:
+    def finish(self, shape: Any, centers: Int[Tensor, " B"], rows: Rows) -> Rows:
         """Decouple the rows from the boundary."""
-        mask, dim = boundary.mask, rows.gradient.shape[1]
+        points, mask, dim = shape.points, shape.boundary.mask, rows.gradient.shape[1]
         local, row, col = rows.row, centers[rows.row], rows.col
         square = (points[col] - points[row]).square().sum(1)
         farthest = square.new_zeros(len(centers)).scatter_reduce(0, local, square, "amax")

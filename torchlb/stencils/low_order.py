@@ -13,6 +13,7 @@ from torch import Tensor
 from torchlb.errors import first_few, warn
 from torchlb.galerkin.assembly import Elements, area_element, flat_metric
 from torchlb.galerkin.delaunay import delaunay_cover, sound_lengths
+from torchlb.galerkin.elements import edge_lengths
 from torchlb.galerkin.nodes import lagrange_nodes
 from torchlb.geometry.vectors import Points
 from torchlb.linalg.precision import ROUNDING
@@ -42,7 +43,8 @@ class MeshLowOrder:
     def _flat(self) -> tuple[Int[Tensor, "T corners"], Tensor, Float[Tensor, " T"], list[Tensor]]:
         """Flat cells, the lengths of their edges, the fractions of them that are integrated, and flips."""
         nodes, flips = lagrange_nodes(self.cells, len(self.points), 1), []
-        cells, lengths = nodes.cells, sound_lengths(nodes.lengths(self.points), nodes.cells)
+        cells = nodes.cells
+        lengths = sound_lengths(edge_lengths(self.points, cells), cells)
         shares = torch.ones_like(lengths[:, 0]) if self.shares is None else self.shares
         if nodes.dim == 2:
             free = torch.zeros(len(nodes.edges), dtype=torch.bool)
@@ -105,8 +107,7 @@ class MeshLowOrder:
         upper = torch.linalg.qr((points[cells[:, 1:]] - points[cells[:, :1]]).mT).R
         boxes = torch.diagonal(upper, dim1=-2, dim2=-1).prod(-1).abs()
         shares = self._in_equal_parts(cells, boxes if self.shares is None else self.shares * boxes)
-        lengths = lagrange_nodes(cells, len(points), 1).lengths(points)
-        square = lengths.amax(1).square().repeat_interleave(corners)
+        square = edge_lengths(points, cells).amax(1).square().repeat_interleave(corners)
         longest = torch.zeros_like(shares).scatter_reduce(0, cells.flatten(), square, "amax")
         sound = corners != 3 or (shares > ROUNDING * longest).all()
         return shares if sound else self._mass

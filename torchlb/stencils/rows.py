@@ -43,7 +43,6 @@ class Pattern:
     """Which columns consecutive rows of a sparse matrix have.
 
     `length`, (B,), counts the entries of each row; `col`, (nnz,), are ascending within a row.
-
     """
 
     length: Int[Tensor, " B"]

@@ -21,12 +21,7 @@ from torchlb.geometry.complex import consistently_wound
 from torchlb.geometry.fit_search import FitSearch
 from torchlb.geometry.frames import complete_frames, mesh_frames, normals_of_frames, vertex_normals
 from torchlb.geometry.local_fits import FitPlan, LocalFits
-from torchlb.geometry.neighbors import (
-    GraphNeighborhoods,
-    mesh_graph,
-    nearest_neighbors,
-    restricted,
-)
+from torchlb.geometry.neighbors import GraphNeighborhoods, mesh_graph, nearest_neighbors, restricted
 from torchlb.geometry.thresholds import NEAREST
 from torchlb.geometry.vectors import Frames, Points, dot
 from torchlb.linalg.precision import AT_ONCE, TINY
@@ -60,7 +55,6 @@ class ShapePlan:
     all. `fits` plans the fits of heights, and of functions where a weak pair is built; `beside` has the data of the
     surface through a cloud, None where points stay as given and frames start from the cells; `side` is the sign of each
     normal along that of the cells around the vertex, None for shapes without sides; `boundary` is as in `Placed`.
-
     """
 
     cells: Int[Tensor, "F corners"]
@@ -164,12 +158,10 @@ def _axes(
 class Shape(Placed):
     """A shape ready for stencils.
 
-    `normal_order` is the degree q of the fit behind each frame, 0 for an initial frame; `neighborhoods`, `plan` and
-    `fits` are None where the rows are planned already. `on_mesh` says whether triangles are given, which follow the
-    surface where its points do not resolve it.
+    `neighborhoods`, `plan` and `fits` are None where the rows are planned already. `on_mesh` says whether triangles are
+    given, which follow the surface where its points do not resolve it.
     """
 
-    normal_order: Int[Tensor, " N"]
     neighborhoods: GraphNeighborhoods | None
     low_order: MeshLowOrder
     condition: Condition
@@ -301,7 +293,6 @@ def _shape(
     low_order = MeshLowOrder(placed.points, cells, shares=shares)
     return Shape(
         **vars(placed),
-        normal_order=fit_plan.order,
         neighborhoods=replace(neighborhoods, frames=placed.frames, sides=sides),
         low_order=low_order,
         condition=Condition() if held is None else held,
