@@ -48,12 +48,12 @@ def hodge_decomposition(
 ) -> HodgeParts:
     """The gradient, the rotated gradient and the harmonic part of the tangential part of v; they add up to it.
 
-    ∇u is closest to v, and so is ν × ∇w, in the mean square of the prolonged fields: two Poisson solves. At the
-    vertices they are the fields whose prolongation is closest to theirs, so that in ``lb.connection.mass_matrix`` the
-    parts are orthogonal up to the square of its error. With a boundary, whatever the condition of the operator is, u is
-    free and w zero along it; h is then tangent to it. On spheres and disks h is the error of the other two. A surface
-    needs two sides, and at most two triangles at an edge: a warning names the points where it is otherwise, as the
-    rotated part is wrong there, and on a one-sided surface everywhere.
+    ∇u is closest to v, and so is ν × ∇w, in the mean square of the prolonged fields: two Poisson solves, and two more
+    for what they leave. At the vertices they are the fields whose prolongation is closest to theirs, and orthogonal in
+    ``lb.connection.mass_matrix``, up to the fourth power of its error. With a boundary, whatever the condition of the
+    operator is, u is free and w zero along it; h is then tangent to it. On spheres and disks h is the error of the
+    other two. A surface needs two sides, and at most two triangles at an edge: a warning names the points where it is
+    otherwise, as the rotated part is wrong there, and on a one-sided surface everywhere.
 
     Differentiable in v. Raises InputError for another shape, for operators in a medium, of batches, and for those that
     are not of surfaces in R³.
@@ -79,11 +79,14 @@ def hodge_decomposition(
     free = _constant(lb)
     held = _constant(lb, boundary) if bool(boundary.any()) else free
     for turned, functions in ((None, free), (normals, held)):
-        form = WeakGradient.of(elements, turned)
-        right = form.divergence(fields.vectors(c).cpu()).to(c)
-        u = solved(functions, right)
-        slope = fields.components(form.gradient(u.cpu()).to(c))
-        found.append((u, solved(fields, slope, torch.zeros_like(slope[0]))))
+        form, part, total = WeakGradient.of(elements, turned), torch.zeros_like(c), 0.0
+        for _ in range(
+            2
+        ):  # what the first leaves at the vertices has a part, too, of the error of the prolongation
+            u = solved(functions, form.divergence(fields.vectors(c - part).cpu()).to(c))
+            slope = fields.components(form.gradient(u.cpu()).to(c))
+            total, part = total + u, part + solved(fields, slope, torch.zeros_like(slope[0]))
+        found.append((total, part))
     (u, gradient), (w, rotated) = found
     parts = [fields.vectors(x) for x in (gradient, rotated, c - gradient - rotated)]
     results = [without(lb, x, "Hodge parts").to(v) for x in (*parts, u, w)]
