@@ -1,9 +1,10 @@
 """Seconds of solves where the tensors are: python benchmarks/device.py [--device cuda] [--sizes N ...]
 
-A star-shaped surface, order 3: eigenpairs, a flow, a step, a Poisson problem, tangent eigenfields, and the derivative
-of eigenvalues in the points. Each is measured on the CPU, with one thread and with all, and on the device; the medians
-of the runs after a first one, factors and bases made anew each time. The last column has the largest difference of the
-results from the CPU's, relative to their largest entry. Without a device the columns of the CPU stand alone.
+A star-shaped surface, order 3: eigenpairs, a flow, a step, a Poisson problem, tangent eigenfields, the operator at other
+points, and the derivative of eigenvalues in the points. Each is measured on the CPU, with one thread and with all, and
+on the device; the medians of the runs after a first one, factors and bases made anew each time. The last column has the
+largest difference of the results from the CPU's, relative to their largest entry. Without a device the columns of the
+CPU stand alone.
 """
 
 from __future__ import annotations
@@ -29,6 +30,11 @@ def of_points(lb: LaplaceBeltrami) -> torch.Tensor:
     return torch.autograd.grad(values.log().sum(), points)[0]
 
 
+def moved(lb: LaplaceBeltrami) -> torch.Tensor:
+    there = lb.at(1.01 * lb.points)
+    return torch.cat([there.weak.values.flatten(), there.stencil.values.flatten()])
+
+
 TASKS: dict[str, Callable[[LaplaceBeltrami, torch.Tensor], torch.Tensor]] = {
     "128 eigenpairs": lambda lb, f: lb.eigenbasis(128).eigenvalues[1:],
     "heat_flow, 64 channels": lambda lb, f: heat_flow(lb, f, 0.1),
@@ -37,6 +43,7 @@ TASKS: dict[str, Callable[[LaplaceBeltrami, torch.Tensor], torch.Tensor]] = {
         lb, f - lb.integral(f) / lb.mass.sum()
     ),
     "16 tangent eigenfields": lambda lb, f: lb.connection.eigenbasis(16).eigenvalues,
+    "lb.at": lambda lb, f: moved(lb),
     "derivative of 39 eigenvalues": lambda lb, f: of_points(lb),
 }
 

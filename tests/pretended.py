@@ -9,14 +9,9 @@ from torch.utils import backend_registration
 from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils._pytree import tree_flatten, tree_map
 
-BETWEEN = {
-    "aten::_to_copy",
-    "aten::copy_",
-    "aten::index",
-    "aten::index_put_",
-    "aten::_index_put_impl_",
-}
-"""Operations that also CUDA does with tensors of the CPU: copies, and picking by indices."""
+COPIES = {"aten::_to_copy", "aten::copy_"}
+PICKS = {"aten::index", "aten::index_put_", "aten::_index_put_impl_"}
+"""Operations on a tensor of the device, for which indices may be on the CPU."""
 
 
 class Pretended(torch.Tensor):
@@ -40,6 +35,10 @@ class Pretended(torch.Tensor):
         """As numbers, for which a device is waited for, but nothing is moved by hand."""
         return self.held.tolist()
 
+    def __repr__(self):
+        """As that of the tensor held."""
+        return f"Pretended({self.held})"
+
     @classmethod
     def __torch_dispatch__(cls, function, types, args=(), kwargs=None):
         """Compute on the CPU."""
@@ -52,7 +51,8 @@ def _computed(function, args, kwargs):
     given = [x for x in tree_flatten((args, kwargs))[0] if isinstance(x, torch.Tensor)]
     here = [x for x in given if not isinstance(x, Pretended)]
     there = len(here) < len(given)
-    if there and name not in BETWEEN and any(x.ndim for x in here):
+    apart = there and name not in COPIES and any(x.ndim for x in here)
+    if apart and not (name in PICKS and isinstance(given[0], Pretended)):
         raise RuntimeError(
             f"{name}: expected all tensors on one device, {len(here)} are on the CPU"
         )

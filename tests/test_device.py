@@ -20,7 +20,7 @@ from torchlb import (
     vector_heat_flow,
 )
 from torchlb.linalg.factor import Factor
-from torchlb.surfaces import Ellipsoid, UnitDisk
+from torchlb.surfaces import CliffordTorus, Ellipsoid, SpaceCurve, UnitDisk
 
 cuda = pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device")
 other = pytest.mark.skipif(not registered(), reason="this torch has no devices of Python's")
@@ -70,6 +70,39 @@ CALLS = {
     "field of eigenvalues": lambda lb, f: lb.connection.eigenbasis(4).eigenvalues,
 }
 
+DISK = UnitDisk().mesh(300)
+
+
+def annulus(sections):
+    """Of triangles that all have a side on its boundary."""
+    angle = 2 * torch.pi * torch.arange(sections).double() / sections
+    ring = torch.stack([angle.cos(), angle.sin(), 0 * angle], 1)
+    one = torch.arange(sections)
+    two = one.roll(-1)
+    inner = torch.stack([one, two, one + sections], 1)
+    outer = torch.stack([two, two + sections, one + sections], 1)
+    return torch.cat([0.5 * ring, ring]), torch.cat([inner, outer])
+
+
+def shaken_grid(size):
+    axes = torch.meshgrid(*[torch.linspace(0, 1, size).double()] * 3, indexing="ij")
+    return torch.stack(axes, -1).view(-1, 3) + 0.01 * torch.randn(size**3, 3).double()
+
+
+MOVED = {
+    "closed": lambda: LaplaceBeltrami.from_mesh(*Ellipsoid().mesh(300)),
+    "order 5": lambda: LaplaceBeltrami.from_mesh(*Ellipsoid().mesh(300), order=5),
+    "along normals": lambda: LaplaceBeltrami.from_mesh(
+        *Ellipsoid().mesh(300), projection="normal", weights="polyharmonic"
+    ),
+    "Robin": lambda: LaplaceBeltrami.from_mesh(*DISK, condition=Robin(1 + DISK[0][:, 0].square())),
+    "Dirichlet": lambda: LaplaceBeltrami.from_mesh(*DISK, condition="dirichlet"),
+    "coarse": lambda: LaplaceBeltrami.from_mesh(*annulus(24)),
+    "cloud": lambda: LaplaceBeltrami.from_points(Ellipsoid().points(300)),
+    "curve": lambda: LaplaceBeltrami.from_points(SpaceCurve().points(80), dim=1),
+    "solid": lambda: LaplaceBeltrami.from_points(shaken_grid(6), dim=3),
+    "in R⁴": lambda: LaplaceBeltrami.from_mesh(*CliffordTorus().mesh(300)),
+}
 OF_ONE = {"moved", "hodge_decomposition"}
 
 
@@ -108,3 +141,28 @@ def test_gradients_of_eigenpairs_are_on_the_device(device):
     assert slope.device.type == device
     assert slope.isfinite().all()
     assert (slope != 0).any()
+
+
+@pytest.mark.parametrize("kind", MOVED)
+@pytest.mark.filterwarnings("ignore:.*low-order rows")
+def test_an_operator_at_other_points_is_made_where_they_are(device, kind):
+    """With its derivatives; ten digits are left after two of them in a fit along normals."""
+    built = MOVED[kind]()
+    points = 1.02 * built.points + 1e-3 * (3 * built.points).sin()
+
+    def computed(lb):
+        moved = lb.at(points.to(lb.device).requires_grad_())
+        f = moved.points.detach()[:, 0].exp()
+        values = moved.eigenbasis(5).eigenvalues
+        loss = values.sum() + ((moved(f) * moved.mass).square().sum() + moved.gradient(f).norm())
+        return moved, torch.autograd.grad(loss, moved.points)[0]
+
+    (expected, slope), (found, other) = computed(built), computed(copy.deepcopy(built).to(device))
+    assert found.device.type == other.device.type == device
+    torch.testing.assert_close(other.cpu(), slope, rtol=1e-6, atol=1e-8 * float(slope.abs().max()))
+    tensors = dict(found.named_buffers())
+    for name, tensor in expected.named_buffers():
+        if not name.startswith("modes"):  # eigenvectors, up to their sign
+            scale = float(tensor.double().abs().nan_to_num().max()) if tensor.numel() else 0.0
+            close = {"rtol": 1e-9, "atol": 1e-9 * scale, "equal_nan": True}
+            torch.testing.assert_close(tensors[name].cpu(), tensor, **close)

@@ -8,13 +8,14 @@ coefficients is a short column of factorials.
 
 from __future__ import annotations
 
-from functools import lru_cache
 from itertools import chain, combinations_with_replacement
 from math import comb
 
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
+
+from torchlb.linalg.devices import constant
 
 
 def num_monomials(dim: int, degree: int) -> int:
@@ -26,7 +27,7 @@ def num_monomials(dim: int, degree: int) -> int:
     return comb(degree + dim, dim)
 
 
-@lru_cache(maxsize=64)
+@constant
 def exponents(dim: int, degree: int) -> Int[Tensor, "M d"]:
     """Multi-indices α with 1 ≤ |α| ≤ `degree`, by ascending |α|; M − 1 of them, one a row.
 
@@ -72,11 +73,11 @@ def monomial_derivatives(
     """
     factor, place = _lowered(coords.shape[-1], degree)
     lower = torch.cat([torch.ones_like(coords[..., :1]), monomials(coords, degree - 1)], dim=-1)
-    taken = lower.index_select(-1, place.to(coords.device).flatten())
+    taken = lower.index_select(-1, place.flatten())
     return factor.to(coords) * taken.unflatten(-1, place.shape)
 
 
-@lru_cache(maxsize=64)
+@constant
 def _lowered(dim: int, degree: int) -> tuple[Float[Tensor, "M d"], Int[Tensor, "M d"]]:
     """For ∂_c y^α = α_c y^(α − e_c): α_c, and the index of α − e_c among the constant and the monomials."""
     alpha = exponents(dim, degree)

@@ -75,12 +75,7 @@ class _LeftInverse(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx: Any, values: Tensor, root: Tensor) -> tuple[Tensor, Tensor]:  # pyright: ignore[reportIncompatibleMethodOverride]
-        from torchlb.linalg import kernels
-
-        columns, weights = values.mT.contiguous().numpy(), root.contiguous().numpy()
-        inverse, condition = (
-            torch.from_numpy(found) for found in kernels.left_inverse(columns, weights)
-        )
+        inverse, condition = _computed(values, root)
         ctx.save_for_backward(values, root, inverse)
         ctx.mark_non_differentiable(condition)
         return inverse, condition
@@ -94,6 +89,26 @@ class _LeftInverse(torch.autograd.Function):
         rest = h - (h @ inverse.mT) @ values.mT
         of_values = root[..., None].square() * rest.mT - inverse.mT @ (grad @ inverse.mT)
         return of_values, 2 * root * (rest * values.mT).sum(1)
+
+
+def _computed(values: Tensor, root: Tensor) -> tuple[Tensor, Tensor]:
+    """C and its condition, by compiled loops on the CPU, by the same ones over columns on other devices."""
+    if values.device.type == "cpu":
+        from torchlb.linalg import kernels
+
+        columns, weights = values.mT.contiguous().numpy(), root.contiguous().numpy()
+        inverse, condition = kernels.left_inverse(columns, weights)
+        return torch.from_numpy(inverse), torch.from_numpy(condition)
+    q = (root[..., None] * values).mT.clone()  # batched QR of CUDA takes one matrix after the other
+    lengths, r = q.norm(dim=2), q.new_zeros(len(q), q.shape[1], q.shape[1])
+    for j in range(q.shape[1]):
+        r[:, j, j] = q[:, j].norm(dim=1)
+        q[:, j] /= r[:, j, j, None]
+        r[:, j, j + 1 :] = (q[:, j + 1 :] @ q[:, j, :, None])[..., 0]
+        q[:, j + 1 :] -= r[:, j, j + 1 :, None] * q[:, j, None]
+    inverse = torch.linalg.solve_triangular(r, q, upper=True)
+    # rows of R⁻¹Qᵀ are as long as those of R⁻¹
+    return inverse * root[:, None], (lengths[..., None] * inverse).norm(dim=(1, 2))
 
 
 def window(radius: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:

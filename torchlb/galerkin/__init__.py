@@ -8,5 +8,5 @@ nodes. `boundary`: nodes on curves along the boundary of a surface, or on the bo
 edge flips that remove folded triangles and slivers. `medium`: conductivity, density and potential. `forms`: PᵀK_FE P
 and PᵀM_FE P, in any medium, and bilinear forms; `matrices`: K, M and what is added to them. `tangent`: matrices of
 tangent fields, and between these and functions; `creases`: these fields where triangles fold. `pair`: an operator's
-matrices and positive lumped mass.
+matrices and positive lumped mass; `device`: what they are made of elsewhere than on the CPU.
 """

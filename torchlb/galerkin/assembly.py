@@ -155,10 +155,10 @@ class ElementMatrices(NamedTuple):
     nodes: Int[Tensor, "T n"]
     blocks: Complex[Tensor, "T n_times_n"]
 
-    def row_sums(self, count: int) -> Float[np.ndarray, " count"]:
+    def row_sums(self, count: int) -> Float[Tensor, " count"]:
         """M1 of the assembled matrix of `count` nodes."""
         shares = self.blocks.imag.unflatten(1, 2 * self.nodes.shape[1:]).sum(2).flatten()
-        return shares.new_zeros(count).index_add_(0, self.nodes.flatten(), shares).numpy()
+        return shares.new_zeros(count).index_add_(0, self.nodes.flatten(), shares)
 
 
 @dataclass(frozen=True)

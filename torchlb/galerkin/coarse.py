@@ -130,7 +130,8 @@ def boundary_shares(points: Points, ends: Int[Tensor, "G 2"], cover: Cover) -> F
         where.append(share.gather(1, nearest[:, None])[:, 0])
         who.append(x)
     edge, where, who = torch.cat(edge), torch.cat(where), torch.cat(who)
-    order = torch.from_numpy(np.lexsort((where.detach().numpy(), edge.numpy())))
+    order = where.argsort(stable=True)
+    order = order[edge[order].argsort(stable=True)]
     edge, where, who = edge[order], where[order], who[order]
     piece = torch.where(edge[1:] == edge[:-1], where.diff() * square.sqrt()[edge[1:]], 0.0) / 2
     return result.index_add_(0, who[1:], piece).index_add_(0, who[:-1], piece)

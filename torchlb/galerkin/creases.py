@@ -20,7 +20,7 @@ from torch import Tensor
 from torchlb.galerkin.assembly import Elements
 from torchlb.galerkin.delaunay import sound_lengths
 from torchlb.galerkin.elements import edge_lengths
-from torchlb.galerkin.forms import Forms
+from torchlb.galerkin.forms import Forms, times
 from torchlb.galerkin.medium import orthonormal
 from torchlb.geometry.complex import consistently_wound
 from torchlb.geometry.frames import summed_normals, summed_projectors, vertex_normals
@@ -60,19 +60,17 @@ def across_creases(
     """The elements for the derivatives of fields: in the place of the creased cells, flat ones with `turns`."""
     if not creased.any():
         return forms
-    gone, curved, share = creased.double().numpy(), forms.lots[0], 1.0
+    gone, curved, share = creased.double(), forms.lots[0], 1.0
     if isinstance(curved.share, Tensor):  # cells that overlap
-        share = torch.from_numpy(curved.mix.T @ curved.share.numpy())[creased]
+        share = times(curved.mix.T, curved.share)[creased]
     lots = [
-        lot
-        if lot.mix is None
-        else replace(lot, share=lot.share * torch.from_numpy(1 - lot.mix @ gone))
+        lot if lot.mix is None else replace(lot, share=lot.share * (1 - times(lot.mix, gone)))
         for lot in forms.lots
     ]
     own, points = cells[creased], forms.places[: len(frames)]
     lengths = sound_lengths(edge_lengths(points, own), own)
     mix: Any = sparse.eye_array(len(cells), format="csr")
-    flat = Elements.flat(own, lengths, share=share, mix=mix[creased.numpy()])
+    flat = Elements.flat(own, lengths, share=share, mix=mix[creased.cpu().numpy()])
     a = orthonormal(flat.slopes(points)[:, 0]).mT[:, None] @ at(frames, own)
     turns = _nearest(a, _sides(points, cells, frames, own)) @ at(frames, own).mT
     lots.append(replace(flat, turns=turns))

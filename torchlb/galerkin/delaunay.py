@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from typing import Any, NamedTuple
 
+import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
 from scipy import sparse
@@ -41,13 +42,12 @@ class Cover(NamedTuple):
         one: Any = sparse.eye_array(count, format="csr")
         result: Any = sparse.vstack([one, one], format="csr")
         for pair, share in self.shares:
-            same = torch.ones(2 * count, dtype=torch.float64)
-            same[pair.flatten()] = 0
-            row = torch.cat([torch.arange(2 * count), pair[:, [0, 0, 1, 1]].flatten()])
-            col = torch.cat([torch.arange(2 * count), pair[:, [0, 1, 0, 1]].flatten()])
-            weight = torch.stack([share, 1 - share, share, 1 - share], 1).flatten()
-            where = row.numpy(), col.numpy()
-            result = sparse.csr_array((torch.cat([same, weight.detach()]).numpy(), where)) @ result
+            same, pair, share = np.ones(2 * count), pair.cpu().numpy(), share.detach().cpu().numpy()
+            same[pair] = 0
+            row = np.append(np.arange(2 * count), pair[:, [0, 0, 1, 1]])
+            col = np.append(np.arange(2 * count), pair[:, [0, 1, 0, 1]])
+            weight = np.append(same, np.stack([share, 1 - share, share, 1 - share], 1))
+            result = sparse.csr_array((weight, (row, col))) @ result
         return result
 
 
@@ -59,7 +59,8 @@ def mollified(sides: Float[Tensor, "F 3"], faces: Int[Tensor, "F 3"]) -> Float[T
     spare = sides.sum(1) - 2 * sides.amax(1)
     if bool((spare >= SINGLE * sides.amax()).all()):
         return sides
-    piece = torch.from_numpy(pieces_of(faces.numpy(), int(faces.max()) + 1))[faces[:, 0]]
+    piece = pieces_of(faces.cpu().numpy(), int(faces.max()) + 1)
+    piece = torch.from_numpy(piece).to(faces)[faces[:, 0]]
     number = torch.bincount(piece).clamp_min(1)
     mean = torch.zeros(len(number), dtype=sides.dtype).index_add_(0, piece, sides.mean(1)) / number
     lack = torch.zeros_like(mean).scatter_reduce_(0, piece, SINGLE * mean[piece] - spare, "amax")

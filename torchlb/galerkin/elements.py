@@ -17,6 +17,7 @@ from torch.nn.functional import pad
 
 from torchlb.fits.polynomials import monomial_derivatives, monomials
 from torchlb.geometry.vectors import Points, at
+from torchlb.linalg.devices import constant
 
 
 class Element(NamedTuple):
@@ -60,7 +61,7 @@ def edge_lengths(points: Points, cells: Int[Tensor, "T corners"]) -> Float[Tenso
     return (at(points, cells[:, second]) - at(points, cells[:, first])).norm(dim=2)
 
 
-@cache
+@constant
 def inner(size: int, degree: int) -> Float[Tensor, "n size"]:
     """Barycentric coordinates of the nodes inside a simplex with `size` corners.
 
@@ -75,7 +76,7 @@ def inner(size: int, degree: int) -> Float[Tensor, "n size"]:
     return torch.tensor(rows, dtype=torch.float64).view(-1, size) / degree
 
 
-@cache
+@constant
 def lattice(dim: int, degree: int) -> Float[Tensor, "n corners"]:
     """Barycentric coordinates of all nodes: corners, then nodes inside each edge, inside each triangle, and so on.
 
@@ -91,7 +92,7 @@ def lattice(dim: int, degree: int) -> Float[Tensor, "n corners"]:
     return torch.cat(rows)
 
 
-@cache
+@constant
 def facet_nodes(dim: int, degree: int) -> Int[Tensor, "facets n"]:
     """Indices into `lattice` of the nodes of each facet, in the order of the lattice of dimension d − 1.
 
@@ -106,7 +107,7 @@ def facet_nodes(dim: int, degree: int) -> Int[Tensor, "facets n"]:
     return torch.stack(places)
 
 
-@cache
+@constant
 def simplex(dim: int, degree: int) -> Element:
     """Lagrange element of dimension d and degree r ≥ 1, with its nodes on `lattice`.
 

@@ -63,7 +63,7 @@ class Forms:
         """Build flat P1 elements, whose stiffness for κ = 1 is the cotangent matrix, with this lumped mass."""
         ones = torch.ones_like(mass)
         own = Elements.flat(faces, edge_lengths(points, faces), lumped=ones)
-        area = torch.from_numpy(own.matrices().row_sums(len(points)))
+        area = own.matrices().row_sums(len(points))
         mix, same = (sparse.eye_array(len(x), format="csr") for x in (faces, points))
         own = replace(own, mix=mix, lumped=mass / area)
         return cls(torch.arange(len(points)), points, same, [own], own)
@@ -205,12 +205,16 @@ class _Times(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, matrix: Any, x: Tensor) -> Tensor:  # pyright: ignore[reportIncompatibleMethodOverride]
         ctx.matrix = matrix
-        return torch.from_numpy(np.asarray(matrix @ x.detach().numpy()))
+        return _product(matrix, x)
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, g: Tensor) -> tuple[Any, ...]:  # pyright: ignore[reportIncompatibleMethodOverride]
-        return None, torch.from_numpy(np.asarray(ctx.matrix.T @ g.numpy()))
+        return None, _product(ctx.matrix.T, g)
+
+
+def _product(matrix: Any, x: Tensor) -> Tensor:
+    return torch.from_numpy(np.asarray(matrix @ x.detach().cpu().numpy())).to(x)
 
 
 times: Any = _Times.apply

@@ -86,8 +86,8 @@ class PairMatrices(Csr):
         edge = open_sides(cells)[0].unique()
         if len(self.values) < 3 or not (a[edge] > 0).any():
             return self
-        nearest = torch.from_numpy(KDTree(points[edge].numpy()).query(points.numpy())[1])
-        a = a[edge][nearest].index_copy(0, edge, a[edge])
+        nearest = KDTree(points[edge].cpu().numpy()).query(points.cpu().numpy())[1]
+        a = a[edge][torch.from_numpy(nearest).to(edge)].index_copy(0, edge, a[edge])
         boundary, near = self.values[2], self.linear
         sums, sizes = (
             torch.zeros_like(a).index_add(0, self.row, b) for b in (boundary, boundary.abs())

@@ -12,6 +12,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from scipy import sparse
 from torch import Tensor
+from torch.nn.functional import pad
 
 from torchlb.errors import first_few, warn
 from torchlb.galerkin.assembly import (
@@ -26,6 +27,7 @@ from torchlb.galerkin.boundary import boundary_nodes
 from torchlb.galerkin.coarse import boundary_shares
 from torchlb.galerkin.curving import CurvedMesh, CurvingPlan, curve
 from torchlb.galerkin.delaunay import sound_lengths
+from torchlb.galerkin.device import congruence, entries_of, summed_entries, without_row_sums
 from torchlb.galerkin.elements import edge_lengths, simplex
 from torchlb.galerkin.forms import BilinearForm, Forms
 from torchlb.galerkin.matrices import PairMatrices
@@ -36,6 +38,7 @@ from torchlb.geometry.local_fits import FitPlan, LocalFits
 from torchlb.geometry.numbering import Numbering
 from torchlb.linalg.csr import Csr
 from torchlb.linalg.precision import LOW
+from torchlb.linalg.sparse import to_scipy
 
 
 @dataclass(frozen=True)
@@ -127,9 +130,9 @@ class PairPlan:
         parts, flats = (nodes.cells, mesh.lengths, nodes.elements, mesh.metric), []
         if mesh.cover is not None:
             cover, beside = mesh.cover, {"share": 0.5, "lumped": torch.ones(count).double()}
-            beside["mix"] = cover.mixed() @ mix[plan.coarse.numpy()]
+            beside["mix"] = cover.mixed() @ mix[plan.coarse.cpu().numpy()]
             flats.append(Elements.flat(cover.faces, cover.lengths, **beside))
-            parts, mix = (x[own] for x in parts), mix[own.numpy()]
+            parts, mix = (x[own] for x in parts), mix[own.cpu().numpy()]
             shares = None if shares is None else shares[own]
         if len(stars):
             lengths = sound_lengths(edge_lengths(fits.points, stars), stars)
@@ -209,6 +212,9 @@ class PairPlan:
         self, fits: LocalFits, mesh: CurvedMesh, numbering: Numbering | None
     ) -> tuple[PairMatrices, Float[Tensor, " N"], Int[Tensor, " L"]]:
         """The matrices in the user's numbers, and the lumped mass with the rows of P lowered for it."""
+        if fits.points.device.type != "cpu":
+            assert numbering is not None
+            return self._assembled_on_device(fits, mesh, numbering)
         forms = self.forms(fits, mesh)
         p, count = forms.prolongation, len(fits.points)
         given = torch.arange(count) if numbering is None else numbering.given
@@ -217,9 +223,9 @@ class PairPlan:
         own, linear, *flats = (lot.matrices() for lot in lots)
         del forms, lots, mesh  # some of these are as large as the pair
         fits.let_go()
-        weights = own.row_sums(p.shape[0])
-        mass, lowered = positive_mass(p, weights, self, linear.row_sums(count))
-        mass += sum(lot.row_sums(count) for lot in flats)
+        weights = own.row_sums(p.shape[0]).numpy()
+        mass, lowered = positive_mass(p, weights, self, linear.row_sums(count).numpy())
+        mass += sum(lot.row_sums(count).numpy() for lot in flats)
         same: Any = sparse.eye_array(count, format="csr")
         near, upper = upper_congruence(same, [linear, *flats]), upper_congruence(p, [own, *flats])
         del p, own, linear, flats
@@ -231,6 +237,36 @@ class PairPlan:
         whole = found["whole"].beside([] if boundary is None else [boundary], given.numpy())
         matrices = PairMatrices(whole.crow, whole.col, whole.values, found["linear"])
         return matrices, torch.from_numpy(mass), lowered
+
+    def _assembled_on_device(
+        self, fits: LocalFits, mesh: CurvedMesh, numbering: Numbering
+    ) -> tuple[PairMatrices, Float[Tensor, " N"], Int[Tensor, " L"]]:
+        """As `assembled`, on the device of the points; the few rows of P to be lowered are found on the CPU."""
+        forms, shape = self.forms(fits, mesh, prolong=False), (len(mesh.places), len(fits.points))
+        row, length, col, value = Prolongation(self.fits, fits, self.curving, mesh).entries()
+        parts = [(row.repeat_interleave(length), col.long(), value[:, None])]
+        crow, col, value = p = summed_entries(parts, shape)
+        size, count = shape
+        lots = forms.lots[0], forms.linear, *forms.lots[1:]
+        own, linear, *flats = (lot.matrices() for lot in lots)
+        sums = own.row_sums(size), linear.row_sums(count)
+        weights, least = (x.cpu().numpy() for x in sums)
+        mass, lowered = positive_mass(to_scipy(crow, col, value[:, 0], shape), weights, self, least)
+        mass = torch.from_numpy(mass).to(value) + sum(lot.row_sums(count) for lot in flats)
+        given, every = numbering.given, torch.arange(count)
+        parts = [entries_of(nodes, torch.view_as_real(blocks)) for nodes, blocks in (own, *flats)]
+        if len(self.curving.nodes.boundary()[0]):
+            rim, shares = boundary_elements(self.curving, mesh)
+            blocks = (rim.element.weights * area_element(rim.metric)) @ squares(rim.element)
+            parts = [(row, col, pad(values, (0, 1))) for row, col, values in parts]
+            parts += [entries_of(rim.nodes, pad(blocks[..., None], (2, 0)))]
+            parts += [(every, every, pad(shares[:, None], (2, 0)))]
+        p = summed_entries([(Csr(*p).row, given[col], value)], shape)
+        whole = without_row_sums(congruence(p, summed_entries(parts, (size, size)), count))
+        parts = [entries_of(given[n], torch.view_as_real(blocks)) for n, blocks in (linear, *flats)]
+        near = without_row_sums(summed_entries(parts, (count, count)))
+        matrices = PairMatrices(whole.crow, whole.col, whole.values, near)
+        return matrices, mass, lowered.to(given)
 
     @property
     def counts(self) -> Int[Tensor, "4 N"]:
@@ -278,13 +314,13 @@ def positive_mass(
     by linear ones; this terminates, since linear rows contribute nothing negative. Return also the nodes of these rows.
     """
     nodes, count, mass = plan.curving.nodes, p.shape[1], p.T @ weights
-    taking, lowered = count + plan.lowered.numpy(), np.zeros(p.shape[0], dtype=bool)
+    taking, lowered = count + plan.lowered.cpu().numpy(), np.zeros(p.shape[0], dtype=bool)
     left: Any = None
     while True:
         lowered[taking] = True
-        shares = nodes.shares.numpy()[taking - count] * weights[taking, None]
+        shares = nodes.shares.cpu().numpy()[taking - count] * weights[taking, None]
         mass -= p[taking].T @ weights[taking]
-        np.add.at(mass, nodes.corners.numpy()[taking - count], shares)
+        np.add.at(mass, nodes.corners.cpu().numpy()[taking - count], shares)
         few = np.flatnonzero(mass < LOW * linear)
         if len(few) == 0:
             break

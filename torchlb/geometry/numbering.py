@@ -50,12 +50,15 @@ class Numbering:
 
     def restored_pattern(
         self, crow: Int[Tensor, " N_plus_1"], col: Int[Tensor, " nnz"]
-    ) -> tuple[Int[Tensor, " N_plus_1"], Int[Tensor, " nnz"], Int[Tensor, " nnz"]]:
-        """Sparse (N, N) pattern in the user's numbers, columns ascending, and the position of its entries in `col`."""
+    ) -> tuple[Int[Tensor, " nnz"], Int[Tensor, " nnz"]]:
+        """Columns of a sparse (N, N) pattern in the user's numbers, ascending, and their positions in `col`."""
+        if col.device.type != "cpu":
+            row = self.given.repeat_interleave(crow.diff())
+            key, order = (row * len(self.given) + self.given[col]).sort()
+            return key % len(self.given), order
         count, given = len(self.given), self.given.int().numpy()
         parts = np.arange(len(col), dtype=np.int32), given[col.numpy()], crow.numpy()
         turned: Any = sparse.csr_array(sparse.csr_array(parts, shape=(count, count)).T)
         turned.indices = given[turned.indices]
         whole: Any = sparse.csr_array(turned.T)  # transposing has sorted the columns
-        found = whole.indptr.astype(np.int64), whole.indices.astype(np.int64), whole.data
-        return torch.from_numpy(found[0]), torch.from_numpy(found[1]), torch.from_numpy(found[2])
+        return torch.from_numpy(whole.indices.astype(np.int64)), torch.from_numpy(whole.data)

@@ -5,4 +5,5 @@ compiled loops. `sparse`: differentiable products with CSR matrices. `csr`: stor
 `factor`: sparse Cholesky and LU. `lanczos`: eigenpairs of a symmetric pencil. `conjugate_gradients`: solves with many
 right-hand sides. `two_grid`: their preconditioner. `exponential`: e^{tL}x by a Chebyshev or a rational series, with
 derivatives. `once`: an error for second derivatives that do not exist. `threads`: one thread for small tensors.
+`devices`: data and constants on a device.
 """

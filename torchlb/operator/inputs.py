@@ -39,8 +39,10 @@ def warn_of_gradients(points: ArrayLike, what: str) -> None:
         )
 
 
-def check_points(points: ArrayLike, what: str = "points") -> Float[Tensor, "N n"]:
-    """Points as (N, n) float64 on the CPU, detached; ValueError for a wrong shape or type, no points, NaN, infinity."""
+def check_points(
+    points: ArrayLike, what: str = "points", device: str | torch.device = "cpu"
+) -> Float[Tensor, "N n"]:
+    """Points as (N, n) float64 on a device, detached; ValueError for a wrong shape or type, none, NaN, infinity."""
     try:
         points = as_tensor(points)
     except (TypeError, ValueError, RuntimeError) as error:
@@ -61,7 +63,7 @@ def check_points(points: ArrayLike, what: str = "points") -> Float[Tensor, "N n"
         )
     if points.is_complex() or points.dtype == torch.bool:
         raise InputError(f"{what}: expected real numbers, got {points.dtype}")
-    points = points.detach().to("cpu", torch.float64, copy=True)  # the operator keeps it
+    points = points.detach().to(device, torch.float64, copy=True)  # the operator keeps it
     if len(bad := (~points.isfinite()).any(1).nonzero()[:, 0]):
         raise InputError(
             f"{what}: {len(bad)} are NaN or infinite ({first_few(bad)}); remove or repair them"

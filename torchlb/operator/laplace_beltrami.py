@@ -241,8 +241,9 @@ class LaplaceBeltrami(StencilMethods, PairMethods):
     def at(self, points: ArrayLike) -> LaplaceBeltrami:
         """The operator of the shape moved to other points, by the same decisions: neighbours, degrees, cells.
 
-        Takes about half the time of a build. It is meant for points that moved a little, as in an animation or
-        a flow; for others the decisions may not fit, and `from_mesh` or `from_points` makes new ones.
+        It is computed on the operator's device, in about half the time of a build. It is meant for points that moved a
+        little, as in an animation or a flow; for others the decisions may not fit, and `from_mesh` or `from_points`
+        makes new ones.
 
         Parameters
         ----------
@@ -259,7 +260,7 @@ class LaplaceBeltrami(StencilMethods, PairMethods):
         >>> ratio[1:].round(decimals=6).tolist()
         [0.25, 0.25, 0.25]
         """
-        there = inputs.check_points(points)
+        there = inputs.check_points(points, device=self.device)
         if there.shape != self.points.shape:
             raise InputError(
                 f"points: expected {tuple(self.points.shape)}, as the operator has, got {tuple(there.shape)}"

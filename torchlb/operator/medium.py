@@ -103,10 +103,10 @@ def _check_values(name: str, x: Tensor) -> None:
         )
 
 
-def plain(medium: Medium) -> dict[str, Field]:
-    """The fields in float64 on the CPU, as leaves that require a gradient."""
+def plain(medium: Medium, device: str | torch.device = "cpu") -> dict[str, Field]:
+    """The fields in float64 on a device, as leaves that require a gradient."""
     return {
-        name: f._replace(values=f.values.detach().cpu().double().requires_grad_())
+        name: f._replace(values=f.values.detach().to(device).double().requires_grad_())
         for name, f in medium.items()
     }
 

@@ -34,6 +34,7 @@ from torchlb.geometry.numbering import Numbering
 from torchlb.geometry.thresholds import CREASE, FACTOR
 from torchlb.geometry.vectors import Points
 from torchlb.linalg.csr import Csr, Record
+from torchlb.linalg.devices import default, moved
 from torchlb.linalg.threads import threads_for
 from torchlb.operator.report import FIELDS
 from torchlb.stencils.assemble import Stencils
@@ -56,7 +57,8 @@ class Plan:
     stencils, `rows`, None with a certificate; and of the weak pair, a `PairPlan`, None without. `flips` lead to the
     Delaunay triangles of the low-order rows. `faces`, (F, d + 1), are the user's; `order`, (G,), has the index among
     these of each cell of the plan; `moved` are points of a noisy curve that were moved. `source` and `options` are
-    those of the operator. `warned` are the lines of a program that were told of points that moved too far.
+    those of the operator. `warned` are the lines of a program that were told of points that moved too far; `elsewhere`
+    has the plan on other devices.
     """
 
     numbering: Numbering
@@ -71,6 +73,15 @@ class Plan:
     source: str
     options: Options
     warned: set[Any] = field(default_factory=set)
+    elsewhere: dict[torch.device, Plan] = field(default_factory=dict)
+
+    def on(self, device: torch.device) -> Plan:
+        """The plan with its tensors on a device, which is kept."""
+        if device == self.points.device:
+            return self
+        if device not in self.elsewhere:
+            self.elsewhere[device] = moved(replace(self, elsewhere={}), device)
+        return self.elsewhere[device]
 
     def forms(self, points: Points) -> Forms:
         """The elements of the weak pair at the user's points, in the user's numbering."""
@@ -91,6 +102,9 @@ class Plan:
         The forms are of tangent fields if `tangent`, given by their components in the frames, (N d, C). Raises
         DerivativeError for a medium on the faces of coarse triangles, which flips mix.
         """
+        own = self.on(points.device)
+        if own is not self:
+            return own.bilinear(points, forms, medium, tangent=tangent)
 
         @cache  # a function that stands in two forms is one
         def sort(f: Tensor) -> Tensor:
@@ -121,6 +135,9 @@ class Plan:
 
         Differentiable in points and mass, but for a turn of each frame in its plane.
         """
+        own = self.on(points.device)
+        if own is not self:
+            return own.rows_at(points, mass)
         placed, _ = self.shape.at(self._sorted(points))
         rows, _ = self._rows(placed, self.numbering.sorted(mass))
         found = [placed.frames]
@@ -158,14 +175,17 @@ class Plan:
 
 
 def evaluate(plan: Plan, points: Points) -> Parts:
-    """An operator by its plan at points, float64 on the CPU; InputError with a certificate or moved points."""
-    here = plan._sorted(points)
-    with renumbered(plan.numbering.given), threads_for(len(points)):
-        placed, fits = plan.shape.at(here)
-        pair_plan, pair, mass = plan.pair.at(fits, plan.numbering, plan.warned)
-        rows, shape = plan._rows(placed, mass)
-    plan = plan if pair_plan is plan.pair else replace(plan, pair=pair_plan)
-    return operator_parts(plan, points, rows, shape, pair)
+    """An operator by its plan at points, float64, on their device; InputError with a certificate or moved points."""
+    own = plan.on(points.device)
+    with renumbered(plan.numbering.given), threads_for(len(points)), default(points.device):
+        placed, fits = own.shape.at(own._sorted(points))
+        pair_plan, pair, mass = own.pair.at(fits, own.numbering, plan.warned)
+        rows, shape = own._rows(placed, mass)
+        parts = operator_parts(own, points, rows, shape, pair)
+    if pair_plan is not own.pair:
+        lowered = pair_plan.lowered.to(plan.points.device)
+        plan = replace(plan, pair=replace(plan.pair, lowered=lowered), elsewhere={})
+    return parts | {"_plans": [plan]}
 
 
 def operator_parts(
@@ -200,7 +220,7 @@ def operator_parts(
     if pair is not None:
         condition = options.held
         if condition is not None and condition.share is not None and "_on_boundary" in parts:
-            a = condition.share * parts["_on_boundary"].to(points)
+            a = torch.as_tensor(condition.share).to(points) * parts["_on_boundary"].to(points)
             pair = pair.absorbing(points, plan.faces, a)
         parts["weak"] = pair
     return parts
@@ -226,7 +246,8 @@ def shape_operators(placed: Placed, rows: Rows, order: Int[Tensor, " N"]) -> Flo
 
 def check_fit(plan: Plan, after: Points) -> None:
     """Warn, once a line of a program, of edges that changed by more than `FACTOR`; InputError for inverted cells."""
-    before, cells = plan.points, plan.faces
+    here = plan.on(after.device)
+    before, cells = here.points, here.faces
     edges = cells[:, torch.tensor(subsets(cells.shape[1] - 1, 2))]
     one, two = (edge_lengths(x, cells) for x in (before, after))
     stretch = torch.where(one > 0, two / one, 1.0)
@@ -257,7 +278,8 @@ PARTS = [
 
 def packed(plans: Sequence[Plan | None]) -> Tensor:
     """The plans as bytes, (B,), on the CPU."""
-    plain = [p and replace(p, options=Options(**p.options.plain), warned=set()) for p in plans]
+    own = {"warned": set(), "elsewhere": {}}
+    plain = [p and replace(p, options=Options(**p.options.plain), **own) for p in plans]
     file = BytesIO()
     torch.save((__version__, plain), file)
     return torch.frombuffer(bytearray(file.getvalue()), dtype=torch.uint8)

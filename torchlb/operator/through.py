@@ -21,6 +21,7 @@ from torchlb.galerkin.forms import BilinearForm
 from torchlb.galerkin.matrices import PairMatrices
 from torchlb.galerkin.medium import Field
 from torchlb.linalg.csr import side_by_side, tensors_of
+from torchlb.linalg.devices import default
 from torchlb.linalg.once import once_differentiable
 from torchlb.linalg.precision import ROOT_EPS
 from torchlb.operator.batching import shapes_of
@@ -49,20 +50,26 @@ class _Origin(NamedTuple):
         every = [self.points, *(field.values for field in self.medium.values())]
         return [t for t in every if t.requires_grad]
 
+    @property
+    def device(self) -> torch.device:
+        """Where the forms are computed: where points are that require a gradient, else on the CPU."""
+        return self.points.device if self.points.requires_grad else torch.device("cpu")
+
     def gradient(self, forms: Sequence[BilinearForm]) -> list[Tensor]:
         """The derivative of a sum of forms in the variables; DerivativeError where it is not finite."""
-        medium, root = plain(self.medium), _root_of_absorption(self.weak)
+        medium, root = plain(self.medium, self.device), _root_of_absorption(self.weak)
         energies = [form for form in forms if form.name == "energy"]
         forms = [form for form in forms if form.name != "energy"]
         forms += [form._replace(name="stiffness") for form in energies]
         if "potential" in medium:
             forms += [form._replace(name="potential") for form in energies]
         if root is not None:
+            root = root.to(self.device)
             forms += [BilinearForm("boundary", root * w, root * u, c) for _, w, u, c, _ in energies]
         leaves = [f.values for name, f in medium.items() if self.medium[name].values.requires_grad]
-        points = self.points.detach().cpu().double().requires_grad_()
+        points = self.points.detach().double().requires_grad_()
         moved = [points] if self.points.requires_grad else []
-        with torch.enable_grad():
+        with torch.enable_grad(), default(self.device):
             assert self.bilinear is not None
             total = self.bilinear(*moved, forms, medium)
             found = [torch.zeros_like(leaf) for leaf in (*moved, *leaves)]
@@ -94,15 +101,14 @@ class Origins(list[_Origin]):
         """The derivative of a sum of bilinear forms in the variables."""
         sizes = [part.size for part in self]
         functions = {id(f): f for form in forms for f in (form.w, form.u)}
-        rows = {k: f.detach().cpu().double().split(sizes) for k, f in functions.items()}
+        rows = {k: f.detach().double().split(sizes) for k, f in functions.items()}
         found = []
         for s, part in enumerate(self):
             if part.variables:
-                own = [
-                    BilinearForm(f.name, rows[id(f.w)][s], rows[id(f.u)][s], f.c.cpu().double())
-                    for f in forms
-                ]
-                found += part.gradient(own)
+                own = {k: f[s].to(part.device) for k, f in rows.items()}
+                own |= {id(f.c): f.c.to(part.device).double() for f in forms}
+                parts = [f._replace(**{n: own[id(getattr(f, n))] for n in "wuc"}) for f in forms]
+                found += part.gradient(parts)
         return found
 
 
@@ -130,7 +136,7 @@ def _root_of_absorption(weak: PairMatrices) -> Tensor | None:
     """√a of a Robin condition, from R_ii = a_i B_ii; None for another condition."""
     if not weak.values[3:4].any():
         return None
-    values = weak.values[:, weak.row == weak.col].cpu().double()
+    values = weak.values[:, weak.row == weak.col].double()
     return torch.where(values[2] != 0, values[3] / values[2], 0.0).clamp_min(0).sqrt()[:, None]
 
 
@@ -192,22 +198,22 @@ def carrying(lb: Any, points: Any) -> Any:
             "points: they require gradients, which there are none of without a weak pair and of noisy curves, whose "
             "points are moved; pass points.detach() if results may be constants of them"
         )
-    plan, one = lb.plan, torch.ones(lb.num_points, 1, dtype=torch.float64)
+    plan, one = lb.plan, torch.ones_like(lb.mass.detach().double())[:, None]
     lb.points = own = points.to(lb.points).view_as(lb.points)  # a buffer is no Parameter
 
     def of_mass(g: Tensor) -> list[BilinearForm]:
         return [BilinearForm("lumped", one, g[:, None], one[0])]
 
     def of_rows(*grads: Tensor) -> list[Tensor]:
-        with torch.enable_grad():
-            leaves = [v.detach().cpu().double().requires_grad_() for v in variables]
+        with torch.enable_grad(), default(lb.device):
+            leaves = [v.detach().double().requires_grad_() for v in variables]
             found = plan.rows_at(leaves[0], (leaves[1:] or [mass])[0])
             scaled = [g.to(f) for g, f in zip(grads, found, strict=True)]
             gradients = torch.autograd.grad(found, leaves, scaled, materialize_grads=True)
         return [_finite(g).to(v) for g, v in zip(gradients, variables, strict=True)]
 
     (lb.mass,) = known(lb, [lb.mass], of_mass)
-    mass = lb.mass.detach().cpu().double()
+    mass = lb.mass.detach().double()
     of_robin = lb.weak.near.values[3:4].any()  # whose low-order rows have the mass in them
     variables = [own, lb.mass] if of_robin else [own]
     rows = [lb.stencil.values, lb.frames]
@@ -223,7 +229,7 @@ def through_product(lb: Any, name: Any, f: Tensor, result: Tensor) -> Tensor:
     if name == "laplacian" or origins(lb) is None:  # the values of Δ have derivatives of their own
         return result
     kind: Any = "boundary" if name == "boundary_mass" else name
-    other = side_by_side(f.detach().cpu().double())
+    other = side_by_side(f.detach().double())
 
     def forms(g: Tensor) -> list[BilinearForm]:
         return [BilinearForm(kind, side_by_side(g), other, torch.ones_like(other[0]))]

@@ -68,7 +68,7 @@ class Condition:
                 f"{self!r}: expected one a, or one of each of {count} points, got {len(self.share)}"
             )
         other = copy(self)
-        other.share = self.share[points]
+        other.share = self.share.to(points.device)[points]
         return other
 
     def finish(self, shape: Any, centers: Int[Tensor, " B"], rows: Rows) -> Rows:

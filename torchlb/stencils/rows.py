@@ -112,7 +112,7 @@ class Rows(Pattern):
 
     def restored(self, numbering: Numbering) -> Rows:
         """All rows, in the user's numbers."""
-        _, col, entry = numbering.restored_pattern(self.crow, self.col)
+        col, entry = numbering.restored_pattern(self.crow, self.col)
         return replace(self._taken(entry, numbering.here), col=col)
 
     @staticmethod
