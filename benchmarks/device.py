@@ -1,7 +1,7 @@
 """Seconds of solves where the tensors are: python benchmarks/device.py [--device cuda] [--sizes N ...]
 
-A star-shaped surface, order 3: eigenpairs, a flow, a step, a Poisson problem, tangent eigenfields, the operator at other
-points, and the derivative of eigenvalues in the points. Each is measured on the CPU, with one thread and with all, and
+A star-shaped surface, order 3: eigenpairs, a flow, a step, a Poisson problem, tangent eigenfields, the operator at
+other points, and the derivative of eigenvalues in them. Each is measured on the CPU, with one thread and with all, and
 on the device; the medians of the runs after a first one, factors and bases made anew each time. The last column has the
 largest difference of the results from the CPU's, relative to their largest entry. Without a device the columns of the
 CPU stand alone.
