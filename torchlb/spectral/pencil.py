@@ -80,7 +80,9 @@ def pencil_eigenbasis(
     units = length ** (dim - 2), length**dim
     given = stiffness, mass_matrix, *(linear or ())
     matrices = [_narrow(m, unit) for m, unit in zip(given, 2 * units, strict=False)]
-    component = csgraph.connected_components(_pattern(*matrices[:2]), directed=False)[1]
+    k1, m1 = matrices[-2:]  # connected where (K, M) is, with fewer entries
+    pattern = sparse.csr_array(abs(k1) + abs(m1))  # without those that are zero
+    component = csgraph.connected_components(pattern, directed=False)[1]
     areas = np.bincount(component, matrices[1].sum(axis=1))
     areas[component[losing]] = 0.0
     zeros = min(int((areas > 0).sum()), k)
@@ -88,7 +90,7 @@ def pencil_eigenbasis(
         tolerance = EPS
     elif tolerance is None:
         tolerance = min(ROOT_EPS * k**2, SMALL)
-    parts = _parts(matrices, fixed, component, areas) if zeros < k else []
+    parts = _parts(matrices, pattern, fixed, component, areas) if zeros < k else []
     found = [_pairs(part, k, tolerance, mass.device) for part in parts]
     null = constants(component, areas, zeros)
     return _merged(
@@ -117,16 +119,14 @@ def constants(
     return values[component]
 
 
-def _pattern(k: Sparse, m: Sparse) -> Sparse:
-    """A matrix with the entries of both, without those that are zero."""
-    return sparse.csr_array(abs(k) + abs(m))
-
-
 def _parts(
-    matrices: list[Sparse], fixed: np.ndarray, component: np.ndarray, areas: np.ndarray
+    matrices: list[Sparse],
+    pattern: Sparse,
+    fixed: np.ndarray,
+    component: np.ndarray,
+    areas: np.ndarray,
 ) -> list[_Part]:
     """The components without fixed points, numbered by reverse Cuthill–McKee, which halves the time of products."""
-    pattern = _pattern(*matrices[-2:])  # of the P1 pair
     order = csgraph.reverse_cuthill_mckee(pattern, symmetric_mode=True)
     order = order[np.argsort(component[order], kind="stable")]
     parts = []
