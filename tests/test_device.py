@@ -4,6 +4,7 @@ import copy
 
 import pytest
 import torch
+from scipy import sparse
 
 from pretended import Pretended, PretendedDevice, held, registered
 from torchlb import (
@@ -19,7 +20,9 @@ from torchlb import (
     poisson_solve,
     vector_heat_flow,
 )
+from torchlb.galerkin.device import product
 from torchlb.linalg.factor import Factor
+from torchlb.linalg.sparse import from_scipy
 from torchlb.surfaces import CliffordTorus, Ellipsoid, SpaceCurve, UnitDisk
 
 cuda = pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device")
@@ -141,6 +144,16 @@ def test_gradients_of_eigenpairs_are_on_the_device(device):
     assert slope.device.type == device
     assert slope.isfinite().all()
     assert (slope != 0).any()
+
+
+@pytest.mark.parametrize("terms", [8, 64, 10**8])
+def test_products_of_sparse_matrices_in_parts(monkeypatch, terms):
+    monkeypatch.setattr("torchlb.galerkin.device.BYTES", terms // 8)
+    a, b = (sparse.random_array(shape, density=0.1, rng=0) for shape in ((30, 20), (20, 10)))
+    one, two = ((*x[:2], x[2][:, None]) for x in map(from_scipy, (a, b)))
+    crow, col, values = product(one, two, 10)
+    found = sparse.csr_array((values[:, 0], col, crow), shape=(30, 10))
+    assert abs(found - a @ b).max() < 1e-15
 
 
 @pytest.mark.parametrize("kind", MOVED)

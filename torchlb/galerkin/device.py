@@ -6,12 +6,14 @@ A matrix is a tuple (crow, col, values) in CSR, with values (nnz, c) of c matric
 from __future__ import annotations
 
 from collections.abc import Iterable
+from itertools import pairwise
 
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
 from torchlb.linalg.csr import Csr
+from torchlb.linalg.precision import BYTES
 from torchlb.linalg.sparse import csr_tensor, transpose_pattern
 
 Matrix = tuple[Int[Tensor, " rows_plus_1"], Int[Tensor, " nnz"], Float[Tensor, "nnz c"]]
@@ -42,19 +44,34 @@ def summed_entries(parts: Iterable[Entries], shape: tuple[int, int]) -> Matrix:
 
 def congruence(p: Matrix, a: Matrix, count: int) -> Matrix:
     """PᵀAP of symmetric matrices, symmetric to the last digit; P has `count` columns."""
-    size = len(p[0]) - 1
     crow, col, order = transpose_pattern(p[0], p[1], count)
-    values = p[2][:, 0]
-    left, right = csr_tensor(crow, col, values[order], size), csr_tensor(*p[:2], values, count)
+    left = crow, col, p[2][order]
     found = []
     for values in a[2].T:
-        whole = left @ csr_tensor(*a[:2], values.contiguous(), size) @ right
-        row = torch.arange(count).repeat_interleave(whole.crow_indices().diff())
-        entries = row, whole.col_indices(), whole.values()[:, None]
-        found.append(summed_entries([entries], (count, count)))
+        half = product(left, (*a[:2], values[:, None]), len(p[0]) - 1)
+        found.append(product(half, p, count))
     crow, col, _ = found[0]
     values = torch.cat([part[2] for part in found], 1)
     return crow, col, (values + values[transpose_pattern(crow, col, count)[2]]) / 2
+
+
+def product(a: Matrix, b: Matrix, count: int) -> Matrix:
+    """AB of single matrices; B has `count` columns.
+
+    Rows of A are multiplied by some 10⁸ terms at once: CUDA takes room for all of them, and counts them in 32 bits.
+    """
+    crow, col, values = a
+    terms = torch.cat([crow.new_zeros(1), b[0].diff()[col].cumsum(0)])[crow]
+    _, rows = torch.unique_consecutive(terms[:-1] // (8 * BYTES), return_counts=True)
+    right, parts = csr_tensor(b[0].int(), b[1].int(), b[2][:, 0].contiguous(), count), []
+    for first, last in pairwise([0, *rows.cumsum(0).tolist()]):
+        own = crow[first : last + 1]
+        some = slice(*own[[0, -1]].tolist())
+        left = (own - own[0]).int(), col[some].int(), values[some, 0].contiguous()
+        part = csr_tensor(*left, len(b[0]) - 1) @ right
+        row = torch.arange(first, last).repeat_interleave(part.crow_indices().diff())
+        parts.append((row, part.col_indices().long(), part.values()[:, None]))
+    return summed_entries(parts, (len(crow) - 1, count))
 
 
 def without_row_sums(matrix: Matrix) -> Csr:
