@@ -16,9 +16,9 @@ from torchlb.linalg.csr import Csr
 from torchlb.linalg.precision import BYTES
 from torchlb.linalg.sparse import csr_tensor, transpose_pattern
 
-Matrix = tuple[Int[Tensor, " rows_plus_1"], Int[Tensor, " nnz"], Float[Tensor, "nnz c"]]
-Entries = tuple[Int[Tensor, " e"], Int[Tensor, " e"], Float[Tensor, "e c"]]
-"""Rows, columns and values."""
+Matrix = tuple[Int[Tensor, " _"], Int[Tensor, " _"], Float[Tensor, "_ _"]]
+Entries = tuple[Int[Tensor, " _"], Int[Tensor, " _"], Float[Tensor, "_ _"]]
+"""Rows, columns and values, (e, c)."""
 
 
 def entries_of(nodes: Int[Tensor, "T n"], blocks: Float[Tensor, "T n_times_n c"]) -> Entries:
