@@ -403,6 +403,9 @@ def test_collate_joins_operators_features_and_faces():
     assert y.shape == (2, 4)
     with pytest.raises(ValueError, match="collate: expected samples"):
         collate([(1, 2), (3, 4)])
+    for samples in ([{"lb": lb, "x": x}, {"lb": lb}], [(lb, x), (lb,)], [(lb, x), {"lb": lb}]):
+        with pytest.raises(InputError, match="collate: expected tuples, or dicts with the same"):
+            collate(samples)
 
 
 def test_collate_knows_rows_of_faces_and_edges_and_names_the_key_that_it_cannot_join():

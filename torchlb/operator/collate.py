@@ -39,17 +39,24 @@ def collate(samples: Sequence[Any]) -> Any:
     if isinstance(first, LaplaceBeltrami):
         return LaplaceBeltrami.batch(samples)
     named = hasattr(first, "_asdict")  # a namedtuple, whose fields are keys
-    rows = [sample._asdict() for sample in samples] if named else samples
-    keys = list(rows[0]) if isinstance(rows[0], Mapping) else range(len(first))
-    columns = {key: [row[key] for row in rows] for key in keys}
-    operators = [c for c in columns.values() if isinstance(c[0], LaplaceBeltrami)]
+    try:
+        rows = [sample._asdict() for sample in samples] if named else samples
+        keys = list(rows[0]) if isinstance(rows[0], Mapping) else range(len(first))
+        columns = {key: [row[key] for row in rows] for key in keys}
+    except (AttributeError, LookupError, TypeError) as error:
+        raise InputError(
+            f"collate: expected tuples, or dicts with the same keys, got {shown(samples)}"
+        ) from error
+    operators = [
+        c for c in columns.values() if all(isinstance(each, LaplaceBeltrami) for each in c)
+    ]
     if not operators:
         raise InputError(
             f"collate: expected samples that are tuples or dicts with a LaplaceBeltrami, got {type(first).__name__}"
         )
     counts = [[lb.num_points for lb in operators[0]]]
     for key in INDICES:
-        if all(isinstance(each, Tensor) for each in columns.get(key, [None])):
+        if all(isinstance(each, Tensor) and each.ndim for each in columns.get(key, [None])):
             counts.append([len(each) for each in columns[key]])
     joined = {key: _joined(key, column, counts) for key, column in columns.items()}
     if named:
