@@ -103,7 +103,7 @@ MOVED = {
     "coarse": lambda: LaplaceBeltrami.from_mesh(*annulus(24)),
     "cloud": lambda: LaplaceBeltrami.from_points(Ellipsoid().points(300)),
     "curve": lambda: LaplaceBeltrami.from_points(SpaceCurve().points(80), dim=1),
-    "solid": lambda: LaplaceBeltrami.from_points(shaken_grid(6), dim=3),
+    "solid": lambda: LaplaceBeltrami.from_points(shaken_grid(5), dim=3),
     "in R⁴": lambda: LaplaceBeltrami.from_mesh(*CliffordTorus().mesh(300)),
 }
 OF_ONE = {"moved", "hodge_decomposition"}
@@ -122,6 +122,8 @@ def shapes():
 def test_results_are_on_the_device_and_those_of_the_cpu(shapes, device, shape, name):
     if shape == "batch" and name in OF_ONE:
         pytest.skip("for one shape")
+    if shape == "closed" and device == "pretended" and name not in OF_ONE:
+        pytest.skip("slow, and in the batch")
     lb = shapes[shape]
     f = lb.points[:, :2].exp()
     found = CALLS[name](copy.deepcopy(lb).to(device), f.to(device))
@@ -160,6 +162,8 @@ def test_products_of_sparse_matrices_in_parts(monkeypatch, terms):
 @pytest.mark.filterwarnings("ignore:.*low-order rows")
 def test_an_operator_at_other_points_is_made_where_they_are(device, kind):
     """With its derivatives; ten digits are left after two of them in a fit along normals."""
+    if device == "cpu":
+        pytest.skip("tested elsewhere")
     built = MOVED[kind]()
     points = 1.02 * built.points + 1e-3 * (3 * built.points).sin()
 
