@@ -10,6 +10,7 @@ from pretended import Pretended, PretendedDevice, held, registered
 from torchlb import (
     LaplaceBeltrami,
     Robin,
+    TorchlbWarning,
     geodesic_distance,
     heat_flow,
     heat_kernel_signature,
@@ -183,3 +184,21 @@ def test_an_operator_at_other_points_is_made_where_they_are(device, kind):
             scale = float(tensor.double().abs().nan_to_num().max()) if tensor.numel() else 0.0
             close = {"rtol": 1e-9, "atol": 1e-9 * scale, "equal_nan": True}
             torch.testing.assert_close(tensors[name].cpu(), tensor, **close)
+
+
+def test_points_that_moved_too_far_are_told_on_a_device(device):
+    lb = LaplaceBeltrami.from_mesh(*Ellipsoid().mesh(300))
+    points = lb.points.clone()
+    points[::7] *= 1.3
+    with pytest.warns(TorchlbWarning, match="moved too far"):
+        copy.deepcopy(lb).to(device).at(points.to(device))
+
+
+def test_rows_are_differentiated_where_the_points_are(device):
+    """Also after the operator was moved."""
+    lb = LaplaceBeltrami.from_mesh(*Ellipsoid().mesh(300))
+    points = lb.points.clone().requires_grad_()
+    moved = lb.at(points).to(device)
+    (g,) = torch.autograd.grad(moved(lb.points.to(device)).square().sum(), points)
+    assert g.device.type == "cpu"
+    assert (g != 0).any()

@@ -243,6 +243,7 @@ def test_clouds(name, content, tmp_path):
     ("name", "content", "reason"),
     [
         ("a.pcd", PCD + "binary_compressed\n123", "data are binary_compressed; write them as"),
+        ("a.pcd", "FIELDS x y z\n1 2 3\n", "no line DATA"),
         ("a.txt", "Read me first.\n", "no rows of two or more numbers"),
         ("b.txt", "0 0 0\n1 0 0\n1 1\n", "rows of 3 numbers and of others"),
         ("b.csv", "id,x,y,z\n1,2,3\n", r"4 names of columns \(id, x, y, z\) and rows of 3 numbers"),

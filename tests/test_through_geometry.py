@@ -1,10 +1,13 @@
 """Derivatives in the points, at frozen decisions, of what follows from the weak pair, and of rows of Δ and ∇."""
 
 import functools
+import gc
+import weakref
 
 import numpy as np
 import pytest
 import torch
+import trimesh
 from scipy.spatial import Delaunay
 
 from noise import noise
@@ -13,13 +16,14 @@ from torchlb import (
     ImplicitDiffusion,
     LaplaceBeltrami,
     Robin,
+    TorchlbWarning,
     geodesic_distance,
     heat_flow,
     heat_kernel_signature,
     implicit_step,
     poisson_solve,
 )
-from torchlb.surfaces import Ellipsoid, Hemisphere, Sphere, Torus
+from torchlb.surfaces import Ellipsoid, Hemisphere, Sphere, Torus, UnitDisk
 
 H = 1e-6
 
@@ -317,3 +321,71 @@ def test_derivatives_of_long_flows_of_modes_do_not_underflow(time):
     warmth = (x * heat_flow(moved, x, time, method="spectral", k=25)).sum()
     (g,) = torch.autograd.grad(warmth, moved.points)
     torch.testing.assert_close((g * x).sum(), 4 * time * warmth, rtol=1e-3, atol=0.0)
+
+
+@pytest.mark.usefixtures("unchecked")
+@pytest.mark.parametrize("shape", ["sphere", "icosphere", "disk"])
+def test_functions_of_equal_eigenvalues_have_derivatives(shape):
+    """Signatures and flows by whole eigenspaces, against differences, in points and in the density."""
+    count = 6 if shape == "disk" else 9  # the next eigenvalue is 0.6 or more away
+    if shape == "icosphere":  # eigenvalues agree to rounding
+        found = trimesh.creation.icosphere(2)
+        points, faces = torch.tensor(found.vertices), torch.tensor(found.faces)
+    else:
+        points, faces = (Sphere() if shape == "sphere" else UnitDisk()).mesh(300)
+    lb = LaplaceBeltrami.from_mesh(points, faces)
+    x, y, way = points[:, 0], points[:, 1], points * (points[:, :1] * points[:, 1:2] + 0.3)
+    density = 1 + 0.3 * x * y
+
+    def losses(lb):
+        basis = lb.eigenbasis(count, tolerance=1e-11)
+        warmth = (-0.2 * basis.eigenvalues).exp()
+        yield (warmth * basis.eigenvectors.square() * (x * y + x)[:, None]).sum()
+        yield (
+            y * basis.from_basis(warmth[:, None] * basis.to_basis(x[:, None] + y[:, None]))[:, 0]
+        ).sum()
+
+    leaf, field = points.clone().requires_grad_(), torch.ones_like(x).requires_grad_()
+    for variable, along, at in (
+        (leaf, way, lambda s: lb.at(points + s * way)),
+        (field, density, lambda s: lb.with_medium(density=1 + s * density)),
+    ):
+        here = lb.at(leaf) if variable is leaf else lb.with_medium(density=field)
+        pairs = zip(losses(at(1e-4)), losses(at(-1e-4)), strict=True)
+        for loss, (up, down) in zip(losses(here), pairs, strict=True):
+            (g,) = torch.autograd.grad(loss, variable, retain_graph=True)
+            expected = float(up - down) / 2e-4
+            assert float((g * along).sum()) == pytest.approx(expected, rel=2e-4, abs=1e-6)
+
+
+def test_close_eigenvalues_in_float32_are_told():
+    found = trimesh.creation.icosphere(2)
+    points = torch.tensor(found.vertices).float().requires_grad_()
+    moved = LaplaceBeltrami.from_mesh(points, torch.tensor(found.faces))
+    with pytest.warns(TorchlbWarning, match="agree with others to the rounding of torch.float32"):
+        moved.eigenbasis(4).eigenvectors.square().sum().backward()
+
+
+def test_operators_at_points_with_gradients_are_let_go(unchecked):
+    lb = built("closed")
+    moved = lb.at(lb.points.clone().requires_grad_())
+    moved(moved.points.detach()).sum().backward()
+    kept = weakref.ref(moved)
+    del moved
+    gc.collect()
+    assert kept() is None
+
+
+@pytest.mark.usefixtures("unchecked")
+def test_tensor_conductivities_have_the_gradient_of_differences_in_the_points():
+    lb = rough(*Ellipsoid().mesh(150))
+    points, way = lb.points, noise(*lb.points.shape)
+    a = torch.eye(3).double() * (1 + points[:, :1, None].square())
+
+    def loss(points):
+        return lb.at(points).with_medium(a).eigenbasis(5, tolerance=1e-11).eigenvalues[1:].sum()
+
+    x = points.clone().requires_grad_()
+    (g,) = torch.autograd.grad(loss(x), x)
+    expected = float(loss(points + H * way) - loss(points - H * way)) / (2 * H)
+    assert float((g * way).sum()) == pytest.approx(expected, rel=1e-5)

@@ -108,8 +108,8 @@ def in_cells(
     q, r = torch.linalg.qr(edges)
     q = torch.where(r.diagonal(dim1=-2, dim2=-1)[..., None, :] < 0, -q, q)
     places = {1: [[0]], 3: [[0, 1], [1, 2]], 6: [[0, 1, 2], [1, 3, 4], [2, 4, 5]]}
-    r = torch.linalg.cholesky_ex(g[..., places[g.shape[-1]]], upper=True).L.clone()
-    others = r.diagonal(dim1=-2, dim2=-1)[..., :-1].prod(-1)
+    root = torch.linalg.cholesky_ex(g[..., places[g.shape[-1]]], upper=True).L
+    others, r = root.diagonal(dim1=-2, dim2=-1)[..., :-1].prod(-1), root.clone()
     # rounded as for numbers: needles have hardly any area
     r[..., -1, -1] = area_element(g) / others
     one = torch.eye(r.shape[-1], dtype=r.dtype).expand_as(r)

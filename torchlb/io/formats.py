@@ -139,7 +139,10 @@ def _strip(corners: Int[np.ndarray, " C"]) -> Iterator[np.ndarray]:
 
 def read_pcd(path: Path) -> Polygons:
     """The points of a .pcd, ascii or binary, without those that are NaN."""
-    head, kind, data = re.split(rb"^DATA (\w+)\s*?\n", path.read_bytes(), maxsplit=1, flags=re.M)
+    parts = re.split(rb"^[ \t]*DATA[ \t]+(\w+)\s*?\n", path.read_bytes(), maxsplit=1, flags=re.M)
+    if len(parts) == 1:
+        raise InputError("it has no line DATA, after which points are expected")
+    head, kind, data = parts
     lines = map(str.split, head.decode("ascii", "replace").splitlines())
     header = {key: words for key, *words in filter(None, lines)}
     if kind == b"ascii":

@@ -15,25 +15,28 @@ Inputs = ParamSpec("Inputs")
 Result = TypeVar("Result")
 
 
-def moved(data: Result, device: torch.device) -> Result:
+def moved(data: Result, device: torch.device, known: dict[int, Any] | None = None) -> Result:
     """Data with all tensors on the device: a tensor, tuples, lists and dictionaries, dataclasses of them.
+
+    Tensors that stand in it twice are moved once; `known` has those moved so far, by `id`.
 
     >>> moved({"one": [torch.ones(1)]}, torch.device("meta"))["one"][0].device
     device(type='meta')
     """
     found: Any = data
+    known = {} if known is None else known
     if isinstance(data, Tensor):
-        found = data.to(device)
+        found = known[id(data)] = known.get(id(data), data.to(device))
     elif isinstance(data, dict):
-        found = {key: moved(value, device) for key, value in data.items()}
+        found = {key: moved(value, device, known) for key, value in data.items()}
     elif isinstance(data, list):
-        found = [moved(value, device) for value in data]
+        found = [moved(value, device, known) for value in data]
     elif isinstance(data, tuple):
-        parts = [moved(value, device) for value in data]
+        parts = [moved(value, device, known) for value in data]
         found = type(data)(*parts) if hasattr(data, "_fields") else tuple(parts)
     elif is_dataclass(data):
-        names = [f.name for f in fields(data) if f.init]
-        found = replace(data, **{n: moved(getattr(data, n), device) for n in names})  # pyright: ignore[reportArgumentType]
+        parts = {f.name: getattr(data, f.name) for f in fields(data) if f.init}
+        found = replace(data, **moved(parts, device, known))  # pyright: ignore[reportArgumentType]
     return found
 
 

@@ -21,7 +21,10 @@ def threads_for(num_points: int) -> Iterator[None]:
     True
     """
     threads = torch.get_num_threads()
-    torch.set_num_threads(threads if num_points > FEW else 1)
+    if threads == 1 or num_points > FEW:  # other threads may be about to restore theirs
+        yield
+        return
+    torch.set_num_threads(1)
     try:
         yield
     finally:

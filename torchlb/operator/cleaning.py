@@ -202,18 +202,18 @@ def triangles_of(vertices: Points, polygons: Int[Tensor, "F c"]) -> Int[Tensor, 
     normal = torch.linalg.cross(around, around.roll(-1, 1)).sum(1)[:, None, None]
     left, triangles = polygons, []
     for size in range(polygons.shape[1], 3, -1):
-        after = torch.stack([left.roll(-i, 1) for i in range(size)], -1)
-        ear, rest = places[after].split([3, size - 3], 2)
+        ear = places[torch.stack([left, left.roll(-1, 1), left.roll(-2, 1)], -1)]
         across = ear[:, :, 2] - ear[:, :, 0]
         cut = across.norm(dim=-1)
         if places.shape[1] == 3:  # in higher dimensions a polygon has no interior side
             inward = torch.linalg.cross(normal, ear.roll(-1, 2) - ear)
-            offset = rest[:, :, None] - ear[..., None, :]
-            sides = (offset * inward[..., None, :]).sum(-1)
-            within = ((sides >= 0) & (offset != 0).any(-1)).all(2).any(-1)
-            convex = (across * inward[:, :, 0]).sum(-1) > 0
-            cut = torch.where(convex & ~within, cut, 1e30 * cut)
-        left = after[torch.arange(len(left)), cut.argmin(1)]
+            bad = (across * inward[:, :, 0]).sum(-1) <= 0
+            some = bad.any(1).nonzero()[:, 0]  # all cuts of convex polygons are good
+            offset = places[left[some]][:, None, None] - ear[some, :, :, None]
+            sides = (offset * inward[some, :, :, None]).sum(-1)
+            bad[some] |= ((sides >= 0) & (offset != 0).any(-1)).all(2).any(-1)
+            cut = torch.where(bad, 1e30 * cut, cut)
+        left = left.gather(1, (cut.argmin(1)[:, None] + torch.arange(size)) % size)
         triangles.append(left[:, :3])
         left = torch.cat([left[:, :1], left[:, 2:]], 1)
     return torch.stack([*triangles, left], 1)

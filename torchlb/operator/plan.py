@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from functools import cache
+from functools import cache, cached_property
 from io import BytesIO
 from typing import Any
 
@@ -57,8 +57,7 @@ class Plan:
     stencils, `rows`, None with a certificate; and of the weak pair, a `PairPlan`, None without. `flips` lead to the
     Delaunay triangles of the low-order rows. `faces`, (F, d + 1), are the user's; `order`, (G,), has the index among
     these of each cell of the plan; `moved` are points of a noisy curve that were moved. `source` and `options` are
-    those of the operator. `warned` are the lines of a program that were told of points that moved too far; `elsewhere`
-    has the plan on other devices.
+    those of the operator. `warned` are the lines of a program that were told of points that moved too far.
     """
 
     numbering: Numbering
@@ -73,14 +72,22 @@ class Plan:
     source: str
     options: Options
     warned: set[Any] = field(default_factory=set)
-    elsewhere: dict[torch.device, Plan] = field(default_factory=dict)
+
+    def __getstate__(self) -> dict[str, Any]:
+        """State for files, without what is elsewhere."""
+        return {name: part for name, part in vars(self).items() if name != "elsewhere"}
+
+    @cached_property
+    def elsewhere(self) -> dict[torch.device, Plan]:
+        """The plan on other devices, as long as it is there."""
+        return {}
 
     def on(self, device: torch.device) -> Plan:
-        """The plan with its tensors on a device, which is kept."""
+        """The plan with its tensors on a device."""
         if device == self.points.device:
             return self
         if device not in self.elsewhere:
-            self.elsewhere[device] = moved(replace(self, elsewhere={}), device)
+            self.elsewhere[device] = moved(self, device)
         return self.elsewhere[device]
 
     def forms(self, points: Points) -> Forms:
@@ -177,14 +184,14 @@ class Plan:
 def evaluate(plan: Plan, points: Points) -> Parts:
     """An operator by its plan at points, float64, on their device; InputError with a certificate or moved points."""
     own = plan.on(points.device)
-    with renumbered(plan.numbering.given), threads_for(len(points)), default(points.device):
+    with renumbered(own.numbering.given), threads_for(len(points)), default(points.device):
         placed, fits = own.shape.at(own._sorted(points))
         pair_plan, pair, mass = own.pair.at(fits, own.numbering, plan.warned)
         rows, shape = own._rows(placed, mass)
         parts = operator_parts(own, points, rows, shape, pair)
     if pair_plan is not own.pair:
         lowered = pair_plan.lowered.to(plan.points.device)
-        plan = replace(plan, pair=replace(plan.pair, lowered=lowered), elsewhere={})
+        plan = replace(plan, pair=replace(plan.pair, lowered=lowered))
     return parts | {"_plans": [plan]}
 
 
@@ -278,8 +285,7 @@ PARTS = [
 
 def packed(plans: Sequence[Plan | None]) -> Tensor:
     """The plans as bytes, (B,), on the CPU."""
-    own = {"warned": set(), "elsewhere": {}}
-    plain = [p and replace(p, options=Options(**p.options.plain), **own) for p in plans]
+    plain = [p and replace(p, options=Options(**p.options.plain), warned=set()) for p in plans]
     file = BytesIO()
     torch.save((__version__, plain), file)
     return torch.frombuffer(bytearray(file.getvalue()), dtype=torch.uint8)

@@ -9,6 +9,7 @@ silence (`method.md`, section 14).
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from typing import Any, NamedTuple
 
 import torch
@@ -16,14 +17,14 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.nn.functional import pad
 
-from torchlb.errors import DerivativeError, first_few
+from torchlb.errors import DerivativeError, first_few, warn
 from torchlb.galerkin.forms import BilinearForm
 from torchlb.galerkin.matrices import PairMatrices
 from torchlb.galerkin.medium import Field
 from torchlb.linalg.csr import side_by_side, tensors_of
 from torchlb.linalg.devices import default
 from torchlb.linalg.once import once_differentiable
-from torchlb.linalg.precision import ROOT_EPS
+from torchlb.linalg.precision import LOW, ROOT_EPS, ROUNDING, TINY
 from torchlb.operator.batching import shapes_of
 from torchlb.operator.medium import plain
 from torchlb.operator.systems import pair_system
@@ -205,7 +206,7 @@ def carrying(lb: Any, points: Any) -> Any:
         return [BilinearForm("lumped", one, g[:, None], one[0])]
 
     def of_rows(*grads: Tensor) -> list[Tensor]:
-        with torch.enable_grad(), default(lb.device):
+        with torch.enable_grad(), default(own.device):  # a reference to lb would keep it alive
             leaves = [v.detach().double().requires_grad_() for v in variables]
             found = plan.rows_at(leaves[0], (leaves[1:] or [mass])[0])
             scaled = [g.to(f) for g, f in zip(grads, found, strict=True)]
@@ -241,11 +242,12 @@ def through_eigenpairs(lb: Any, whole: Eigenbasis, k: int) -> Eigenbasis:
     """The first k pairs of a basis, differentiable in the variables of the operator.
 
     Of eigenvectors, what does not depend on the basis of an eigenspace (signatures, filters Φg(Λ)ΦᵀM, projectors) has
-    exact gradients; so have symmetric functions of the eigenvalues of a cluster.
+    exact gradients; so have symmetric functions of the eigenvalues of a cluster. Eigenvalues are spread for that.
     """
-    basis = whole.truncate(k)
     if origins(lb) is None:
-        return basis
+        return whole.truncate(k)
+    whole = replace(whole, eigenvalues=_spread(whole.eigenvalues))
+    basis = whole.truncate(k)
     shapes, wholes = shapes_of(lb) or (lb,), unstack_eigenbases(whole)
     sizes = [shape.num_points for shape in shapes]
 
@@ -265,6 +267,22 @@ def through_eigenpairs(lb: Any, whole: Eigenbasis, k: int) -> Eigenbasis:
     return Eigenbasis(values, vectors, lb.mass, left, basis.sizes, basis.relative_errors)
 
 
+def _spread(values: Float[Tensor, "*S k"]) -> Float[Tensor, "*S k"]:
+    """Eigenvalues, moved apart by some 1e-9 where they agree, so that quotients of differences are derivatives.
+
+    >>> (_spread(torch.tensor([0.0, 2.0, 2.0], dtype=torch.float64)) / 2 - 1)[1:] > 1e-9
+    tensor([False,  True])
+    """
+    step = LOW * ROOT_EPS * torch.arange(values.shape[-1], device=values.device).double()
+    apart = ((values.double().log() - step).cummax(-1).values + step).exp()
+    return torch.where(apart > (1 + ROUNDING) * values, apart, values.double()).to(values)
+
+
+def _rounding(x: Tensor) -> float:
+    """Relative rounding error of sums in the type of x."""
+    return torch.finfo(x.dtype).eps ** 0.75
+
+
 def _of_shape(
     lb: Any,
     whole: Eigenbasis,
@@ -274,8 +292,8 @@ def _of_shape(
 ) -> tuple[Float[Tensor, "N m"], Float[Tensor, "N m"], Float[Tensor, "N m"]]:
     """Functions w and v with the derivative Σ_i w_iᵀdK φ_i + v_iᵀdM φ_i of a result, and all known φ.
 
-    Inside the span of the m known eigenvectors it takes differences of eigenvalues, broadened where they agree to
-    rounding; outside, a solve for each vector (Nelson 1976).
+    Inside the span of the m known eigenvectors it takes quotients of differences, broadened where rounding of the type
+    of the eigenvectors decides; outside, a solve for each vector (Nelson 1976).
     """
     phi, lam = whole.eigenvectors.double(), whole.eigenvalues.double()
     count = min(of_values.shape[0], len(lam))
@@ -288,9 +306,15 @@ def _of_shape(
     v += pad(left, more)
     gradient = of_vectors[:, :count] + solver.mass_product(left)
     inside = pad(phi.T @ gradient, more)  # φ_jᵀḡ_i
-    gap = lam - lam[:, None]
-    gap = gap / (gap.square() + (ROOT_EPS * lam[-1]) ** 2)
-    turning = (inside - inside.T) * gap / 2
+    gap, width = lam - lam[:, None], _rounding(whole.eigenvectors) * lam
+    close = ((gap.abs() < width / LOW) & (lam > 0)).triu(1)[:count].any(0)
+    if close.any():
+        warn(
+            f"eigenbasis: {int(close.sum())} eigenvalues ({first_few(close.nonzero()[:, 0])}) agree with others to the "
+            f"rounding of {whole.eigenvectors.dtype}; derivatives of what eigenvectors turn into each other there are "
+            "not exact; take the operator in float64"
+        )
+    turning = (inside - inside.T) * gap / (gap.square() + width.square()).clamp_min(TINY) / 2
     w += phi @ turning
     v -= phi @ (turning * (lam + lam[:, None]) / 2 + (inside + inside.T) / 4)
     free = lb.num_points if lb.fixed is None else int((~lb.fixed).sum())
