@@ -243,7 +243,7 @@ class LaplaceBeltrami(StencilMethods, PairMethods):
 
         It is computed on the operator's device, in about half the time of a build. It is meant for points that moved a
         little, as in an animation or a flow; for others the decisions may not fit, and `from_mesh` or `from_points`
-        makes new ones.
+        makes new ones. Cells keep their winding, so that normals of a mirror image point inwards.
 
         Parameters
         ----------

@@ -90,8 +90,9 @@ def parallel_transport(
         oriented surfaces in space with triangles. "heat": the vector heat method (Sharp, Soliman, Crane 2019), for all
         shapes. The direction is that of an implicit step of the connection Laplacian, the length the ratio of two
         steps of functions. It mixes paths, and is of first order, but differentiable in points and medium; a warning
-        names the points where the step is not positive. By default "paths" for such surfaces without a medium or points
-        that require gradients, else "heat". In the plane and in solids vectors stay as they are.
+        names the points where the step is not positive. The step has the operator's condition, which should be
+        Neumann's. By default "paths" for such surfaces without a medium or points that require gradients, else "heat".
+        In the plane and in solids vectors stay as they are.
 
     Differentiable in the vectors. Zero where no path leads to a source. Raises InputError for indices out of range,
     vectors of other shapes, and a method that is not for this shape.
