@@ -93,11 +93,11 @@ def check_certificate(
     q = shared_outflow(matrix, areas) if outflow else np.zeros(len(areas))
     mass, components, error = left_null_vector(matrix, areas, q)
     smallest = float((mass / areas).min())
-    contracts, max_s, feed = False, np.nan, np.zeros((len(areas), 0))
+    contracts, max_s, indicator = False, np.nan, np.zeros((len(areas), 0))
     if smallest > 0 and error <= CONSERVED:
-        contracts, max_s, feed = dissipation(matrix, mass)
+        contracts, max_s, indicator = dissipation(matrix, mass)
     holds = smallest > ROOT_EPS and contracts
-    return mass, Certificate(holds, smallest, max_s, components), feed
+    return mass, Certificate(holds, smallest, max_s, components), indicator
 
 
 def left_null_vector(
@@ -171,9 +171,9 @@ def dissipation(
     negative = np.flatnonzero(pivots < 0)[:DIRECTIONS]
     columns = (lu.L[:, negative] * pivots[negative]).toarray()
     vectors = lu.solve(columns[lu.perm_r])
-    feed = vectors * (weighted @ vectors)
-    rayleigh = feed.sum(axis=0) / (size @ vectors**2)
-    return len(negative) == 0, float(rayleigh.max(initial=0.0)), feed
+    indicator = vectors * (weighted @ vectors)
+    rayleigh = indicator.sum(axis=0) / (size @ vectors**2)
+    return len(negative) == 0, float(rayleigh.max(initial=0.0)), indicator
 
 
 def certify(
@@ -198,9 +198,9 @@ def certify(
         while True:
             bar.update()
             matrix = to_scipy(rows.crow, rows.col, rows.laplacian, (count, count))
-            mass, result, feed = check_certificate(matrix, areas, outflow=outflow)
+            mass, result, indicator = check_certificate(matrix, areas, outflow=outflow)
             free = (rows.candidate < bottom).numpy()
-            marked = _marked(matrix, mass / areas, feed, free, not result.holds)
+            marked = _marked(matrix, mass / areas, indicator, free, not result.holds)
             if not marked.any() or rounds == MOST_ROUNDS:
                 break
             rounds, rows = rounds + 1, _lowered(rows, first, marked, lower)
@@ -210,7 +210,9 @@ def certify(
     counts = {"lowered": int(below.sum()), "widened": int(widened.sum()), "rounds": rounds}
     result = replace(result, **counts)
     if not result.holds:
-        worst = (mass / areas).argsort() if feed.shape[1] == 0 else (-feed.max(1)).argsort()
+        worst = (
+            (mass / areas).argsort() if indicator.shape[1] == 0 else (-indicator.max(1)).argsort()
+        )
         names = ", ".join(map(str, as_given(worst[:8]).tolist()))
         stopped = ", where rounds end" if rounds == MOST_ROUNDS else ""
         warn(
@@ -221,7 +223,7 @@ def certify(
 
 
 def _marked(
-    matrix: sparse.csr_array, density: Tensor, feed: np.ndarray, free: np.ndarray, spread: bool
+    matrix: sparse.csr_array, density: Tensor, indicator: np.ndarray, free: np.ndarray, spread: bool
 ) -> Bool[Tensor, " N"]:
     """Rows to widen or lower: those that make π small, or contribute most to a direction v with vᵀSv > 0.
 
@@ -234,7 +236,7 @@ def _marked(
     row, col = columns.coords
     inflow, worst = np.where(row == small[col], 0.0, columns.data), np.zeros(len(small))
     np.minimum.at(worst, col, inflow)
-    marked = (feed > LOW * feed.max(axis=0)).any(axis=1)
+    marked = (indicator > LOW * indicator.max(axis=0)).any(axis=1)
     marked[row[inflow < LOW * worst[col]]] = True
     marked[matrix[small[~free[small]]].indices] = True
     joined = abs(matrix) + abs(matrix).T

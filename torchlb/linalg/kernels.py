@@ -230,7 +230,7 @@ def _k_hop_neighborhoods(shape, graph, centers, bounds, room, index, count):
 )
 @no_type_check
 def congruence(first, left, right, rows, elements, of_nodes, of_columns, result):
-    """Rows of the upper triangle of PᵀAP from `first` on, until one does not fit; return its number.
+    """Rows of the upper triangle of PᵀAP (Gustavson 1978) from `first` on, until one does not fit; return its number.
 
     `left` and `right` are Pᵀ and P, with ascending columns. Row a of A is the sum of the parts from `part_ptr[a]` to
     `part_ptr[a + 1]`, with `part_size` entries in the columns `nodes[part_col :]`, `values[part_value :]`. A row of
