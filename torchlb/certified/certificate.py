@@ -210,9 +210,7 @@ def certify(
     counts = {"lowered": int(below.sum()), "widened": int(widened.sum()), "rounds": rounds}
     result = replace(result, **counts)
     if not result.holds:
-        worst = (
-            (mass / areas).argsort() if indicator.shape[1] == 0 else (-indicator.max(1)).argsort()
-        )
+        worst = (-indicator.max(1) if indicator.shape[1] else mass / areas).argsort()
         names = ", ".join(map(str, as_given(worst[:8]).tolist()))
         stopped = ", where rounds end" if rounds == MOST_ROUNDS else ""
         warn(

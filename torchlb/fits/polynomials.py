@@ -53,11 +53,8 @@ def monomials(coords: Float[Tensor, "*batch d"], degree: int) -> Float[Tensor, "
     if degree * coords.shape[-1] == 0:
         return coords[..., :0]
     variables = coords.unbind(-1)
-    columns, last = (
-        list(variables),
-        [[y] for y in variables],
-    )  # of one degree, by the first variable
-    for _ in range(degree - 1):
+    columns, last = list(variables), [[y] for y in variables]
+    for _ in range(degree - 1):  # `last` has those of one degree by their first variable
         last = [[y * z for z in chain(*last[c:])] for c, y in enumerate(variables)]
         columns += chain(*last)
     return torch.stack(columns, dim=-2).mT if coords.ndim > 1 else torch.stack(columns)

@@ -137,14 +137,21 @@ def spread(x: Tensor, shape: Element) -> Tensor:
     return x[:, None].expand(-1, len(shape.weights), *x.shape[1:])
 
 
+def entries_of(
+    nodes: Int[Tensor, "T n"], blocks: Shaped[Tensor, "T n_times_n c"]
+) -> tuple[Int[Tensor, " e"], Int[Tensor, " e"], Shaped[Tensor, "e c"]]:
+    """Rows, columns and values of element matrices, flattened row by row."""
+    size = nodes.shape[1]
+    row, col = nodes.repeat_interleave(size, 1), nodes.repeat(1, size)
+    return row.flatten(), col.flatten(), blocks.flatten(0, 1)
+
+
 def summed(
     blocks: Shaped[Tensor, "T n_times_n"], nodes: Int[Tensor, "T n"], num_nodes: int
 ) -> sparse.csr_array:
     """Assemble element matrices, each flattened row by row, into one sparse matrix."""
-    size, nodes = nodes.shape[1], nodes.int()
-    row, col = nodes.repeat_interleave(size, dim=1).flatten(), nodes.repeat(1, size).flatten()
-    entries = blocks.flatten().numpy(), (row.numpy(), col.numpy())
-    result = sparse.csr_array(entries, shape=(num_nodes, num_nodes))
+    row, col, values = (part.numpy() for part in entries_of(nodes.int(), blocks[..., None]))
+    result = sparse.csr_array((values[:, 0], (row, col)), shape=(num_nodes, num_nodes))
     result.data, result.indices = result.data.copy(), result.indices.copy()  # without duplicates
     return result
 

@@ -21,13 +21,6 @@ Entries = tuple[Int[Tensor, " _"], Int[Tensor, " _"], Float[Tensor, "_ _"]]
 """Rows, columns and values, (e, c)."""
 
 
-def entries_of(nodes: Int[Tensor, "T n"], blocks: Float[Tensor, "T n_times_n c"]) -> Entries:
-    """Entries of element matrices, flattened row by row."""
-    size = nodes.shape[1]
-    row, col = nodes.repeat_interleave(size, 1), nodes.repeat(1, size)
-    return row.flatten(), col.flatten(), blocks.flatten(0, 1)
-
-
 def summed_entries(parts: Iterable[Entries], shape: tuple[int, int]) -> Matrix:
     """The sum of entries, with ascending columns.
 

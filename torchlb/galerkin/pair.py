@@ -18,6 +18,7 @@ from torchlb.errors import first_few, warn
 from torchlb.galerkin.assembly import (
     Elements,
     area_element,
+    entries_of,
     metric,
     squares,
     summed,
@@ -27,7 +28,7 @@ from torchlb.galerkin.boundary import boundary_nodes
 from torchlb.galerkin.coarse import boundary_shares
 from torchlb.galerkin.curving import CurvedMesh, CurvingPlan, curve
 from torchlb.galerkin.delaunay import sound_lengths
-from torchlb.galerkin.device import congruence, entries_of, summed_entries, without_row_sums
+from torchlb.galerkin.device import congruence, summed_entries, without_row_sums
 from torchlb.galerkin.elements import edge_lengths, simplex
 from torchlb.galerkin.forms import BilinearForm, Forms
 from torchlb.galerkin.matrices import PairMatrices
@@ -245,7 +246,7 @@ class PairPlan:
         forms, shape = self.forms(fits, mesh, prolong=False), (len(mesh.places), len(fits.points))
         row, length, col, value = Prolongation(self.fits, fits, self.curving, mesh).entries()
         parts = [(row.repeat_interleave(length), col.long(), value[:, None])]
-        crow, col, value = p = summed_entries(parts, shape)
+        crow, col, value = summed_entries(parts, shape)
         size, count = shape
         lots = forms.lots[0], forms.linear, *forms.lots[1:]
         own, linear, *flats = (lot.matrices() for lot in lots)
@@ -261,7 +262,8 @@ class PairPlan:
             parts = [(row, col, pad(values, (0, 1))) for row, col, values in parts]
             parts += [entries_of(rim.nodes, pad(blocks[..., None], (2, 0)))]
             parts += [(every, every, pad(shares[:, None], (2, 0)))]
-        p = summed_entries([(Csr(*p).row, given[col], value)], shape)
+        row = torch.arange(size).repeat_interleave(crow.diff())
+        p = summed_entries([(row, given[col], value)], shape)
         whole = without_row_sums(congruence(p, summed_entries(parts, (size, size)), count))
         parts = [entries_of(given[n], torch.view_as_real(blocks)) for n, blocks in (linear, *flats)]
         near = without_row_sums(summed_entries(parts, (count, count)))

@@ -67,9 +67,8 @@ class Modes(Tensors):
         self, vectors: Float[Tensor, "N k"], free: Bool[Tensor, " N"], sizes: tuple[int, ...]
     ) -> None:
         """Set `count`, the pairs known of every shape, all that the free points allow where these are fewer."""
-        parts = zip(
-            vectors.split(sizes), free.split(sizes), strict=True
-        )  # zero columns are padding
+        parts = zip(vectors.split(sizes), free.split(sizes), strict=True)
+        # zero columns are padding
         counts = [(int((modes != 0).any(0).sum()), int(inside.sum())) for modes, inside in parts]
         most = max(sizes)
         known = min((held for held, every in counts if held < every), default=most)

@@ -73,10 +73,6 @@ class Plan:
     options: Options
     warned: set[Any] = field(default_factory=set)
 
-    def __getstate__(self) -> dict[str, Any]:
-        """State for files, without what is elsewhere."""
-        return {name: part for name, part in vars(self).items() if name != "elsewhere"}
-
     @cached_property
     def elsewhere(self) -> dict[torch.device, Plan]:
         """The plan on other devices, as long as it is there."""

@@ -278,11 +278,6 @@ def _spread(values: Float[Tensor, "*S k"]) -> Float[Tensor, "*S k"]:
     return torch.where(apart > (1 + ROUNDING) * values, apart, values.double()).to(values)
 
 
-def _rounding(x: Tensor) -> float:
-    """Relative rounding error of sums in the type of x."""
-    return torch.finfo(x.dtype).eps ** 0.75
-
-
 def _of_shape(
     lb: Any,
     whole: Eigenbasis,
@@ -306,7 +301,7 @@ def _of_shape(
     v += pad(left, more)
     gradient = of_vectors[:, :count] + solver.mass_product(left)
     inside = pad(phi.T @ gradient, more)  # φ_jᵀḡ_i
-    gap, width = lam - lam[:, None], _rounding(whole.eigenvectors) * lam
+    gap, width = lam - lam[:, None], torch.finfo(whole.eigenvectors.dtype).eps ** 0.75 * lam
     close = ((gap.abs() < width / LOW) & (lam > 0)).triu(1)[:count].any(0)
     if close.any():
         warn(
