@@ -4,6 +4,7 @@ import copy
 import functools
 import io
 import pickle
+import threading
 import warnings
 from collections import namedtuple
 from functools import cache
@@ -15,7 +16,7 @@ import pytest
 import torch
 from torch.autograd import gradcheck, gradgradcheck
 
-from torchlb import InputError, LaplaceBeltrami, collate, load_or_build
+from torchlb import InputError, LaplaceBeltrami, Robin, collate, load_or_build
 from torchlb.linalg.csr import tensors_of
 from torchlb.operator.parts import BASIS
 from torchlb.surfaces import (
@@ -677,3 +678,42 @@ def test_small_shapes_take_one_thread_and_leave_the_number_as_it_was(monkeypatch
         assert set(seen) == {1}
     finally:
         torch.set_num_threads(before)
+
+
+@pytest.fixture
+def two_threads():
+    """Torch with two threads, as a user has them."""
+    torch.set_num_threads(2)
+    yield
+    torch.set_num_threads(1)
+
+
+def robin():
+    return LaplaceBeltrami.from_mesh(*mesh_of(UnitDisk(), 200), condition=Robin(2.0))
+
+
+@pytest.mark.parametrize("kind", [*BUILDERS, "robin"])
+def test_with_two_threads_operators_are_those_of_one(kind, two_threads):
+    """The weak pair is computed beside the stencils then."""
+    build = robin if kind == "robin" else BUILDERS[kind][1]
+    found = build().state_dict()
+    torch.set_num_threads(1)
+    expected = build().state_dict()
+    assert found.keys() == expected.keys()
+    for name, value in expected.items():
+        if isinstance(value, torch.Tensor):
+            torch.testing.assert_close(found[name], value, rtol=0, atol=0, equal_nan=True)
+
+
+def test_an_error_beside_the_stencils_is_raised(two_threads, monkeypatch):
+    """Of the weak pair, computed in a thread of its own."""
+    threads = []
+
+    def fail(*_):
+        threads.append(threading.current_thread())
+        raise InputError("of the pair")
+
+    monkeypatch.setattr("torchlb.operator.build.mesh_pair", fail)
+    with pytest.raises(InputError, match="of the pair"):
+        LaplaceBeltrami.from_mesh(*Sphere().mesh(100))
+    assert threads != [threading.main_thread()]

@@ -31,7 +31,7 @@ from torchlb.geometry.thresholds import NEAREST
 from torchlb.geometry.vectors import Points
 from torchlb.linalg.precision import LOW
 from torchlb.linalg.sparse import from_scipy
-from torchlb.linalg.threads import threads_for
+from torchlb.linalg.threads import beside, threads_for
 from torchlb.operator import checks
 from torchlb.operator.inputs import ArrayLike, check_points
 from torchlb.operator.plan import Parts, Plan, operator_parts
@@ -208,20 +208,25 @@ def finished(
     plan: Plan, shape: Shape, progress: bool, surface: CloudSurface | None = None
 ) -> Parts:
     """The operator of a shape of cells: weak pair, rows, certified if asked for, and the rest of the plan."""
-    options, pair, fits = plan.options.taken(plan.numbering), None, plan.shape.fits
+    options, fits = plan.options.taken(plan.numbering), plan.shape.fits
+    waiting = pair = None
     if options.weak_form:
         cells, stars = (surface.cells, surface.stars) if surface else (plan.shape.cells, None)
         rest = stars, shape.held, plan.shape.shares, plan.numbering
         assert shape.fits is not None
         own = fits, shape.fits, *options.elements
-        pair_plan, pair, mass = mesh_pair(cells, *own, *rest)
+        waiting = beside(mesh_pair, cells, *own, *rest)
+        if not shape.condition.conserves:  # low-order rows need the mass
+            shape = replace(shape, mass=waiting()[2])
+    stencils = Stencils(shape, options)
+    rows, certificate = assemble(stencils, progress=progress), None
+    if waiting is not None:
+        pair_plan, pair, mass = waiting()
         plan, shape = replace(plan, pair=pair_plan), replace(shape, mass=mass)
     if surface is not None:
         if pair is not None:
             doubts.warn_of_doubts(surface, fits, shape.areas)
         doubts.warn_of_joins(surface)
-    stencils = Stencils(shape, options)
-    rows, certificate = assemble(stencils, progress=progress), None
     if options.certify:
         last, outflow = len(stencils.candidates), not shape.condition.conserves
         rows, mass, certificate = certify(
