@@ -15,7 +15,8 @@ from torch import Tensor
 
 from torchlb.galerkin.assembly import ElementMatrices, Elements, spread, upper_congruence
 from torchlb.galerkin.elements import Element, edge_lengths
-from torchlb.galerkin.medium import Field, Medium, orthonormal
+from torchlb.galerkin.medium import Field, Jumps, Medium, orthonormal
+from torchlb.galerkin.prolongation import Prolongation
 from torchlb.geometry.numbering import Numbering
 from torchlb.geometry.vectors import Points, at
 from torchlb.linalg.once import computed_again, once_differentiable
@@ -48,6 +49,7 @@ class Forms:
     vertices in an order along the shape, of which the computed triangles of matrices are; `places` the positions of the
     nodes, ℓ, the vertices first; `prolongation` is P, from the vertices to the nodes. The `lots` are the curved
     elements, then flat ones in their place or beside them; `linear` are P1 elements on the cells of the curved ones.
+    `fits` are what P follows from, not in the user's numbers but in the order of the `numbering`; None for P1 elements.
     """
 
     given: Int[Tensor, " N"]
@@ -55,6 +57,8 @@ class Forms:
     prolongation: Any
     lots: list[Elements]
     linear: Elements
+    fits: Prolongation | None = None
+    numbering: Numbering | None = None
 
     @classmethod
     def flat(
@@ -85,10 +89,34 @@ class Forms:
         return Forms(
             given,
             self.places[rows],
-            _renumbered(self.prolongation[rows.numpy()], given, len(given)),
+            _restored(self.prolongation, numbering),
             lots,
             replace(self.linear, nodes=given[self.linear.nodes]),
+            self.fits,
+            numbering,
         )
+
+    def in_medium(self, medium: Medium) -> Forms:
+        """The same in the user's numbers with P by fits on one side of a jump, where solutions have a kink."""
+        jumps, p, numbering = self.jumps(medium), self.fits, self.numbering
+        if jumps is None or p is None or numbering is None:
+            return self
+        p = p.one_sided(Jumps(*(numbering.sorted(x) for x in jumps)))
+        return replace(self, prolongation=_restored(p.matrix(), numbering), fits=p)
+
+    def jumps(self, medium: Medium) -> Jumps | None:
+        """Jumps of a conductivity on the faces; None without any, as in a medium at the vertices."""
+        field, parts = medium.get("conductivity"), []
+        if field is None or not field.on_faces:
+            return None
+        for lot in self.lots:
+            logs = field.transforms[0](_along(partial(times, lot.mix), field.values.detach()))
+            corners = lot.nodes[:, : lot.element.dim + 1]
+            logs = logs.view(len(logs), -1).repeat_interleave(corners.shape[1], 0)
+            parts.append((corners.flatten(), logs))
+        vertices, logs = (torch.cat(column) for column in zip(*parts, strict=True))
+        found = Jumps.of(vertices, logs, len(self.given))
+        return found if bool(found.at.any()) else None
 
     def values(self, field: Field, prolong: Linear | None = None) -> list[Tensor]:
         """Values of a field, differentiable in it.
@@ -149,6 +177,7 @@ class Forms:
 
     def bilinear(self, forms: Sequence[BilinearForm], medium: Medium) -> Float[Tensor, ""]:
         """Σ of bilinear forms, differentiable in the medium; of "lumped" and "boundary", which depend on none, 0."""
+        self = self.in_medium(medium)
         values = self.factors(medium, any(form.along for form in forms))
         total = [torch.zeros((), dtype=torch.float64)]
         # a function that stands in two forms is one
@@ -186,6 +215,13 @@ class Forms:
 def _renumbered(matrix: Any, columns: Int[Tensor, " C"], count: int) -> sparse.csr_array:
     parts = matrix.data, columns.numpy()[matrix.indices], matrix.indptr
     return sparse.csr_array(parts, shape=(matrix.shape[0], count))
+
+
+def _restored(p: Any, numbering: Numbering) -> sparse.csr_array:
+    """P in the user's numbers of the points."""
+    beyond = np.arange(p.shape[1], p.shape[0])
+    rows = np.concatenate([numbering.here.numpy(), beyond])
+    return _renumbered(p[rows], numbering.given, p.shape[1])
 
 
 def _mean(values: Float[Tensor, "T Q ..."], element: Element, other: Element) -> Tensor:

@@ -64,6 +64,15 @@ class PairMatrices(Csr):
         """As `pair`, of P1 elements."""
         return self.near.crow, self.near.col, _with_added(self.near.values)
 
+    @property
+    def root_of_absorption(self) -> Float[Tensor, "N 1"] | None:
+        """√a of Robin's condition, from R_ii = a_i B_ii; None for another condition."""
+        if not self.values[3:4].any():
+            return None
+        values = self.values[:, self.row == self.col].double()
+        a = torch.where(values[2] != 0, values[3] / values[2], 0.0)
+        return a.clamp_min(0).sqrt()[:, None]
+
     def losing(self, fixed: Bool[Tensor, " N"] | None) -> Bool[Tensor, " N"]:
         """Mask of the points where a condition or a potential keeps constants from the kernel of K; `fixed` too."""
         found = torch.full((self.num_rows,), not self.of_functions, device=self.col.device)

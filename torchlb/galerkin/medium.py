@@ -4,12 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from functools import partial
+from math import log
 from typing import Any, Literal, NamedTuple
 
 import torch
-from jaxtyping import Float, Shaped
+from jaxtyping import Bool, Float, Int, Shaped
 from torch import Tensor
 
+from torchlb.geometry.thresholds import FACTOR
 from torchlb.geometry.vectors import dot
 from torchlb.linalg.once import once_differentiable
 from torchlb.linalg.precision import TINY
@@ -45,6 +47,51 @@ class Field(NamedTuple):
 
 Medium = Mapping[str, Field]
 """Fields by their `FieldName`; a conductivity or density that is left out is 1, a potential 0."""
+
+
+class Jumps(NamedTuple):
+    """Where a conductivity on the faces jumps: `at` the vertices whose faces differ by more than `FACTOR`.
+
+    `extremes` are the largest logarithms at the faces of each vertex, for a tensor of each entry, and the largest of
+    their negatives.
+    """
+
+    at: Bool[Tensor, " N"]
+    extremes: Float[Tensor, "N c"]
+
+    @classmethod
+    def of(cls, vertices: Int[Tensor, " e"], logs: Float[Tensor, "e c"], count: int) -> Jumps:
+        """The jumps at so many vertices, from the logarithms at the corners of all faces.
+
+        >>> logs = torch.tensor([0.0, 0.0, 7.0, 7.0])[:, None]
+        >>> jumps = Jumps.of(torch.tensor([0, 1, 1, 2]), logs, 3)
+        >>> jumps.at
+        tensor([False,  True, False])
+        >>> jumps.between(torch.tensor([0, 0, 1, 1, 1]), torch.tensor([0, 1, 0, 1, 2]), 2)
+        tensor([False,  True])
+        """
+        found = _extremes(vertices, torch.cat([logs, -logs], 1), count)
+        return cls(_differ(found), found)
+
+    def between(
+        self, groups: Int[Tensor, " e"], vertices: Int[Tensor, " e"], count: int
+    ) -> Bool[Tensor, " G"]:
+        """Whether each of so many groups of vertices has some on both sides of a jump."""
+        on = self.at[vertices]
+        near = self.at.new_zeros(count).index_fill(0, groups[on], True)
+        return near & _differ(_extremes(groups[~on], self.extremes[vertices[~on]], count))
+
+
+def _extremes(groups: Tensor, values: Tensor, count: int) -> Float[Tensor, "G c"]:
+    """Largest values of each group, −∞ of an empty one."""
+    found = values.new_full((count, values.shape[1]), -torch.inf)
+    return found.scatter_reduce(0, groups[:, None].expand_as(values), values, "amax")
+
+
+def _differ(extremes: Float[Tensor, "G c"]) -> Bool[Tensor, " G"]:
+    """Whether the logarithms of each group, whose extremes these are, differ by more than that of `FACTOR`."""
+    high, low = extremes.chunk(2, 1)
+    return (high + low).amax(1) > log(FACTOR)
 
 
 class _SpectralFunction(torch.autograd.Function):

@@ -142,8 +142,9 @@ class PairPlan:
         cells, lengths, elements, metric = parts
         bent = Elements(elements, metric, simplex(nodes.dim, nodes.degree), share, mix)
         linear = Elements.flat(cells, lengths, share=share)
-        p = Prolongation(self.fits, fits, plan, mesh).matrix() if prolong else None
-        return Forms(torch.arange(count), mesh.places, p, [bent, *flats], linear)
+        p = Prolongation(self.fits, fits, plan, mesh)
+        matrix = p.matrix() if prolong else None
+        return Forms(torch.arange(count), mesh.places, matrix, [bent, *flats], linear, p)
 
     def at(
         self, fits: LocalFits, numbering: Numbering, warned: set[Any]
@@ -179,21 +180,24 @@ class PairPlan:
         """
         mesh = self.curving.at(self.fits, fits)
         elements = self.forms(fits, mesh, prolong=False)
-        p = Prolongation(self.fits, fits, self.curving, mesh)
+        p = elements.fits
+        assert p is not None
         needed = {bool(form.along) for form in forms}
         kinds = {along: for_fields(elements) if along else elements for along in needed}
-        values = {along: own.factors(medium, along, p.times) for along, own in kinds.items()}
+        jumps = elements.jumps(medium)
+        here = p if jumps is None else p.one_sided(jumps)
+        values = {along: own.factors(medium, along, here.times) for along, own in kinds.items()}
         flat = self.curving.bent.index_fill(0, self.lowered, False)
-        total = []
         lower = p._replace(curving=replace(self.curving, bent=flat))
-        for lumped, here in ((False, p), (True, lower)):
+        total = []
+        for lumped, own in ((False, here), (True, lower)):
             chosen = [form for form in forms if (form.name == "lumped") == lumped]
             functions = {id(f): f for form in chosen for f in (form.w, form.u)}
             if not chosen:
                 continue
             widths = [f.shape[1] for f in functions.values()]
             every = torch.cat(list(functions.values()), 1)
-            at_nodes = here.times(every).split(widths, 1)
+            at_nodes = own.times(every).split(widths, 1)
             nodes = dict(zip(functions, at_nodes, strict=True))
             for form in chosen:
                 both, along = [nodes[id(form.w)], nodes[id(form.u)]], bool(form.along)
@@ -346,11 +350,19 @@ def boundary_elements(plan: CurvingPlan, mesh: CurvedMesh) -> tuple[Elements, Fl
     return Elements(own, metric(mesh.places, own, shape), shape), shares
 
 
-def boundary_mass(plan: CurvingPlan, mesh: CurvedMesh, p: Any) -> Any:
-    """Boundary mass ∫ φ_i φ_j, 1 at the end of a curve, lumped at coarse triangles; None for a closed shape."""
+def boundary_mass(
+    plan: CurvingPlan, mesh: CurvedMesh, p: Any, numbering: Numbering | None = None
+) -> Any:
+    """Boundary mass ∫ φ_i φ_j, 1 at the end of a curve, lumped at coarse triangles; None for a closed shape.
+
+    It is in the user's numbers, as P is, if the numbering is given.
+    """
     if len(plan.nodes.boundary()[0]) == 0:
         return None
     rim, shares = boundary_elements(plan, mesh)
+    number = torch.arange(len(mesh.places))
+    if numbering is not None:
+        number[: len(shares)], shares = numbering.given, numbering.restored(shares)
     blocks = (rim.element.weights * area_element(rim.metric)) @ squares(rim.element)
-    result = p.T @ summed(blocks, rim.nodes, len(mesh.places)) @ p
+    result = p.T @ summed(blocks, number[rim.nodes], len(mesh.places)) @ p
     return (result + result.T) / 2 + sparse.diags_array(shares.numpy(), format="csr")

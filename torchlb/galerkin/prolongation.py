@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import replace
 from typing import Any, NamedTuple
 
 import torch
@@ -12,9 +13,11 @@ from torch import Tensor
 
 from torchlb.fits.weights import cardinal
 from torchlb.galerkin.curving import CurvedMesh, CurvingPlan
+from torchlb.galerkin.medium import Jumps
 from torchlb.geometry.local_fits import FitPlan, LocalFits
 from torchlb.geometry.vectors import at
 from torchlb.linalg.once import computed_again
+from torchlb.linalg.precision import ROUNDING
 
 
 class Prolongation(NamedTuple):
@@ -27,6 +30,26 @@ class Prolongation(NamedTuple):
     fits: LocalFits
     curving: CurvingPlan
     mesh: CurvedMesh
+
+    def one_sided(self, jumps: Jumps) -> Prolongation:
+        """The same without fits that reach over a jump; linear at nodes where those left do not suffice.
+
+        For the degrees 2 and 3 fits are exact at a node only together with those of its other vertices.
+        """
+        ends, boundary, bent = self.mesh.ends, self.mesh.boundary, self.curving.bent
+        over = torch.zeros_like(jumps.at)
+        for block in self.plan.functions:
+            row = torch.arange(len(block.points)).repeat_interleave(block.points.shape[1])
+            over[block.vertices] = jumps.between(row, block.points.flatten(), len(block.points))
+        kept = torch.where(over[ends.vertex], 0.0, ends.share)
+        total = kept.new_zeros(len(bent)).index_add(0, ends.node, kept)
+        sound = total > (0 if self.plan.reach == 1 else 1 - ROUNDING)
+        node, vertex, _ = boundary.entries
+        sound[boundary.nodes] = ~jumps.between(node, vertex, len(bent))[boundary.nodes]
+        bent, none = bent & sound, total == 0
+        share = (kept / torch.where(none, 1.0, total)[ends.node]).where(bent[ends.node], ends.share)
+        mesh = replace(self.mesh, ends=replace(ends, share=share))
+        return self._replace(mesh=mesh, curving=replace(self.curving, bent=bent))
 
     def matrix(self) -> sparse.csr_array:
         """The matrix P."""

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from scipy import sparse
 from torch import Tensor
 from torch.nn.functional import pad
 
@@ -14,7 +15,7 @@ from torchlb.errors import InputError, first_few
 from torchlb.galerkin.forms import Forms
 from torchlb.galerkin.matrices import PairMatrices
 from torchlb.galerkin.medium import Field, Medium
-from torchlb.galerkin.pair import Pattern
+from torchlb.galerkin.pair import Pattern, boundary_mass
 from torchlb.linalg.checks import check_tensor
 from torchlb.linalg.csr import Csr
 from torchlb.linalg.precision import ROOT_EPS, ROUNDING
@@ -121,20 +122,41 @@ def pair_in(lb: OperatorStorage, medium: Medium) -> PairMatrices:
                 f"{faces[0]}: some points of this cloud have local triangles beside the faces; give it at the vertices"
             )
     with torch.no_grad():
+        elements, weak = elements.in_medium(medium), lb.weak
         values = {name: elements.values(field) for name, field in plain(medium).items()}
-        whole = _stored(elements.matrix, values, lb.weak, elements.given)
+        whole = _stored(elements.matrix, values, weak, elements.given, _boundary(elements, weak))
         linear = None
-        if lb.weak.linear.num_rows:
-            linear = _stored(elements.near, values, lb.weak.linear, elements.given)
+        if weak.linear.num_rows:
+            rest = _channels(weak.linear)
+            linear = _stored(elements.near, values, weak.linear, elements.given, rest)
     return PairMatrices(whole.crow, whole.col, whole.values, linear)
 
 
-def _stored(matrix: Any, fields: dict[str, list[Tensor]], pair: Csr, given: Tensor) -> Csr:
-    """K and M in a medium from upper triangles, with B and what a condition and the potential add to K."""
+def _boundary(elements: Forms, weak: PairMatrices) -> list[Any]:
+    """B, and what Robin's condition adds to K, with the prolongation of the elements."""
+    fits, numbering = elements.fits, elements.numbering
+    if fits is None or not weak.has_boundary:
+        return _channels(weak)
+    p, root = elements.prolongation, weak.root_of_absorption
+    b = boundary_mass(fits.curving, fits.mesh, p, numbering)
+    if root is None:
+        return [b]
+    scale: Any = sparse.diags_array(root[:, 0].cpu().numpy())
+    return [b, scale @ b @ scale]
+
+
+def _channels(pair: Csr) -> list[Any]:
+    """B, and what a condition adds to K, of a pair that has them."""
+    return [pair.to_scipy(channel) for channel in range(2, min(len(pair.values), 4))]
+
+
+def _stored(
+    matrix: Any, fields: dict[str, list[Tensor]], pair: Csr, given: Tensor, rest: list[Any]
+) -> Csr:
+    """K and M in a medium from upper triangles, with the `rest`, and what the potential adds to K."""
     kappa, rho, c = (fields.get(name) for name in ("conductivity", "density", "potential"))
     upper = matrix(kappa, rho)
     pattern = Pattern.of(upper, given)
-    rest = [pair.to_scipy(channel) for channel in range(2, min(len(pair.values), 4))]
     found = pattern.pair(upper).beside(rest)
     values = found.values
     if c is not None:

@@ -58,7 +58,7 @@ class _Origin(NamedTuple):
 
     def gradient(self, forms: Sequence[BilinearForm]) -> list[Tensor]:
         """The derivative of a sum of forms in the variables; DerivativeError where it is not finite."""
-        medium, root = plain(self.medium, self.device), _root_of_absorption(self.weak)
+        medium, root = plain(self.medium, self.device), self.weak.root_of_absorption
         energies = [form for form in forms if form.name == "energy"]
         forms = [form for form in forms if form.name != "energy"]
         forms += [form._replace(name="stiffness") for form in energies]
@@ -131,14 +131,6 @@ def origins(lb: Any) -> Origins | None:
         origin = _Origin(shape.num_points, shape.points, medium, None, shape.weak)
         found.append(origin._replace(bilinear=shape._bilinear()) if origin.variables else origin)
     return found
-
-
-def _root_of_absorption(weak: PairMatrices) -> Tensor | None:
-    """√a of a Robin condition, from R_ii = a_i B_ii; None for another condition."""
-    if not weak.values[3:4].any():
-        return None
-    values = weak.values[:, weak.row == weak.col].double()
-    return torch.where(values[2] != 0, values[3] / values[2], 0.0).clamp_min(0).sqrt()[:, None]
 
 
 class _Known(torch.autograd.Function):
