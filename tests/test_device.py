@@ -150,6 +150,25 @@ def test_gradients_of_eigenpairs_are_on_the_device(device):
     assert (slope != 0).any()
 
 
+@pytest.mark.parametrize("kind", ["closed", "Robin"])
+def test_derivatives_where_a_conductivity_jumps_are_computed_on_the_device(device, kind):
+    """In the points, with a conductivity on the faces."""
+    built = MOVED[kind]()
+    right = built.points[built.faces][..., 0].mean(1) > 0
+
+    def computed(lb):
+        points = lb.points.detach().requires_grad_()
+        moved = lb.at(points).with_medium(torch.where(right, 9.0, 1.0).double().to(lb.device))
+        values = moved.eigenbasis(5, tolerance=1e-11).eigenvalues
+        return values, *torch.autograd.grad(values.sum(), points)
+
+    for found, expected in zip(
+        computed(copy.deepcopy(built).to(device)), computed(built), strict=True
+    ):
+        assert found.device.type == device
+        torch.testing.assert_close(found.cpu(), expected, rtol=1e-8, atol=1e-8)
+
+
 @pytest.mark.parametrize("terms", [8, 64, 10**8])
 def test_products_of_sparse_matrices_in_parts(monkeypatch, terms):
     monkeypatch.setattr("torchlb.galerkin.device.BYTES", terms // 8)

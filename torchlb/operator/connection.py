@@ -137,7 +137,8 @@ def _field_elements(lb: Any) -> Any:
 
 def _of_shape(lb: Any, *, hodge: bool = False) -> Connection:
     frames, medium = lb.frames.detach().cpu().double(), lb._known_medium.fields(len(lb.points))
-    elements, medium = _field_elements(lb).in_medium(medium), plain(medium)
+    medium = plain(medium)
+    elements = _field_elements(lb).in_medium(medium)
     with torch.no_grad():
         kappa = medium.get("conductivity")
         kappa = None if kappa is None else elements.values(kappa)

@@ -122,8 +122,9 @@ def pair_in(lb: OperatorStorage, medium: Medium) -> PairMatrices:
                 f"{faces[0]}: some points of this cloud have local triangles beside the faces; give it at the vertices"
             )
     with torch.no_grad():
-        elements, weak = elements.in_medium(medium), lb.weak
-        values = {name: elements.values(field) for name, field in plain(medium).items()}
+        medium, weak = plain(medium), lb.weak
+        elements = elements.in_medium(medium)
+        values = {name: elements.values(field) for name, field in medium.items()}
         whole = _stored(elements.matrix, values, weak, elements.given, _boundary(elements, weak))
         linear = None
         if weak.linear.num_rows:
