@@ -136,8 +136,8 @@ def _field_elements(lb: Any) -> Any:
 
 
 def _of_shape(lb: Any, *, hodge: bool = False) -> Connection:
-    frames, medium = lb.frames.detach().cpu().double(), lb._known_medium.fields(len(lb.points))
-    medium = plain(medium)
+    frames = lb.frames.detach().cpu().double()
+    medium = plain(lb._known_medium.fields(len(lb.points)))
     elements = _field_elements(lb).in_medium(medium)
     with torch.no_grad():
         kappa = medium.get("conductivity")
