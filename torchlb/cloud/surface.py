@@ -10,7 +10,6 @@ import torch
 from jaxtyping import Bool, Float, Int
 from scipy import sparse
 from torch import Tensor
-from torch.nn.functional import normalize
 
 from torchlb.cloud.cocone import REACH, Candidates, Cloud, Tetrahedra, best_manifold
 from torchlb.cloud.complexes import Complex, Places, in_words, places_of
@@ -25,7 +24,7 @@ from torchlb.geometry.complex import Faces, components, delaunay, pieces_of
 from torchlb.geometry.frames import vertex_normals
 from torchlb.geometry.neighbors import mesh_graph, nearest_neighbors
 from torchlb.geometry.thresholds import LEVEL, NEAREST, RING
-from torchlb.geometry.vectors import Frames, Mask, Near, Nearest, Points, Vectors, lengths
+from torchlb.geometry.vectors import Mask, Near, Nearest, Points, Vectors, lengths
 from torchlb.linalg.precision import LOW, NEGLIGIBLE, ROOT_EPS
 
 
@@ -88,8 +87,8 @@ class CloudSurface(Complex):
     ----------
     stars
         (S, 3), local triangles in its gaps, each counted by a third.
-    normals, frames
-        (N, 3), unit, on the side of the faces; (N, 3, 2), orthonormal to them; they turn with the points.
+    normals
+        (N, 3), unit, on the side of the faces; they turn with the points.
     neighbors
         (N, K), nearest points, itself first.
     lone
@@ -100,7 +99,6 @@ class CloudSurface(Complex):
 
     stars: Int[Tensor, "S 3"]
     normals: Float[Tensor, "N 3"]
-    frames: Float[Tensor, "N 3 2"]
     neighbors: Int[Tensor, "N K"]
     lone: Bool[Tensor, " N"]
     summary: SurfaceSummary
@@ -121,7 +119,7 @@ def cloud_surface(
     candidates, oriented = nearest_neighbors(points, min(NEAREST, len(points))), False
     if normals is not None:
         normals, oriented = settled_normals(points, normals, candidates)
-    cloud, found, two_sided, frames, noise, lone = _start(points, candidates, normals, boundary)
+    cloud, found, two_sided, noise, lone = _start(points, candidates, normals, boundary)
     places, pairs, count = cloud.points, _neighbor_graph(cloud), len(points)
     outward = normals.numpy() if normals is not None and oriented else found.outward
     every, seam = wound_alike(places, _chosen(cloud, found, two_sided, pairs))
@@ -147,14 +145,13 @@ def cloud_surface(
     parts = {"points": places, "cells": faces, "stars": stars, "normals": cloud.normals}
     parts |= {"neighbors": cloud.neighbors, "lone": lone}
     tensors: Any = {name: torch.from_numpy(part) for name, part in parts.items()}
-    frames = _orthogonal_to(frames, tensors["normals"])
-    return CloudSurface(**tensors, frames=frames, summary=summary)
+    return CloudSurface(**tensors, summary=summary)
 
 
 def _start(
     points: Points, candidates: Near, given: Points | None, boundary: Bool[Tensor, " N"] | None
-) -> tuple[Cloud, Candidates, bool, Frames, float, Mask]:
-    """(denoised cloud; candidates among Delaunay triangles; whether these have two sides; frames; noise; lone points).
+) -> tuple[Cloud, Candidates, bool, float, Mask]:
+    """(denoised cloud; candidates among Delaunay triangles; whether these have two sides; noise; lone points).
 
     The normals are those given, that of the plane for planar points, or estimated.
     """
@@ -162,7 +159,7 @@ def _start(
     if lone.any():
         points = torch.from_numpy(put_beside(points.numpy(), lone))
         candidates = nearest_neighbors(points, candidates.shape[1])
-    frames, near = cloud_frames(points, candidates, 2, rounds=1), candidates.numpy()
+    near = candidates.numpy()
     on_boundary = np.zeros(len(points), dtype=bool) if boundary is None else boundary.numpy()
 
     def cloud_of(points: Tensor, normals: Tensor) -> Cloud:
@@ -177,8 +174,9 @@ def _start(
         small = cloud.small(delaunay(centered @ axes[:2].T).simplices.astype(np.int64))
         every = np.ones(len(small), dtype=bool)
         found = Candidates(small, small, every, every, up.numpy())
-        return cloud, found, True, frames, 0.0, lone
+        return cloud, found, True, 0.0, lone
     if normals is None:
+        frames = cloud_frames(points, candidates, 2, rounds=1)
         first = torch.linalg.cross(*frames.unbind(-1))
         normals = refined_normals(points, first, candidates, rounds=2)
     points, noise = denoised(points, normals, candidates)
@@ -192,7 +190,7 @@ def _start(
         normals = corrected_normals(points, normals, candidates, poles)
     side, two_sided = poles.sides(normals)
     cloud = cloud_of(points, normals)
-    return cloud, tetrahedra.candidates(cloud, side), two_sided, frames, noise, lone
+    return cloud, tetrahedra.candidates(cloud, side), two_sided, noise, lone
 
 
 def _reaches(points: Vectors, near: Nearest) -> Float[np.ndarray, " N"]:
@@ -206,13 +204,6 @@ def _reaches(points: Vectors, near: Nearest) -> Float[np.ndarray, " N"]:
     in_row = length[:, 1] < LOW**2 * length[:, 2]
     far = np.where(in_row, near[:, -1], few[:, -1])
     return REACH * np.linalg.norm(points[far] - points, axis=1)
-
-
-def _orthogonal_to(frames: Frames, normals: Points) -> Frames:
-    """Frames orthogonal to the normals, from the first given direction that is not along the normal."""
-    first, second = (frames - normals[..., None] * (normals[:, None] @ frames)).unbind(-1)
-    first = normalize(torch.where(first.norm(dim=1, keepdim=True) > 0.5, first, second))
-    return torch.stack([first, torch.linalg.cross(normals, first)], -1)
 
 
 def _chosen(cloud: Cloud, found: Candidates, two_sided: bool, pairs: Pairs) -> Faces:
