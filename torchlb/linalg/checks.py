@@ -63,6 +63,15 @@ def check_tensor(f: object, what: str = "f") -> None:
         )
 
 
+def as_floats(x: Tensor, dtype: torch.dtype) -> Tensor:
+    """x, integers and masks in the type.
+
+    >>> as_floats(torch.tensor([True]), torch.float32)
+    tensor([1.])
+    """
+    return x if x.is_floating_point() or x.is_complex() else x.to(dtype)
+
+
 def check_rows(f: Tensor, count: int) -> None:
     """Raise InputError unless f is (N,), (N, C) or (B, N, C) with N = `count`, InputTypeError unless a tensor."""
     check_tensor(f)

@@ -14,7 +14,7 @@ from torchlb.galerkin.creases import across_creases, creased_cells
 from torchlb.galerkin.matrices import PairMatrices
 from torchlb.galerkin.tangent import in_space, tangent_matrices
 from torchlb.geometry.vectors import Points
-from torchlb.linalg.checks import check_tensor
+from torchlb.linalg.checks import as_floats, check_tensor
 from torchlb.linalg.csr import Csr
 from torchlb.operator.batching import remember_shapes, shapes_of
 from torchlb.operator.medium import elements_of, plain
@@ -88,7 +88,9 @@ class Connection(PairMethods):
             raise InputError(
                 f"expected a field of shape (N, n) or (N, n, C) with N = {size}, n = {n}, got {tuple(v.shape)}"
             )
-        return torch.einsum("ind,in...->id...", self.frames.to(v), v).flatten(0, 1)
+        v = as_floats(v, self.frames.dtype)
+        with torch.autocast(v.device.type, enabled=False):
+            return torch.einsum("ind,in...->id...", self.frames.to(v), v).flatten(0, 1)
 
     def vectors(
         self, c: Float[Tensor, "rows C"] | Float[Tensor, " rows"]
@@ -99,7 +101,11 @@ class Connection(PairMethods):
             raise InputError(
                 f"expected components of shape (N d,) or (N d, C) with N d = {self.num_points}, got {tuple(c.shape)}"
             )
-        return torch.einsum("ind,id...->in...", self.frames.to(c), c.unflatten(0, (-1, self.dim)))
+        c = as_floats(c, self.frames.dtype)
+        with torch.autocast(c.device.type, enabled=False):
+            return torch.einsum(
+                "ind,id...->in...", self.frames.to(c), c.unflatten(0, (-1, self.dim))
+            )
 
     @classmethod
     def _of(cls, lb: Any, weak: PairMatrices, hodge: bool = False) -> Connection:

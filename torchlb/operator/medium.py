@@ -47,7 +47,8 @@ def checked_fields(lb: OperatorStorage, given: Given) -> MediumFields:
     for name, x in fields.items():
         if not isinstance(x, int | float | np.ndarray):
             check_tensor(x, name)
-        x = torch.as_tensor(x, device=lb.device)
+        dtype = torch.float64 if isinstance(x, int | float) else None
+        x = torch.as_tensor(x, dtype=dtype, device=lb.device)
         x = x.expand(lb.num_points) if x.ndim == 0 else x
         n, counts = lb.points.shape[1], (lb.num_points, len(lb.faces))
         tensors = name == "conductivity" and x.shape[1:] == (n, n)
@@ -58,6 +59,7 @@ def checked_fields(lb: OperatorStorage, given: Given) -> MediumFields:
                 f"{tuple(x.shape)}"
             )
         _check_values(name, x.detach().cpu().double())
+        x = x.clone() if x.is_inference() else x  # a medium may be trained
         found[name] = x.to(lb.points.dtype)
     return MediumFields(found)
 

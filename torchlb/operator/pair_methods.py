@@ -194,7 +194,8 @@ class PairMethods(OperatorStorage):
         errors = self.modes.relative_errors[..., :k]
         if not self.modes.has(k) or (tolerance is not None and (errors > tolerance).any()):
             # The basis is kept, and may be used in training.
-            with torch.inference_mode(False), threads_for(self.num_points):
+            exact = torch.autocast(self.device.type, enabled=False)
+            with torch.inference_mode(False), exact, threads_for(self.num_points):
                 check_pair(self)
                 self._keep_basis(self._solved_basis(max(k, self.modes.count), tolerance))
         if store:

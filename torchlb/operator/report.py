@@ -137,8 +137,8 @@ class StencilReport:
             lines.append("stencils                      median      95 %       max")
             for name, (middle, high, most) in quantiles.items():
                 lines.append(f"  {name:<22}{middle:12.4g}{high:10.4g}{most:10.4g}")
-            good = self.summary["reference_growth"]
-            lines.append(f"  (growth of a good stencil of the requested order: {good:.3g})")
+            if (good := self.summary.get("reference_growth")) is not None:
+                lines.append(f"  (growth of a good stencil of the requested order: {good:.3g})")
         if self.edges.any():
             lines.append(f"weak pair: {100 * self.curved_share:.2f} % of the edges curved")
             for degree, count in self.fit_counts.items():

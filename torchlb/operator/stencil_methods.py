@@ -47,7 +47,8 @@ class Curvatures:
     @property
     def directions(self) -> Float[Tensor, "N 3 2"]:
         """Unit tangent vectors of space of κ₁ and κ₂, up to their sign; any where both are equal."""
-        return self.frames @ torch.linalg.eigh(self.shape_operator).eigenvectors.flip(2)
+        with torch.autocast(self.frames.device.type, enabled=False):
+            return self.frames @ torch.linalg.eigh(self.shape_operator).eigenvectors.flip(2)
 
     @property
     def mean(self) -> Float[Tensor, " N"]:

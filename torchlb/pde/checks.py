@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from torchlb.errors import InputError, InputTypeError
-from torchlb.linalg.checks import check_finite, check_operator, check_tensor
+from torchlb.linalg.checks import as_floats, check_finite, check_operator, check_tensor
 from torchlb.operator.pair_methods import PairMethods, check_pair
 
 P = ParamSpec("P")
@@ -38,7 +38,7 @@ def as_columns(f: Tensor, lb: PairMethods) -> Tensor:
     if x.is_complex():
         raise InputError(f"expected real f, got {x.dtype}; torch.view_as_real(f) makes channels")
     check_finite(x)
-    return x if x.is_floating_point() else x.to(lb.dtype)
+    return as_floats(x, lb.dtype)
 
 
 def as_times(t: float | Tensor, x: Tensor, dtype: torch.dtype) -> Tensor:

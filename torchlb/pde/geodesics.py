@@ -167,10 +167,14 @@ def _curvature(first: np.ndarray, _: np.ndarray, sides: np.ndarray) -> Float[np.
 def _edges(lb: LaplaceBeltrami) -> tuple[np.ndarray, np.ndarray]:
     """Edges in both directions, of faces and of the P1 pair; without a weak pair, those of the stencils."""
     matrix: Any = mesh_graph(lb.faces.cpu(), lb.num_points)
-    if len(lb.faces) == 0 or lb.source not in ("mesh", "cotangent"):
+    shapes = lb._states or [{"source": lb.source}]
+    on_mesh = [shape["source"] in ("mesh", "cotangent") for shape in shapes]
+    if not all(on_mesh):
         crow, col, *_ = lb.weak.linear_pair if lb._has_weak_form else lb.stencil.pattern
-        where = (np.ones(len(col)), col.cpu().numpy(), crow.cpu().numpy())
-        near = sparse.csr_array(where, shape=lb.shape)
+        of_clouds = ~np.repeat(on_mesh, lb.sizes or [lb.num_points])
+        values = of_clouds[col.cpu().numpy()].astype(float)
+        near = sparse.csr_array((values, col.cpu().numpy(), crow.cpu().numpy()), shape=lb.shape)
+        near.eliminate_zeros()
         matrix = matrix + near + near.T
     row, column = sparse.coo_array(matrix).coords
     return row[row != column], column[row != column]

@@ -121,7 +121,8 @@ def smooth(
     check_shape(f[:, None] if f.ndim == 1 else f, lb)
     inside = check_mask(mask, lb.num_points).to(f.device).view((-1, 1) if f.ndim > 1 else -1)
     whole = heat_flow(lb, torch.where(inside, f, 0), time)
-    return torch.where(inside, whole / heat_flow(lb, inside.to(whole), time), torch.nan)
+    weight = heat_flow(lb, inside.to(whole), time)  # zero where a condition holds f at zero
+    return torch.where(inside, whole / torch.where(weight == 0, 1.0, weight), torch.nan)
 
 
 def flow(lb: PairMethods, x: Tensor, time: Tensor, method: str, k: int, tolerance: float) -> Tensor:

@@ -13,7 +13,7 @@ from torch import Tensor
 from torchlb.errors import InputError, first_few, warn
 from torchlb.galerkin.tangent import WeakGradient
 from torchlb.geometry.complex import edges_of
-from torchlb.linalg.checks import check_operator, check_tensor
+from torchlb.linalg.checks import as_floats, check_operator, check_tensor
 from torchlb.linalg.csr import Csr
 from torchlb.operator.cleaning import turned_faces
 from torchlb.operator.laplace_beltrami import LaplaceBeltrami
@@ -66,6 +66,7 @@ def hodge_decomposition(
     """
     check_operator(lb)
     check_tensor(v, "v")
+    v = as_floats(v, lb.dtype)
     check_surface(lb, "hodge_decomposition")
     if lb.sizes is not None or lb._in_medium:
         raise InputError(

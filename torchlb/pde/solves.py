@@ -197,16 +197,18 @@ def potential(
     """
     if tolerance != "P1":
         check_tolerance(tolerance)
+    check_pair(lb)
     products = []
     if source is not None:
-        mass = lb.product("mass", torch.ones_like(lb.mass)) if lb._in_medium else lb.mass
+        mass = lb.product(
+            "mass", torch.ones_like(lb.mass)
+        )  # lb.mass has linear rows where it has to
         products.append(mass.to(source.dtype)[:, None] * source)
     if field is not None:
         weighted = lb.mass.to(field.dtype)[:, None, None] * field
         products += [
             lb.stencil.product(1 + c, weighted[..., c, :], transposed=True) for c in range(lb.dim)
         ]
-    check_pair(lb)
     columns = side_by_side(sum(products[1:], products[0]).double())
     given = field if source is None else source
     assert given is not None, "neither field nor source"
@@ -246,13 +248,11 @@ def _data(lb: PairMethods, data: Tensor | float | None, kind: int, f: Tensor) ->
             missing = "the shape is closed; it has no boundary for them"
         raise InputError(f"{name}: {missing}")
     values = torch.as_tensor(data, dtype=torch.float64, device=f.device)
-    try:
-        values = values.expand(f.shape)
-    except RuntimeError as error:
+    if values.shape not in ((), f.shape):
         raise InputError(
-            f"{name}: expected the shape of f, {tuple(f.shape)}, got {tuple(values.shape)}"
-        ) from error
-    columns = side_by_side(values.double())
+            f"{name}: expected a number or the shape of f, {tuple(f.shape)}, got {tuple(values.shape)}"
+        )
+    columns = side_by_side(values.expand(f.shape))
     columns = torch.where(counts[:, None], columns, 0.0)
     check_finite(columns, name)
     return columns

@@ -14,6 +14,7 @@ from torch.nn.functional import normalize
 from torchlb.errors import InputError, first_few, warn
 from torchlb.geometry.complex import edges_of
 from torchlb.linalg.checks import (
+    as_floats,
     check_choice,
     check_operator,
     check_sources,
@@ -106,6 +107,7 @@ def parallel_transport(
     check_operator(lb)
     check_tensor(vectors, "vectors")
     index = check_sources(sources, lb.num_points).to(lb.device)
+    vectors = as_floats(vectors, lb.dtype)
     given = vectors[None] if vectors.ndim == 1 else vectors
     if given.ndim not in (2, 3) or given.shape[:2] != (len(index), lb.points.shape[1]):
         raise InputError(

@@ -28,10 +28,9 @@ def _basis(lb: Spectral, k: int) -> tuple[Eigenbasis, Tensor]:
 
 def _present(basis: Eigenbasis) -> Tensor:
     """Mask of the pairs of each shape, without padding: (k,) or (S, k)."""
-    k = torch.arange(basis.eigenvectors.shape[1], device=basis.mass.device)
     if basis.sizes is None:
-        return k >= 0
-    return k < torch.tensor(basis.sizes, device=k.device)[:, None]
+        return torch.ones_like(basis.eigenvalues, dtype=torch.bool)
+    return torch.stack([(part != 0).any(0) for part in basis.eigenvectors.split(basis.sizes)])
 
 
 def _first_positive(basis: Eigenbasis) -> Tensor:
@@ -54,7 +53,8 @@ def _evenly(start: Tensor, end: Tensor, count: int) -> Tensor:
 
 def _numbers(name: str, given: Any, values: Tensor, least: float = 0.0) -> Float[Tensor, " T"]:
     """One number or a list of them, in the type of the eigenvalues; InputError unless each is at least `least`."""
-    found = torch.as_tensor(given).to(values)
+    dtype = given.dtype if isinstance(given, Tensor) else torch.float64
+    found = torch.as_tensor(given, dtype=dtype).to(values)
     if found.ndim > 1 or not found.numel() or not bool(((found >= least) & found.isfinite()).all()):
         raise InputError(
             f"{name}: expected one finite number or more, none below {least:g}, got {shown(given)}"
