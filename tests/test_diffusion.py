@@ -10,7 +10,7 @@ import torch
 from scipy.linalg import eigh
 from torch.autograd import gradcheck
 
-from torchlb import Diffusion, InputError, LaplaceBeltrami, heat_flow
+from torchlb import Diffusion, InputError, LaplaceBeltrami, heat_flow, smooth
 from torchlb.linalg.exponential import rational_coefficients
 from torchlb.pde.heat import Method
 from torchlb.surfaces import Circle, Sphere, Torus, UnitDisk
@@ -283,3 +283,12 @@ def test_a_time_may_be_an_integer(unchecked):
 def test_learned_times_start_above_zero(time):
     with pytest.raises(InputError, match="init_time"):
         Diffusion(3, init_time=time)
+
+
+def test_smoothing_within_a_mask_is_zero_where_a_condition_holds_it():
+    lb = LaplaceBeltrami.from_mesh(*UnitDisk().mesh(200), condition="dirichlet")
+    mask = lb.points[:, 0] > 0
+    found = smooth(lb, torch.ones(200).double(), 0.5, mask=mask)
+    assert found[mask].isfinite().all()
+    assert (found[mask & lb.boundary] == 0).all()
+    assert found[~mask].isnan().all()

@@ -217,3 +217,22 @@ def test_every_point_has_normal_coordinates(build):
     torch.testing.assert_close(x.norm(dim=1), distance, rtol=0, atol=1e-9)
     moved = parallel_transport(lb, 0, torch.as_tensor(lb.frames)[0, :, 0])
     assert (moved.norm(dim=1) - 1).abs().max() < 1e-9
+
+
+def test_paths_of_a_batch_stay_on_its_meshes():
+    """Over a ridge of long triangles, where the edges of the linear pair are chords; in a batch with a cloud, too."""
+    along = 4.0 * torch.arange(6).double()
+    half = torch.full((5,), 0.5).double()
+    ridge = torch.stack([along, 0 * along, 0 * along], 1)
+    wings = [torch.stack([along[:5] + 2, side * half, half], 1) for side in (1, -1)]
+    one = torch.arange(5)
+    faces = [torch.stack([one, one + 1, one + 6], 1), torch.stack([one + 1, one, one + 11], 1)]
+    lb = LaplaceBeltrami.from_mesh(torch.cat([ridge, *wings]), torch.cat(faces), order=1)
+    expected = geodesic_distance(lb, 6)
+    assert abs(expected[11] - 2**0.5) < 1e-3
+    cloud = LaplaceBeltrami.from_points(Sphere().points(100))
+    for batch in ([lb], [lb, cloud]):
+        found = geodesic_distance(LaplaceBeltrami.batch(batch), 6)
+        torch.testing.assert_close(found[:16], expected)
+    batch = LaplaceBeltrami.batch([lb, cloud])
+    torch.testing.assert_close(geodesic_distance(batch, 16)[16:], geodesic_distance(cloud, 0))

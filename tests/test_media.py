@@ -331,6 +331,36 @@ def test_points_and_medium_together():
         assert abs(ours - theirs) < 1e-4 * abs(theirs) + 1e-6, (name, ours, theirs)
 
 
+def test_a_layer_of_one_cell():
+    """Which has no vertex of its own; two slow modes, of halves that hardly exchange, and a fast layer."""
+    lb, _ = halves(2, 33)
+    place = lb.points[lb.faces][..., 0].mean(1)
+    layer = (place > 0.5) & (place < 0.5 + 1 / 32)
+    fast = lb.with_medium(torch.where(layer, 1e3, 1.0).double()).eigenbasis(4).eigenvalues
+    slow = lb.with_medium(torch.where(layer, 1e-3, 1.0).double()).eigenbasis(4).eigenvalues
+    width = 1 / 32
+    expected = brentq(lambda s: s * np.tan(s / 2 - s * width / 2) - 2e-3 / width, 1e-3, 1.0) ** 2
+    assert abs(slow[1] / expected - 1) < 0.1
+    assert abs(fast[1] / np.pi**2 - 1) < 0.1
+
+
+def test_the_part_of_a_tensor_across_the_surface_does_not_jump():
+    lb, _ = halves(2, 17)
+    across = torch.rand(len(lb.faces)).double().mul(7).exp()
+    tensors = torch.diag_embed(torch.stack([across**0, across**0, across], 1))
+    expected = lb.with_medium(density=1.0).stiffness.to_dense()
+    torch.testing.assert_close(lb.with_medium(tensors).stiffness.to_dense(), expected)
+
+
+@pytest.mark.parametrize("order", [3, 4])
+def test_a_condition_stays_after_a_medium_that_jumps(order):
+    """In a solid, with a potential."""
+    lb, kappa = halves(3, 5, order=order, condition=Robin(2.0))
+    again = lb.with_medium(kappa, potential=1.0).with_medium(potential=2.0)
+    torch.testing.assert_close(again.weak.values, lb.with_medium(potential=2.0).weak.values)
+    assert abs(float(lb.with_medium(kappa).weak.values[3].sum()) - 12) < 1e-6
+
+
 @pytest.mark.usefixtures("unchecked")
 @pytest.mark.parametrize("order", [3, 5])
 @pytest.mark.parametrize("condition", ["neumann", Robin(2.0)])

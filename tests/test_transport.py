@@ -14,6 +14,7 @@ from torchlb import (
     hodge_decomposition,
     logarithmic_map,
     parallel_transport,
+    vector_heat_flow,
 )
 from torchlb.surfaces import Circle, CliffordTorus, Hemisphere, Sphere, Torus
 
@@ -237,3 +238,32 @@ def test_heat_that_may_reverse_vectors_is_told():
     reversed_ = moved[:, 0] < 0
     assert 0 < reversed_.sum() < 20
     assert parallel_transport(lb, 400, axis, method="paths")[:, 0].min() > 0.99
+
+
+def test_integers_are_vectors():
+    """They were cut off to integers on the way."""
+    lb = LaplaceBeltrami.from_mesh(*Sphere().mesh(200))
+    up = torch.tensor([0, 0, 1]).repeat(200, 1)
+    calls = [
+        lambda v: parallel_transport(lb, 0, v[0]),
+        lambda v: vector_heat_flow(lb, v, 0.1),
+        lambda v: hodge_decomposition(lb, v).gradient,
+        lambda v: lb.connection.components(v),
+        lambda v: lb.connection.vectors(v[:, 1:].flatten()),
+    ]
+    for call in calls:
+        for given in (up, up > 0):
+            torch.testing.assert_close(call(given), call(up.double()))
+
+
+def test_tangent_fields_keep_their_type_under_autocast():
+    lb = LaplaceBeltrami.from_mesh(*Sphere().mesh(700)).to(torch.float32)
+    v = lb.points.roll(1, 1)
+    expected = vector_heat_flow(lb, v, 0.1), lb.curvatures().directions
+    lb = LaplaceBeltrami.from_mesh(*Sphere().mesh(700)).to(torch.float32)
+    with torch.autocast("cpu", dtype=torch.bfloat16):
+        found = vector_heat_flow(lb, v, 0.1), lb.curvatures().directions
+        assert lb.eigenbasis(5).eigenvalues.dtype == torch.float32
+    for one, other in zip(found, expected, strict=True):
+        assert one.dtype == torch.float32
+        torch.testing.assert_close(one, other, rtol=1e-4, atol=1e-4)

@@ -101,7 +101,8 @@ class Forms:
         jumps, p, numbering = self.jumps(medium), self.fits, self.numbering
         if jumps is None or p is None or numbering is None:
             return self
-        p = p.one_sided(Jumps(*(numbering.sorted(x) for x in jumps)))
+        here = jumps._replace(at=numbering.sorted(jumps.at), cells=numbering.here[jumps.cells])
+        p = p.one_sided(here)
         return replace(self, prolongation=_restored(p.matrix(), numbering), fits=p)
 
     def jumps(self, medium: Medium) -> Jumps | None:
@@ -110,12 +111,13 @@ class Forms:
         if field is None or not field.on_faces:
             return None
         for lot in self.lots:
-            logs = field.transforms[0](_along(partial(times, lot.mix), field.values.detach()))
-            corners = lot.nodes[:, : lot.element.dim + 1]
-            logs = logs.view(len(logs), -1).repeat_interleave(corners.shape[1], 0)
-            parts.append((corners.flatten(), logs))
-        vertices, logs = (torch.cat(column) for column in zip(*parts, strict=True))
-        found = Jumps.of(vertices, logs, len(self.given))
+            a = _along(partial(times, lot.mix), field.values.detach())
+            if a.ndim == 3:
+                a = _tangential(a, orthonormal(lot.slopes(self.places)[:, 0]))
+            logs = field.transforms[0](a)
+            parts.append((lot.nodes[:, : lot.element.dim + 1], logs.view(len(a), -1)))
+        cells, logs = (torch.cat(column) for column in zip(*parts, strict=True))
+        found = Jumps.of(cells, logs, len(self.given))
         return found if bool(found.at.any()) else None
 
     def values(self, field: Field, prolong: Linear | None = None) -> list[Tensor]:
@@ -215,6 +217,17 @@ class Forms:
 def _renumbered(matrix: Any, columns: Int[Tensor, " C"], count: int) -> sparse.csr_array:
     parts = matrix.data, columns.numpy()[matrix.indices], matrix.indptr
     return sparse.csr_array(parts, shape=(matrix.shape[0], count))
+
+
+def _tangential(
+    a: Float[Tensor, "T n n"], tangents: Float[Tensor, "T n d"]
+) -> Float[Tensor, "T n n"]:
+    """Tensors with the same part along a cell, and the mean of that across it."""
+    own = tangents.mT @ a @ tangents
+    mean = own.diagonal(dim1=1, dim2=2).mean(1)[:, None, None]
+    turn = torch.eye(own.shape[1], dtype=a.dtype)
+    across = mean * torch.eye(a.shape[1], dtype=a.dtype)
+    return across + tangents @ (own - mean * turn) @ tangents.mT
 
 
 def _restored(p: Any, numbering: Numbering) -> sparse.csr_array:

@@ -7,14 +7,16 @@ from functools import partial
 from math import log
 from typing import Any, Literal, NamedTuple
 
+import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int, Shaped
+from scipy import sparse
 from torch import Tensor
 
 from torchlb.geometry.thresholds import FACTOR
 from torchlb.geometry.vectors import dot
 from torchlb.linalg.once import once_differentiable
-from torchlb.linalg.precision import TINY
+from torchlb.linalg.precision import ROOT_EPS, TINY
 
 FieldName = Literal["conductivity", "density", "potential"]
 Map = Callable[[Tensor], Tensor]
@@ -50,48 +52,66 @@ Medium = Mapping[str, Field]
 
 
 class Jumps(NamedTuple):
-    """Where a conductivity on the faces jumps: `at` the vertices whose faces differ by more than `FACTOR`.
+    """Where a conductivity on the faces jumps, by more than `FACTOR`: `at` vertices whose cells differ.
 
-    `extremes` are the largest logarithms at the faces of each vertex, for a tensor of each entry, and the largest of
-    their negatives.
+    The cells have logarithms `logs`, of every entry of a tensor.
     """
 
     at: Bool[Tensor, " N"]
-    extremes: Float[Tensor, "N c"]
+    cells: Int[Tensor, "T corners"]
+    logs: Float[Tensor, "T c"]
 
     @classmethod
-    def of(cls, vertices: Int[Tensor, " e"], logs: Float[Tensor, "e c"], count: int) -> Jumps:
-        """The jumps at so many vertices, from the logarithms at the corners of all faces.
+    def of(cls, cells: Int[Tensor, "T corners"], logs: Float[Tensor, "T c"], count: int) -> Jumps:
+        """The jumps at so many vertices.
 
-        >>> logs = torch.tensor([0.0, 0.0, 7.0, 7.0])[:, None]
-        >>> jumps = Jumps.of(torch.tensor([0, 1, 1, 2]), logs, 3)
+        >>> logs = torch.tensor([[0.0], [0.0], [7.0]])
+        >>> jumps = Jumps.of(torch.tensor([[0, 1], [1, 2], [2, 3]]), logs, 4)
         >>> jumps.at
-        tensor([False,  True, False])
-        >>> jumps.between(torch.tensor([0, 0, 1, 1, 1]), torch.tensor([0, 1, 0, 1, 2]), 2)
+        tensor([False, False,  True, False])
+        >>> jumps.inside(torch.tensor([0, 0, 0, 1, 1, 1]), torch.tensor([0, 1, 2, 1, 2, 3]), 2)
         tensor([False,  True])
         """
-        found = _extremes(vertices, torch.cat([logs, -logs], 1), count)
-        return cls(_differ(found), found)
+        corners = cells.shape[1]
+        every = logs.repeat_interleave(corners, 0)
+        return cls(_differ(cells.flatten(), every, count), cells, logs)
 
-    def between(
+    def reached(
         self, groups: Int[Tensor, " e"], vertices: Int[Tensor, " e"], count: int
     ) -> Bool[Tensor, " G"]:
-        """Whether each of so many groups of vertices has some on both sides of a jump."""
-        on = self.at[vertices]
-        near = self.at.new_zeros(count).index_fill(0, groups[on], True)
-        return near & _differ(_extremes(groups[~on], self.extremes[vertices[~on]], count))
+        """Whether each of so many groups of vertices has one where the conductivity jumps."""
+        return self.at.new_zeros(count).index_fill(0, groups[self.at[vertices]], True)
+
+    def inside(
+        self, groups: Int[Tensor, " e"], vertices: Int[Tensor, " e"], count: int
+    ) -> Bool[Tensor, " G"]:
+        """Whether it jumps between cells whose corners are all in one group of vertices, of each of so many."""
+        some, corners = self.reached(groups, vertices, count)[groups], self.cells.shape[1]
+        pairs = [
+            (groups[some], vertices[some]),
+            (self.cells.flatten(), torch.arange(self.cells.numel()) // corners),
+        ]
+        sizes = (count, len(self.at)), (len(self.at), len(self.cells))
+        of, uses = (
+            sparse.csr_array(
+                (np.ones(len(row)), (row.cpu().numpy(), col.cpu().numpy())), shape=size
+            )
+            for (row, col), size in zip(pairs, sizes, strict=True)
+        )
+        of.data[:] = 1  # points stand twice where there are few
+        found = sparse.coo_array(of @ uses)
+        whole = found.data == corners
+        group, cell = (torch.from_numpy(x[whole]).to(self.cells) for x in found.coords)
+        return _differ(group, self.logs[cell], count)
 
 
-def _extremes(groups: Tensor, values: Tensor, count: int) -> Float[Tensor, "G c"]:
-    """Largest values of each group, −∞ of an empty one."""
-    found = values.new_full((count, values.shape[1]), -torch.inf)
-    return found.scatter_reduce(0, groups[:, None].expand_as(values), values, "amax")
-
-
-def _differ(extremes: Float[Tensor, "G c"]) -> Bool[Tensor, " G"]:
-    """Whether the logarithms of each group, whose extremes these are, differ by more than that of `FACTOR`."""
-    high, low = extremes.chunk(2, 1)
-    return (high + low).amax(1) > log(FACTOR)
+def _differ(groups: Tensor, logs: Float[Tensor, "e c"], count: int) -> Bool[Tensor, " G"]:
+    """Whether logarithms in one group differ by more than that of `FACTOR`, and rounding."""
+    signed = torch.cat([logs, -logs], 1)
+    most = signed.new_full((count, signed.shape[1]), -torch.inf)
+    most = most.scatter_reduce(0, groups[:, None].expand_as(signed), signed, "amax")
+    high, low = most.chunk(2, 1)
+    return (high + low).amax(1) > log(FACTOR) + ROOT_EPS
 
 
 class _SpectralFunction(torch.autograd.Function):

@@ -40,12 +40,12 @@ class Prolongation(NamedTuple):
         over = torch.zeros_like(jumps.at)
         for block in self.plan.functions:
             row = torch.arange(len(block.points)).repeat_interleave(block.points.shape[1])
-            over[block.vertices] = jumps.between(row, block.points.flatten(), len(block.points))
+            over[block.vertices] = jumps.inside(row, block.points.flatten(), len(block.points))
         kept = torch.where(over[ends.vertex], 0.0, ends.share)
         total = kept.new_zeros(len(bent)).index_add(0, ends.node, kept)
         sound = total > (0 if self.plan.reach == 1 else 1 - ROUNDING)
         node, vertex, _ = boundary.entries
-        sound[boundary.nodes] = ~jumps.between(node, vertex, len(bent))[boundary.nodes]
+        sound[boundary.nodes] = ~jumps.reached(node, vertex, len(bent))[boundary.nodes]
         bent, none = bent & sound, total == 0
         share = (kept / torch.where(none, 1.0, total)[ends.node]).where(bent[ends.node], ends.share)
         mesh = replace(self.mesh, ends=replace(ends, share=share))

@@ -20,6 +20,8 @@ _spare: ContextVar[bool] = ContextVar("spare", default=False)
 def threads_for(num_points: int) -> Iterator[None]:
     """Context with one thread if there are few points; the former number is restored afterwards.
 
+    For no points at all there is none to spare, either.
+
     >>> before = torch.get_num_threads()
     >>> with threads_for(100):
     ...     torch.get_num_threads()
@@ -28,16 +30,18 @@ def threads_for(num_points: int) -> Iterator[None]:
     True
     """
     threads = torch.get_num_threads()
-    if threads == 1 or num_points > FEW:  # other threads may be about to restore theirs
-        yield
-        return
-    torch.set_num_threads(1)
-    spare = _spare.set(True)
+    few = (
+        threads > 1 and num_points <= FEW
+    )  # with one, other threads may be about to restore theirs
+    spare = _spare.set(few and num_points > 0)
+    if few:
+        torch.set_num_threads(1)
     try:
         yield
     finally:
         _spare.reset(spare)
-        torch.set_num_threads(threads)
+        if few:
+            torch.set_num_threads(threads)
 
 
 def beside(
@@ -45,7 +49,8 @@ def beside(
 ) -> Callable[[], Result]:
     """Compute beside what follows if `threads_for` has left a thread to spare, else at once; calling it is waiting.
 
-    The function must not warn, since warnings name the line that called the package, nor need gradients.
+    The function must not warn, since warnings name the line that called the package, nor need gradients. Where what
+    follows fails it goes on to its end.
 
     >>> found = beside(sum, [1, 2])
     >>> found()

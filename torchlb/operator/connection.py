@@ -6,7 +6,7 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Shaped
 from torch import Tensor
 
 from torchlb.errors import DerivativeError, InputError
@@ -76,7 +76,7 @@ class Connection(PairMethods):
         return self.cache.connection
 
     def components(
-        self, v: Float[Tensor, "N n C"] | Points
+        self, v: Shaped[Tensor, "N n C"] | Shaped[Tensor, "N n"]
     ) -> Float[Tensor, "rows C"] | Float[Tensor, " rows"]:
         """Components in the frames, (N d, C) or (N d,), of the tangential part of the space vectors `v`.
 
@@ -93,7 +93,7 @@ class Connection(PairMethods):
             return torch.einsum("ind,in...->id...", self.frames.to(v), v).flatten(0, 1)
 
     def vectors(
-        self, c: Float[Tensor, "rows C"] | Float[Tensor, " rows"]
+        self, c: Shaped[Tensor, "rows C"] | Shaped[Tensor, " rows"]
     ) -> Float[Tensor, "N n C"] | Points:
         """The tangent field of space vectors, (N, n, C) or (N, n), with components `c`, (N d, C) or (N d,)."""
         check_tensor(c, "c")

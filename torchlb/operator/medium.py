@@ -7,7 +7,6 @@ from typing import Any
 
 import numpy as np
 import torch
-from scipy import sparse
 from torch import Tensor
 from torch.nn.functional import pad
 
@@ -22,6 +21,7 @@ from torchlb.linalg.precision import ROOT_EPS, ROUNDING
 from torchlb.operator.inputs import ArrayLike
 from torchlb.operator.parts import MediumFields
 from torchlb.operator.storage import OperatorStorage
+from torchlb.stencils.conditions import condition_of
 
 Given = Mapping[str, ArrayLike | float | None]
 
@@ -124,45 +124,47 @@ def pair_in(lb: OperatorStorage, medium: Medium) -> PairMatrices:
                 f"{faces[0]}: some points of this cloud have local triangles beside the faces; give it at the vertices"
             )
     with torch.no_grad():
-        medium, weak = plain(medium), lb.weak
+        medium = plain(medium)
         elements = elements.in_medium(medium)
         values = {name: elements.values(field) for name, field in medium.items()}
-        whole = _stored(elements.matrix, values, weak, elements.given, _boundary(elements, weak))
-        linear = None
-        if weak.linear.num_rows:
-            rest = _channels(weak.linear)
-            linear = _stored(elements.near, values, weak.linear, elements.given, rest)
-    return PairMatrices(whole.crow, whole.col, whole.values, linear)
+        whole, *added = _matrices(
+            elements.matrix, values, elements.given, _boundary(elements, lb.weak)
+        )
+        near = None
+        if lb.weak.linear.num_rows:
+            near, *others = _matrices(elements.near, values, elements.given, [])
+            added += others
+        pair = PairMatrices(whole.crow, whole.col, whole.values, near)
+        condition = condition_of(lb.condition)
+        if condition is not None and condition.share is not None and len(lb._on_boundary):
+            points, on_boundary = (x.detach().cpu().double() for x in (lb.points, lb._on_boundary))
+            a = torch.as_tensor(condition.share).to(points) * on_boundary
+            pair = pair.absorbing(points, lb.faces.cpu(), a)
+        each = [pair, *([pair.linear] if pair.linear.num_rows else [])]
+        for part, potential in zip(each, added, strict=False):
+            part.values = torch.cat([pad(part.values, (0, 0, 0, 4 - len(part.values))), potential])
+    whole, *near = (Csr(part.crow, part.col, part.values).to(lb.weak.values) for part in each)
+    return PairMatrices(whole.crow, whole.col, whole.values, *near)
 
 
 def _boundary(elements: Forms, weak: PairMatrices) -> list[Any]:
-    """B, and what Robin's condition adds to K, with the prolongation of the elements."""
-    fits, numbering = elements.fits, elements.numbering
-    if fits is None or not weak.has_boundary:
-        return _channels(weak)
-    p, root = elements.prolongation, weak.root_of_absorption
-    b = boundary_mass(fits.curving, fits.mesh, p, numbering)
-    if root is None:
-        return [b]
-    scale: Any = sparse.diags_array(root[:, 0].cpu().numpy())
-    return [b, scale @ b @ scale]
+    """B with the prolongation of the elements, if there is a boundary."""
+    fits = elements.fits
+    if not weak.has_boundary:
+        return []
+    if fits is None:
+        return [weak.to_scipy(2)]
+    return [boundary_mass(fits.curving, fits.mesh, elements.prolongation, elements.numbering)]
 
 
-def _channels(pair: Csr) -> list[Any]:
-    """B, and what a condition adds to K, of a pair that has them."""
-    return [pair.to_scipy(channel) for channel in range(2, min(len(pair.values), 4))]
-
-
-def _stored(
-    matrix: Any, fields: dict[str, list[Tensor]], pair: Csr, given: Tensor, rest: list[Any]
-) -> Csr:
-    """K and M in a medium from upper triangles, with the `rest`, and what the potential adds to K."""
+def _matrices(
+    matrix: Any, fields: dict[str, list[Tensor]], given: Tensor, rest: list[Any]
+) -> tuple[Any, ...]:
+    """K, M and the rest in a medium, from upper triangles, and the matrix of the potential, if there is one."""
     kappa, rho, c = (fields.get(name) for name in ("conductivity", "density", "potential"))
     upper = matrix(kappa, rho)
     pattern = Pattern.of(upper, given)
     found = pattern.pair(upper).beside(rest)
-    values = found.values
-    if c is not None:
-        potential = torch.from_numpy(pattern.whole(matrix(None, c).data.imag))
-        values = torch.cat([pad(values, (0, 0, 0, 4 - len(values))), potential[None]])
-    return Csr(found.crow, found.col, values).to(pair.values)
+    if c is None:
+        return (found,)
+    return found, torch.from_numpy(pattern.whole(matrix(None, c).data.imag))[None]

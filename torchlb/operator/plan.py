@@ -90,7 +90,9 @@ class Plan:
         """The elements of the weak pair at the user's points, in the user's numbering."""
         here = self._sorted(points)
         _, fits = self.shape.at(here)
-        return self.pair.forms(fits).restored(self.numbering, self.order, len(self.faces))
+        forms = self.pair.forms(fits)
+        fits.heights, fits.second = (x[:0].clone() for x in (fits.heights, fits.second))
+        return forms.restored(self.numbering, self.order, len(self.faces))
 
     def bilinear(
         self,

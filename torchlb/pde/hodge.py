@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Int, Shaped
 from torch import Tensor
 
 from torchlb.errors import InputError, first_few, warn
@@ -44,7 +44,7 @@ class HodgeParts:
 
 
 def hodge_decomposition(
-    lb: LaplaceBeltrami, v: Float[Tensor, "N n C"] | Float[Tensor, "N n"]
+    lb: LaplaceBeltrami, v: Shaped[Tensor, "N n C"] | Shaped[Tensor, "N n"]
 ) -> HodgeParts:
     """The gradient, the rotated gradient and the harmonic part of the tangential part of v; they add up to it.
 

@@ -250,7 +250,7 @@ def _data(lb: PairMethods, data: Tensor | float | None, kind: int, f: Tensor) ->
     values = torch.as_tensor(data, dtype=torch.float64, device=f.device)
     if values.shape not in ((), f.shape):
         raise InputError(
-            f"{name}: expected a number or the shape of f, {tuple(f.shape)}, got {tuple(values.shape)}"
+            f"{name}: expected the shape of f, {tuple(f.shape)}, or a number, got {tuple(values.shape)}"
         )
     columns = side_by_side(values.expand(f.shape))
     columns = torch.where(counts[:, None], columns, 0.0)

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from typing import Any, Literal
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Float, Int, Shaped
 from torch import Tensor
 from torch.nn.functional import normalize
 
@@ -38,7 +38,7 @@ FARTHEST = -math.log(torch.finfo(torch.float32).tiny)
 @takes_arrays
 def vector_heat_flow(
     lb: LaplaceBeltrami,
-    v: Float[Tensor, "N n C"] | Float[Tensor, "N n"],
+    v: Shaped[Tensor, "N n C"] | Shaped[Tensor, "N n"],
     t: float | Tensor,
     *,
     tolerance: float = ROOT_EPS,
@@ -71,7 +71,7 @@ def vector_heat_flow(
 def parallel_transport(
     lb: LaplaceBeltrami,
     sources: int | Sequence[int] | Int[Tensor, " S"],
-    vectors: Float[Tensor, " n"] | Float[Tensor, "S n"] | Float[Tensor, "S n C"],
+    vectors: Shaped[Tensor, " n"] | Shaped[Tensor, "S n"] | Shaped[Tensor, "S n C"],
     *,
     method: Transport | None = None,
 ) -> Float[Tensor, "N n"] | Float[Tensor, "N n C"]:
