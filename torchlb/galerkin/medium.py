@@ -7,7 +7,6 @@ from functools import partial
 from math import log
 from typing import Any, Literal, NamedTuple
 
-import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int, Shaped
 from scipy import sparse
@@ -85,24 +84,25 @@ class Jumps(NamedTuple):
     def inside(
         self, groups: Int[Tensor, " e"], vertices: Int[Tensor, " e"], count: int
     ) -> Bool[Tensor, " G"]:
-        """Whether it jumps between cells whose corners are all in one group of vertices, of each of so many."""
-        some, corners = self.reached(groups, vertices, count)[groups], self.cells.shape[1]
-        pairs = [
-            (groups[some], vertices[some]),
-            (self.cells.flatten(), torch.arange(self.cells.numel()) // corners),
-        ]
-        sizes = (count, len(self.at)), (len(self.at), len(self.cells))
-        of, uses = (
-            sparse.csr_array(
-                (np.ones(len(row)), (row.cpu().numpy(), col.cpu().numpy())), shape=size
-            )
-            for (row, col), size in zip(pairs, sizes, strict=True)
-        )
-        of.data[:] = 1  # points stand twice where there are few
-        found = sparse.coo_array(of @ uses)
-        whole = found.data == corners
-        group, cell = (torch.from_numpy(x[whole]).to(self.cells) for x in found.coords)
+        """Whether it jumps between cells of one group of vertices, for each of so many.
+
+        These are cells with all corners in the group, and those with one there at which it does not jump.
+        """
+        some = self.reached(groups, vertices, count)[groups]
+        (size, corners), points, ends = self.cells.shape, len(self.at), self.cells.flatten()
+        cell = torch.arange(len(ends), device=ends.device) // corners
+        enough = torch.where(self.at[ends], 1, corners)
+        own = _matrix(torch.ones_like(ends[:1]), groups[some], vertices[some], (count, points))
+        own.data[:] = 1  # points stand twice where there are few
+        met = sparse.coo_array(own @ _matrix(enough, ends, cell, (points, size)))
+        within = met.data >= corners
+        group, cell = (torch.from_numpy(x[within]).to(ends) for x in met.coords)
         return _differ(group, self.logs[cell], count)
+
+
+def _matrix(values: Tensor, row: Tensor, col: Tensor, shape: tuple[int, int]) -> Any:
+    entries = values.expand_as(row).cpu().numpy(), (row.cpu().numpy(), col.cpu().numpy())
+    return sparse.csr_array(entries, shape=shape)
 
 
 def _differ(groups: Tensor, logs: Float[Tensor, "e c"], count: int) -> Bool[Tensor, " G"]:
