@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import torch
 from scipy.linalg import eigh
+from scipy.special import j0, j1, jn_zeros
 from torch.autograd import gradcheck
 
 from torchlb import Diffusion, InputError, LaplaceBeltrami, heat_flow, smooth
@@ -262,7 +263,7 @@ def test_the_derivative_in_the_time_at_zero_is_that_from_above(condition):
 
 @pytest.mark.usefixtures("unchecked")
 def test_derivatives_where_a_dirichlet_condition_holds_and_f_does_not_vanish():
-    """Values there count for nothing: not in ∂/∂t, and ∂/∂f is zero at these points."""
+    """The flow starts from the closest function that does, which values there have a part in."""
     lb = LaplaceBeltrami.from_mesh(*UnitDisk().mesh(200), condition="dirichlet")
     f, w = (torch.randn(200, generator=torch.Generator().manual_seed(s)).double() for s in (0, 1))
     f.requires_grad_()
@@ -272,7 +273,13 @@ def test_derivatives_where_a_dirichlet_condition_holds_and_f_does_not_vanish():
     step = 1e-5
     before, after = (heat_flow(lb, f, 0.03 + s, tolerance=1e-12) for s in (-step, step))
     torch.testing.assert_close(slope, w @ (after - before) / (2 * step), rtol=1e-5, atol=0.0)
-    assert not of_f[lb.fixed].any()
+    with torch.no_grad():
+        boundary = torch.where(lb.fixed, f, 0.0)
+        change = heat_flow(lb, f, time, tolerance=1e-11) - heat_flow(
+            lb, f - boundary, time, tolerance=1e-11
+        )
+    torch.testing.assert_close(of_f @ boundary, w @ change, rtol=1e-6, atol=0.0)
+    assert (of_f[lb.fixed] != 0).all()
 
 
 def test_a_time_may_be_an_integer(unchecked):
@@ -292,3 +299,17 @@ def test_smoothing_within_a_mask_is_zero_where_a_condition_holds_it():
     assert found[mask].isfinite().all()
     assert (found[mask & lb.boundary] == 0).all()
     assert found[~mask].isnan().all()
+
+
+@pytest.mark.parametrize("method", ["rational", "spectral"])
+def test_heat_leaves_a_disk_through_a_cold_boundary(method):
+    """Of one everywhere: 2 Σ_k J₀(j_k r) e^{−j_k² t} / (j_k J₁(j_k)), and its derivative in what is at the boundary."""
+    lb = LaplaceBeltrami.from_mesh(*UnitDisk().mesh(500), condition="dirichlet")
+    roots, r = torch.from_numpy(jn_zeros(0, 20)), lb.points.norm(dim=1)[:, None]
+    exact = (2 * j0(roots * r) * torch.exp(-0.2 * roots**2) / (roots * j1(roots))).sum(1)
+    ones = torch.ones(500, dtype=torch.float64, requires_grad=True)
+    found = heat_flow(lb, ones, 0.2, method=method)
+    assert (found - exact).abs().max() < 2e-5
+    (slope,) = torch.autograd.grad(found.sum(), ones)
+    assert (slope[lb.fixed] != 0).all()
+    torch.testing.assert_close(slope @ ones.detach(), found.detach().sum())

@@ -25,7 +25,7 @@ from torchlb.linalg.conjugate_gradients import Linear
 from torchlb.linalg.csr import shaped_like, side_by_side
 from torchlb.linalg.exponential import chebyshev_vectors, poles, rational_coefficients
 from torchlb.linalg.once import once_differentiable
-from torchlb.linalg.precision import ROOT_EPS
+from torchlb.linalg.precision import ROOT_EPS, ROUNDING
 from torchlb.linalg.sparse import compute_dtype
 from torchlb.operator.checks import check_tolerance
 from torchlb.operator.inputs import check_mask
@@ -34,6 +34,7 @@ from torchlb.operator.pair_methods import PairMethods, check_pair
 from torchlb.operator.systems import PairSystem, pair_system
 from torchlb.operator.through import Origins, origins
 from torchlb.pde.checks import as_columns, as_times, check_shape, uncompiled
+from torchlb.pde.solves import implicit_step
 
 Method = Literal["rational", "spectral"]
 
@@ -59,7 +60,8 @@ def heat_flow(
     lb
         Operator of one shape, or of a batch.
     f
-        (N,), (N, C) or (B, N, C).
+        (N,), (N, C) or (B, N, C). With Dirichlet's condition the flow starts from the closest function that is zero
+        along the boundary.
     t
         Time ≥ 0 in ℓ², one for all channels or (C,). (In a time t a peak spreads to a width of √(2t).)
     method
@@ -83,9 +85,19 @@ def heat_flow(
     dtype = compute_dtype(x, lb.mass)
     time = as_times(t, x, dtype)
     with torch.autocast(x.device.type, enabled=False):
-        y = flow(lb, x.to(dtype), time, method, k, tolerance)
+        y = flow(lb, _vanishing(lb, x.to(dtype)), time, method, k, tolerance)
     y = y.to(x.dtype) if x.dtype.itemsize < 4 else y
     return y[:, 0] if f.ndim == 1 else y
+
+
+def _vanishing(lb: PairMethods, x: Tensor) -> Tensor:
+    """The functions closest to x, in the norm of M, of those that are zero at Dirichlet points."""
+    if lb.fixed is None:
+        return x
+    known = not torch.compiler.is_compiling() and not x.requires_grad
+    if known and not bool(x[..., lb.fixed, :].any()):
+        return x
+    return implicit_step(lb, x, 0.0, tolerance=ROUNDING)
 
 
 @takes_arrays
