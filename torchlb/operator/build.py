@@ -218,15 +218,15 @@ def finished(
         waiting = beside(mesh_pair, cells, *own, *rest)
         if not shape.condition.conserves:  # low-order rows need the mass
             shape = replace(shape, mass=waiting()[2])
-    if surface is not None:
-        doubts.warn_of_joins(surface)
     stencils = Stencils(shape, options)
     rows, certificate = assemble(stencils, progress=progress), None
     if waiting is not None:
         pair_plan, pair, mass = waiting()
         plan, shape = replace(plan, pair=pair_plan), replace(shape, mass=mass)
-        if surface is not None:
+    if surface is not None:
+        if pair is not None:
             doubts.warn_of_doubts(surface, fits, shape.areas)
+        doubts.warn_of_joins(surface)
     if options.certify:
         last, outflow = len(stencils.candidates), not shape.condition.conserves
         rows, mass, certificate = certify(
