@@ -75,8 +75,7 @@ class Forms:
     def restored(self, numbering: Numbering, order: Int[Tensor, " G"], num_faces: int) -> Forms:
         """Renumber to the user's points and `num_faces` faces; `order` has the user's numbers of the faces here."""
         given = numbering.given
-        beyond = torch.arange(len(given), len(self.places))  # nodes that are no vertices
-        number, rows = torch.cat([given, beyond]), torch.cat([numbering.here, beyond])
+        number, rows = numbering.of_nodes(len(self.places))
         lots = [
             replace(
                 lot,
@@ -232,9 +231,8 @@ def _tangential(
 
 def _restored(p: Any, numbering: Numbering) -> sparse.csr_array:
     """P in the user's numbers of the points."""
-    beyond = np.arange(p.shape[1], p.shape[0])
-    rows = np.concatenate([numbering.here.numpy(), beyond])
-    return _renumbered(p[rows], numbering.given, p.shape[1])
+    _, rows = numbering.of_nodes(p.shape[0])
+    return _renumbered(p[rows.numpy()], numbering.given, p.shape[1])
 
 
 def _mean(values: Float[Tensor, "T Q ..."], element: Element, other: Element) -> Tensor:

@@ -180,8 +180,7 @@ class PairPlan:
         """
         mesh = self.curving.at(self.fits, fits)
         elements = self.forms(fits, mesh, prolong=False)
-        p = elements.fits
-        assert p is not None
+        p = Prolongation(self.fits, fits, self.curving, mesh)
         needed = {bool(form.along) for form in forms}
         kinds = {along: for_fields(elements) if along else elements for along in needed}
         jumps = elements.jumps(medium)
@@ -190,14 +189,14 @@ class PairPlan:
         flat = self.curving.bent.index_fill(0, self.lowered, False)
         lower = p._replace(curving=replace(self.curving, bent=flat))
         total = []
-        for lumped, own in ((False, here), (True, lower)):
+        for lumped, prolong in ((False, here), (True, lower)):
             chosen = [form for form in forms if (form.name == "lumped") == lumped]
             functions = {id(f): f for form in chosen for f in (form.w, form.u)}
             if not chosen:
                 continue
             widths = [f.shape[1] for f in functions.values()]
             every = torch.cat(list(functions.values()), 1)
-            at_nodes = own.times(every).split(widths, 1)
+            at_nodes = prolong.times(every).split(widths, 1)
             nodes = dict(zip(functions, at_nodes, strict=True))
             for form in chosen:
                 both, along = [nodes[id(form.w)], nodes[id(form.u)]], bool(form.along)
@@ -360,9 +359,10 @@ def boundary_mass(
     if len(plan.nodes.boundary()[0]) == 0:
         return None
     rim, shares = boundary_elements(plan, mesh)
-    number = torch.arange(len(mesh.places))
+    nodes = rim.nodes
     if numbering is not None:
-        number[: len(shares)], shares = numbering.given, numbering.restored(shares)
+        number, _ = numbering.of_nodes(len(mesh.places))
+        nodes, shares = number[nodes], numbering.restored(shares)
     blocks = (rim.element.weights * area_element(rim.metric)) @ squares(rim.element)
-    result = p.T @ summed(blocks, number[rim.nodes], len(mesh.places)) @ p
+    result = p.T @ summed(blocks, nodes, len(mesh.places)) @ p
     return (result + result.T) / 2 + sparse.diags_array(shares.numpy(), format="csr")

@@ -110,10 +110,11 @@ class LocalFits:
             found.coefficients.append(kept)
         return found
 
-    def let_go(self) -> None:
-        """Release the graphs and the fits of functions, which are not needed once there is a pair."""
+    def let_go(self, *, functions: bool = True) -> None:
+        """Release the graphs, not needed once there are elements, and the fits of functions, once there is a pair."""
         self.heights, self.second = self.heights[:0].clone(), self.second[:0].clone()
-        self.coefficients = []
+        if functions:
+            self.coefficients = []
 
     def fit(self, block: Neighborhoods) -> tuple[CenteredFit, Tensor, Tensor]:
         """Fit polynomials around some vertices; return the fits, and offsets and coordinates of the neighbours.

@@ -42,6 +42,11 @@ class Numbering:
         """Inverse of `sorted`."""
         return values[self.here]
 
+    def of_nodes(self, count: int) -> tuple[Int[Tensor, " X"], Int[Tensor, " X"]]:
+        """As `given` and `here`, of so many nodes, the points first, those beyond them with numbers of their own."""
+        beyond = torch.arange(len(self.given), count)
+        return torch.cat([self.given, beyond]), torch.cat([self.here, beyond])
+
     def faces(self, faces: Int[Tensor, "F v"]) -> tuple[Int[Tensor, "F v"], Int[Tensor, " F"]]:
         """(faces in the numbers of the tree, sorted by their lowest; the position of each among `faces`)."""
         faces = self.here[faces]

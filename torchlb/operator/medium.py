@@ -127,24 +127,29 @@ def pair_in(lb: OperatorStorage, medium: Medium) -> PairMatrices:
         medium = plain(medium)
         elements = elements.in_medium(medium)
         values = {name: elements.values(field) for name, field in medium.items()}
-        whole, *added = _matrices(
-            elements.matrix, values, elements.given, _boundary(elements, lb.weak)
-        )
-        near = None
+        rest = _boundary(elements, lb.weak)
+        found = [_matrices(elements.matrix, values, elements.given, rest)]
         if lb.weak.linear.num_rows:
-            near, *others = _matrices(elements.near, values, elements.given, [])
-            added += others
-        pair = PairMatrices(whole.crow, whole.col, whole.values, near)
+            found.append(_matrices(elements.near, values, elements.given, []))
+        (whole, *near), potentials = zip(*found, strict=True)
+        pair = PairMatrices(whole.crow, whole.col, whole.values, *near)
         condition = condition_of(lb.condition)
-        if condition is not None and condition.share is not None and len(lb._on_boundary):
-            points, on_boundary = (x.detach().cpu().double() for x in (lb.points, lb._on_boundary))
-            a = torch.as_tensor(condition.share).to(points) * on_boundary
-            pair = pair.absorbing(points, lb.faces.cpu(), a)
-        each = [pair, *([pair.linear] if pair.linear.num_rows else [])]
-        for part, potential in zip(each, added, strict=False):
-            part.values = torch.cat([pad(part.values, (0, 0, 0, 4 - len(part.values))), potential])
-    whole, *near = (Csr(part.crow, part.col, part.values).to(lb.weak.values) for part in each)
+        if condition is not None and len(lb._on_boundary):
+            a = condition.absorption(lb._on_boundary.cpu())
+            points = lb.points.detach().cpu().double()
+            pair = pair if a is None else pair.absorbing(points, lb.faces.cpu(), a)
+    parts = [pair, pair.linear][: len(found)]
+    parts = [_with_potential(*each) for each in zip(parts, potentials, strict=True)]
+    whole, *near = (part.to(lb.weak.values) for part in parts)
     return PairMatrices(whole.crow, whole.col, whole.values, *near)
+
+
+def _with_potential(pair: Csr, potential: Tensor | None) -> Csr:
+    """Matrices of a pair, with what the potential adds to K."""
+    values = pair.values
+    if potential is not None:
+        values = torch.cat([pad(values, (0, 0, 0, 4 - len(values))), potential[None]])
+    return Csr(pair.crow, pair.col, values)
 
 
 def _boundary(elements: Forms, weak: PairMatrices) -> list[Any]:
@@ -159,12 +164,10 @@ def _boundary(elements: Forms, weak: PairMatrices) -> list[Any]:
 
 def _matrices(
     matrix: Any, fields: dict[str, list[Tensor]], given: Tensor, rest: list[Any]
-) -> tuple[Any, ...]:
-    """K, M and the rest in a medium, from upper triangles, and the matrix of the potential, if there is one."""
+) -> tuple[Csr, Tensor | None]:
+    """K, M and the rest in a medium, from upper triangles; and the matrix of the potential, on the same pattern."""
     kappa, rho, c = (fields.get(name) for name in ("conductivity", "density", "potential"))
     upper = matrix(kappa, rho)
     pattern = Pattern.of(upper, given)
-    found = pattern.pair(upper).beside(rest)
-    if c is None:
-        return (found,)
-    return found, torch.from_numpy(pattern.whole(matrix(None, c).data.imag))[None]
+    potential = None if c is None else torch.from_numpy(pattern.whole(matrix(None, c).data.imag))
+    return pattern.pair(upper).beside(rest), potential

@@ -91,7 +91,7 @@ class Plan:
         here = self._sorted(points)
         _, fits = self.shape.at(here)
         forms = self.pair.forms(fits)
-        fits.heights, fits.second = (x[:0].clone() for x in (fits.heights, fits.second))
+        fits.let_go(functions=False)
         return forms.restored(self.numbering, self.order, len(self.faces))
 
     def bilinear(
@@ -223,10 +223,9 @@ def operator_parts(
     if shape.boundary is not None and shape.boundary.mask.any():
         parts["_on_boundary"] = given(shape.boundary.mask)
     if pair is not None:
-        condition = options.held
-        if condition is not None and condition.share is not None and "_on_boundary" in parts:
-            a = torch.as_tensor(condition.share).to(points) * parts["_on_boundary"].to(points)
-            pair = pair.absorbing(points, plan.faces, a)
+        if options.held is not None and "_on_boundary" in parts:
+            a = options.held.absorption(parts["_on_boundary"])
+            pair = pair if a is None else pair.absorbing(points, plan.faces, a)
         parts["weak"] = pair
     return parts
 

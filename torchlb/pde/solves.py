@@ -200,9 +200,8 @@ def potential(
     check_pair(lb)
     products = []
     if source is not None:
-        mass = lb.product(
-            "mass", torch.ones_like(lb.mass)
-        )  # lb.mass has linear rows where it has to
+        # lb.mass has linear rows of P where it would be negative else
+        mass = lb.product("mass", torch.ones_like(lb.mass))
         products.append(mass.to(source.dtype)[:, None] * source)
     if field is not None:
         weighted = lb.mass.to(field.dtype)[:, None, None] * field

@@ -8,7 +8,7 @@ from dataclasses import replace
 from typing import Any, ClassVar, Literal
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from torchlb.errors import InputError, first_few
@@ -70,6 +70,13 @@ class Condition:
         other = copy(self)
         other.share = self.share.to(points.device)[points]
         return other
+
+    def absorption(self, on_boundary: Bool[Tensor, " N"]) -> Float[Tensor, " N"] | None:
+        """a at the points of the boundary, zero at the others, 1/ℓ; None without data."""
+        if self.share is None:
+            return None
+        share = torch.as_tensor(self.share, dtype=torch.float64, device=on_boundary.device)
+        return share * on_boundary
 
     def finish(self, shape: Any, centers: Int[Tensor, " B"], rows: Rows) -> Rows:
         """Adapt the rows of a `Shape`: low-order ones, without data, lose a f over their share of the boundary."""
